@@ -4,8 +4,9 @@
 of ratios.
 """
 
-from snakesim_hal.base.arithmetic import pin
+from snakesim_hal.base.arithmetic import pin_common_arithmetic
 
-pin()  # before NumPy is imported: a run in this process then stays on one thread, where it can be measured
+# Before NumPy is imported: a run in this process then stays on one thread, where it can be measured.
+pin_common_arithmetic()
 
 import snakesim_testing.isolation  # noqa: E402, F401 - latched stops and lists of robots stay apart from the user's

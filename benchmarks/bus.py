@@ -105,12 +105,12 @@ def _make_driver_receiver(source: socket.socket) -> ReceiveFrames:
     buffer = bytearray(RAW_FRAME.size)
 
     def receive_frames(sync: int) -> int:
-        reports.begin_sync(sync, contacts=True, tail=False)
+        reports.start_sync(sync, contacts=True, tail=False)
         frames = []
         drain_socket(source, buffer, frames, lambda _identifier, _data: None)
         for frame in frames:
             reports.process_frame(frame)
-        assert reports.complete
+        assert reports.is_complete
         reports.shaft_values()
         return len(frames)
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.whole import run
-from snakesim_can_backend.bus.load import MAX_LOAD, ReportSchedule, bus_load
+from snakesim_can_backend.bus.load import MAX_LOAD, ReportSchedule, compute_bus_load
 from snakesim_can_backend.protocol.definitions import Opcode, parse_opcode
 from snakesim_hal.base.arrays import Floats
-from snakesim_testing.can.module_rig import run_at
+from snakesim_testing.can.module_rig import measure_bus_traffic
 
 WARM_UP_CYCLES = 100  # left out at both ends of the run
 RATE_HZ = 100
@@ -93,8 +93,8 @@ def make_load_table() -> list[str]:
     rows = list(LOAD_HEADER)
     for joints in LOAD_JOINTS:
         for rate_hz in LOAD_RATES_HZ:
-            _, before, after, _ = run_at(joints, rate_hz)
-            computed = bus_load(joints, ReportSchedule(rate_hz))
+            _, before, after, _ = measure_bus_traffic(joints, rate_hz)
+            computed = compute_bus_load(joints, ReportSchedule(rate_hz))
             measured = after.load_since(before)
             difference = "bus is full"
             if computed < 1:

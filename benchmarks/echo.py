@@ -10,8 +10,8 @@ from typing import Any
 
 import zenoh
 
-from snakesim_hal.base.process import child_environment, python_command
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_hal.base.process import make_child_environment, make_python_command
+from snakesim_testing.harness.endpoint import find_free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"
 BLOCK = zenoh.CongestionControl.BLOCK
@@ -55,12 +55,12 @@ def measure_echo_times_us(
     Raises:
         TimeoutError: the other process does not answer.
     """
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with zenoh.open(_make_zenoh_config(endpoint, listen=True)) as session:
         publisher = declare_publisher(session, REQUEST)
         replies = session.declare_subscriber(REPLY, zenoh.handlers.RingChannel(4))
-        command = python_command("-m", "benchmarks.echo", endpoint, str(len(reply)))
-        echo_process = subprocess.Popen([*prefix, *command], env=child_environment())
+        command = make_python_command("-m", "benchmarks.echo", endpoint, str(len(reply)))
+        echo_process = subprocess.Popen([*prefix, *command], env=make_child_environment())
         try:
             _wait_for_first_reply(publisher, replies, request)
             times_us: list[float] = []

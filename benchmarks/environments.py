@@ -23,7 +23,7 @@ from benchmarks.physics import open_simulator
 from snakesim.environments import SnakeEnv, SnakeVectorEnv
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import load
+from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.laws.version import choose_laws
 
@@ -78,7 +78,7 @@ def make_environment_step(scenario: str, **options: Any) -> Step:
 
 def make_physics_step(scenario: str) -> Step:
     """Return a function that makes the same step without sensors, command limiter and rewards."""
-    config = load(scenario).config
+    config = load_scenario(scenario).config
     backend = open_simulator(config)
     joints = config.robot.chain.modules
     modes = [Mode.POSITION] * joints
@@ -128,7 +128,7 @@ def make_bare_chain(robot: RobotFile) -> mujoco.MjModel:
 
 def make_bare_step(scenario: str) -> Step:
     """Return a function that makes the same step of a bare chain."""
-    config = load(scenario).config
+    config = load_scenario(scenario).config
     model = make_bare_chain(config.robot)
     data = mujoco.MjData(model)
     wave = TravelingWave(config.robot.chain.modules)
@@ -144,7 +144,7 @@ def make_bare_step(scenario: str) -> Step:
 
 def make_bare_batch_step(scenario: str, count: int) -> Step:
     """Return a function that makes the same step of many bare chains."""
-    config = load(scenario).config
+    config = load_scenario(scenario).config
     batch = Batch(make_bare_chain(config.robot), count, THREADS)
     inputs = batch.bind("ctrl")
     wave = TravelingWave(config.robot.chain.modules)
@@ -260,7 +260,7 @@ def format_rows_per_degree_of_freedom() -> list[str]:
     The columns are comparable because they count physics steps, and seconds of robot time, times degrees of freedom.
     """
     scenario = SCENARIOS[0]
-    config = load(scenario).config
+    config = load_scenario(scenario).config
     sim = open_simulator(config).sim
     swimmer: Any = gymnasium.make("Swimmer-v5").unwrapped
     compared = [

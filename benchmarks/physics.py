@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.backend import SafeSetpoints, Samples
-from snakesim_hal.model.plugins import plugin_settings
-from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.model.plugins import decode_plugin_settings
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire.codec import encode
@@ -17,9 +17,9 @@ from snakesim_hal.wire.keys import CLOCK, JOINTS
 from snakesim_hal.wire.messages import JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.laws.version import LawsVersion
-from snakesim_testing.hal.small_robots import clock, command
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.runs.whole_run import run as run_in_process
+from snakesim_testing.hal.small_robots import make_clock, make_joint_command
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.runs.whole_run import run_controller as run_in_process
 
 TICKS_A_BLOCK = 50  # measured in one go, before the next kind of measurement has its turn
 # What decides the forces of MuJoCo itself: everything except the memory of our laws.
@@ -31,12 +31,12 @@ LONG_NUMBER = 10**6  # a tick and sequence number of a run of some hours: it tak
 
 def load_config(*sets: str) -> RunConfig:
     """Load the scenario that is measured, changed by texts as of `--set`."""
-    return load("triplet", [parse_set(text) for text in sets]).config
+    return load_scenario("triplet", [parse_set_option(text) for text in sets]).config
 
 
 def open_simulator(config: RunConfig, laws: LawsVersion | None = None) -> SimBackend:
     """Open the simulator as the host opens it, or with a certain version of the laws."""
-    settings = plugin_settings(SimBackend, config.backends.get("sim", {}), "benchmarks", "backends.sim")
+    settings = decode_plugin_settings(SimBackend, config.backends.get("sim", {}), "benchmarks", "backends.sim")
     return SimBackend(config, settings, laws=laws)
 
 
@@ -49,11 +49,11 @@ class SamplePublisher:
 
     def publish(self, tick: int, samples: Samples) -> None:
         """Publish every sample and the clock."""
-        newest = dict.fromkeys(samples.others, tick)
-        now = clock(tick, arm_session=1, clock_mode="free", newest=newest)
-        for key, message in ((JOINTS, samples.joints), *samples.others.items(), (CLOCK, now)):
+        newest = dict.fromkeys(samples.by_key, tick)
+        now = make_clock(tick, arm_session=1, clock_mode="free", newest=newest)
+        for key, message in ((JOINTS, samples.joints), *samples.by_key.items(), (CLOCK, now)):
             if key not in self._publishers:
-                self._publishers[key] = self._session.publisher(key, type(message))  # pyright: ignore
+                self._publishers[key] = self._session.declare_publisher(key, type(message))  # pyright: ignore
             self._publishers[key].put(message)  # pyright: ignore
 
 
@@ -138,10 +138,12 @@ def measure_tick_times(config: RunConfig) -> TickTimes:
     bare_mujoco = BareMujoco(config)
     setpoints, _ = record_motion(config)
     times = TickTimes()
-    endpoint = free_endpoint()  # published messages really go over the network
+    endpoint = find_free_endpoint()  # published messages really go over the network
     with open_session(Link(endpoint, "bench", True)) as session, open_session(Link(endpoint, "bench")) as other:
         first = full.sample(0, 0)
-        readers = [other.reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.others.items())]
+        readers = [
+            other.declare_reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.by_key.items())
+        ]
         publisher = SamplePublisher(session)
         tick = 0
         for start in range(0, len(setpoints) - TICKS_A_BLOCK + 1, TICKS_A_BLOCK):
@@ -171,8 +173,8 @@ def encode_tick(config: RunConfig) -> tuple[bytes, bytes]:
     robot = backend.describe()
     backend.close()
     limits_nm = [joint.torque_limit_nm for joint in robot.joints]
-    hold_command = command(
+    hold_command = make_joint_command(
         robot, samples.joints.angle_rad, tick=LONG_NUMBER, sequence=LONG_NUMBER, torque_limit_nm=limits_nm
     )
-    state = encode(samples.joints) + b"".join(encode(message) for message in samples.others.values())
+    state = encode(samples.joints) + b"".join(encode(message) for message in samples.by_key.values())
     return state, encode(hold_command)

@@ -3,18 +3,18 @@
 import statistics
 import time
 
-from snakesim_gnc.geometry.body_on_path import chain_nodes
-from snakesim_gnc.geometry.planar import space_evenly
+from snakesim_gnc.geometry.body_on_path import compute_chain_points
+from snakesim_gnc.geometry.planar import resample_evenly
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.path_search.beam import BeamSearch
-from snakesim_gnc.navigation.path_search.native_growth import NativeGrowth
+from snakesim_gnc.navigation.path_search.native_growth import NativeExpander
 from snakesim_gnc.navigation.path_search.native_library import is_native_available
 from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters
-from snakesim_gnc.navigation.path_search.specified_growth import SpecifiedGrowth
+from snakesim_gnc.navigation.path_search.specified_growth import NumpyExpander
 from snakesim_gnc.navigation.plan import HORIZON_M
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.route import yaw_segments_m
-from snakesim_hal.model.scenario import find_start_pose, load, parse_set, place_obstacles
+from snakesim_hal.model.route import compute_yaw_segments_m
+from snakesim_hal.model.scenario import compute_start_pose, load_scenario, parse_set_option, place_obstacles
 
 SEEDS = (1, 2, 3, 4, 5)  # of the fields
 SEARCH = SearchParameters(body_length_m=1.54, radius_m=0.04, segment_m=0.11)  # planar13
@@ -38,8 +38,8 @@ class PlanningCosts:
         native_us: list[float] = []
         python_us: list[float] = []
         for grid, body_w in self._scenes:
-            native_us.append(_measure_search_us(BeamSearch(grid, SEARCH, NativeGrowth), body_w))
-            python_us.append(_measure_search_us(BeamSearch(grid, SEARCH, SpecifiedGrowth), body_w))
+            native_us.append(_measure_search_us(BeamSearch(grid, SEARCH, NativeExpander), body_w))
+            python_us.append(_measure_search_us(BeamSearch(grid, SEARCH, NumpyExpander), body_w))
         return native_us, python_us
 
 
@@ -52,12 +52,12 @@ def format_rates(native_us: list[float], python_us: list[float]) -> str:
 
 def _make_scene(seed: int) -> tuple[ObstacleGrid, Floats]:
     """Return the map of a random field, and the body (n, 2) before it."""
-    config = load("surveyed_clutter", [parse_set(f"scene.random_field.0.seed={seed}")]).config
-    start = find_start_pose(config)
-    segments_m = yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
-    nodes_w = chain_nodes(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments_m)
+    config = load_scenario("surveyed_clutter", [parse_set_option(f"scene.random_field.0.seed={seed}")]).config
+    start = compute_start_pose(config)
+    segments_m = compute_yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
+    nodes_w = compute_chain_points(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments_m)
     obstacles = [placed.obstacle for placed in place_obstacles(config)]
-    return ObstacleGrid(obstacles), space_evenly(nodes_w.T)
+    return ObstacleGrid(obstacles), resample_evenly(nodes_w.T)
 
 
 def _measure_search_us(beam: BeamSearch, body_w: Floats) -> float:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.base.process import child_environment, python_command
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.base.process import make_child_environment, make_python_command
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
-from snakesim_operator.results.run_reader import SUMMARY
+from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from snakesim_operator.results.summary import RunSummary
 
 ATTEMPTS = 3  # a machine that pauses for 50 ms stops a run in real time
@@ -31,11 +31,11 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
     """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        command = python_command("-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments)
+        command = make_python_command("-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments)
         for attempts_left in reversed(range(ATTEMPTS)):
             completed = subprocess.run(
                 command,
-                env=child_environment(),
+                env=make_child_environment(),
                 check=attempts_left == 0,
                 stdout=subprocess.DEVNULL,
                 timeout=RUN_TIMEOUT_S,
@@ -43,7 +43,7 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
             if completed.returncode == 0:
                 break
             print(f"stopped, tried again: snakesim run {scenario} {' '.join(arguments)}", file=sys.stderr)
-        summary = (out / SUMMARY).read_bytes()
+        summary = (out / SUMMARY_FILENAME).read_bytes()
         return msgspec.json.decode(summary, type=RunSummary)
 
 
@@ -69,7 +69,7 @@ def measure_speed_in_process(*arguments: str) -> float:
 
 def measure_loop_in_process() -> float:
     """Return how many seconds of robot time a run without a recording makes in a second of CPU time."""
-    config = load(IN_PROCESS_SCENARIO, [parse_set(f"duration_s={IN_PROCESS_S:g}")]).config
+    config = load_scenario(IN_PROCESS_SCENARIO, [parse_set_option(f"duration_s={IN_PROCESS_S:g}")]).config
     with InProcessRun(config) as in_process_run:
         began_s = time.process_time()
         for _ in in_process_run.iterate_ticks():

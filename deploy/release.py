@@ -35,9 +35,9 @@ MAIN_JOB = ("run", "peg_row", "--controller", "obstacle_aided", "--duration", "3
 AUDIT_TIMEOUT_S = 300
 FIND_LAWS_PROBLEM = """
 import mujoco
-from snakesim_native.libraries import LAWS
-from snakesim_native.load import load
-print(load(LAWS).problem)
+from snakesim_native.libraries import LAWS_LIBRARY
+from snakesim_native.load import load_shared_library
+print(load_shared_library(LAWS_LIBRARY).problem)
 """
 
 

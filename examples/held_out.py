@@ -14,8 +14,8 @@ from snakesim.environments import SnakeEnv  # before NumPy, so that its arithmet
 # isort: split
 import numpy as np
 
-from snakesim_gnc.control.policy import Model
-from snakesim_hal.model.scenario import parse_set
+from snakesim_gnc.control.policy import PolicyModel
+from snakesim_hal.model.scenario import parse_set_option
 
 SCENARIO = "surveyed_clutter"
 DURATION_S = 40.0
@@ -33,7 +33,7 @@ class Episode:
     energy_j: float
 
 
-def run_episode(env: SnakeEnv, model: Model, seed: int) -> Episode:
+def run_episode(env: SnakeEnv, model: PolicyModel, seed: int) -> Episode:
     """Run the policy on the scene of one seed, until the goal, the time limit, or no more progress."""
     observation, info = env.reset(seed=seed)
     energy_j = 0.0
@@ -53,8 +53,8 @@ def run_episode(env: SnakeEnv, model: Model, seed: int) -> Episode:
 
 def main() -> None:
     name, first_seed, count, *changes = sys.argv[1:]
-    settings = {override.key: override.value for override in map(parse_set, changes)}
-    model = Model(SnakeEnv(SCENARIO).description, name)
+    settings = {override.key: override.value for override in map(parse_set_option, changes)}
+    model = PolicyModel(SnakeEnv(SCENARIO).description, name)
     env = SnakeEnv(
         SCENARIO,
         observe=tuple(model.parts),

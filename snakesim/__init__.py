@@ -7,8 +7,8 @@
 
 `run`, `load` and `Result` are for whole runs, `Robot` is a connection to a robot that is already running.
 `Controller` is the base class of controllers; `Observation`, `ControllerCommand`, `Telemetry`, `Parameters` and
-`positions` go with it, and `find_nodes_w` computes where joints, head and tail are. `docs/how-to/python.md` is the
-reference. Nothing of SnakeSIM imports this package.
+`make_position_setpoints` go with it, and `compute_body_points_w` computes where joints, head and tail are.
+`docs/how-to/python.md` is the reference. Nothing of SnakeSIM imports this package.
 
 Names are loaded when they are first used, and importing this package changes nothing in the process. A run gives the
 digest of `snakesim run`, because it is computed in a child process where this process would round otherwise. Only a run
@@ -20,7 +20,7 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from snakesim_hal.base.arithmetic import is_pinned, pin
+from snakesim_hal.base.arithmetic import is_pinned, pin_common_arithmetic
 from snakesim_hal.base.errors import (
     ConfigError,
     ControllerError,
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from snakesim.result import Result
     from snakesim.robot import Robot
     from snakesim.runs import load, run
-    from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
+    from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
     from snakesim_hal.model.files import FileStruct as Parameters
-    from snakesim_hal.model.kinematics import find_nodes_w
+    from snakesim_hal.model.kinematics import compute_body_points_w
 
 __all__ = [
     "ConfigError",
@@ -52,9 +52,9 @@ __all__ = [
     "SnakesimError",
     "StalledError",
     "Telemetry",
-    "find_nodes_w",
+    "compute_body_points_w",
     "load",
-    "positions",
+    "make_position_setpoints",
     "run",
     "use_common_arithmetic",
 ]
@@ -67,9 +67,9 @@ LAZY = {
     "Result": ("snakesim.result", "Result"),
     "Robot": ("snakesim.robot", "Robot"),
     "Telemetry": (CONTROLLER, "Telemetry"),
-    "find_nodes_w": ("snakesim_hal.model.kinematics", "find_nodes_w"),
+    "compute_body_points_w": ("snakesim_hal.model.kinematics", "compute_body_points_w"),
     "load": ("snakesim.runs", "load"),
-    "positions": (CONTROLLER, "positions"),
+    "make_position_setpoints": (CONTROLLER, "make_position_setpoints"),
     "run": ("snakesim.runs", "run"),
 }
 
@@ -84,7 +84,7 @@ def use_common_arithmetic() -> None:
     Raises:
         ConfigError: NumPy is imported already, and rounds otherwise.
     """
-    pin()
+    pin_common_arithmetic()
     if "numpy" in sys.modules and not is_pinned():
         raise ConfigError(
             "use_common_arithmetic(): NumPy is imported already, and rounds otherwise than `snakesim run`; call this "

@@ -7,10 +7,10 @@ from html import escape
 from pathlib import Path
 
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.results.page.charts import Figure
-from snakesim_operator.results.page.html import render
+from snakesim_operator.results.page.charts import PlotlyDict
+from snakesim_operator.results.page.html import render_page
 
-PAGE = Path(__file__).with_name("plot.html")
+PAGE_TEMPLATE = Path(__file__).with_name("plot.html")
 MARGIN_PX = 30  # below each figure
 PADDING_PX = 160  # of the page
 
@@ -20,7 +20,7 @@ class Chart:
     """Figures of signals over time. A notebook shows them."""
 
     title: str  # of the page
-    figures: Sequence[Figure]  # in the form of Plotly, from top to bottom
+    figures: Sequence[PlotlyDict]  # in the form of Plotly, from top to bottom
     joints: int  # number of joints, each of which has its own color
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -35,18 +35,18 @@ class Chart:
         Raises:
             ConfigError: The file cannot be written.
         """
-        write_text(Path(path), self._page())
+        write_text(Path(path), self._render_page())
         return Path(path)
 
     def _repr_html_(self) -> str:
         heights = [figure["layout"]["height"] + MARGIN_PX for figure in self.figures]
-        return framed(self._page(), sum(heights) + PADDING_PX)
+        return embed_in_iframe(self._render_page(), sum(heights) + PADDING_PX)
 
-    def _page(self) -> str:
-        return render(PAGE, self.joints, title=self.title, figures=self.figures)
+    def _render_page(self) -> str:
+        return render_page(PAGE_TEMPLATE, self.joints, title=self.title, figures=self.figures)
 
 
-def framed(page: str, height_px: int) -> str:
+def embed_in_iframe(page: str, height_px: int) -> str:
     """Return HTML that shows a page within another one, isolated from it."""
     style = f"width:100%;height:{height_px}px;border:0"
     return f'<iframe style="{style}" sandbox="allow-scripts allow-downloads" srcdoc="{escape(page)}"></iframe>'

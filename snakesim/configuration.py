@@ -5,19 +5,22 @@ from collections.abc import Mapping
 from typing import Any
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scenario import Override, RunConfig, load
-from snakesim_hal.programs.preflight import check_plugins
+from snakesim_hal.model.scenario import Override, RunConfig, load_scenario
+from snakesim_hal.programs.preflight import validate_and_complete_config
 
 
-def list_overrides(values: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
-    """Return the values that a caller sets, as overrides of the scenario.
+def make_overrides(values: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
+    """Convert the arguments of a Python call to overrides of a scenario.
 
     Args:
-        values: The argument `set` of the caller: values by their dotted keys.
-        **arguments: Other arguments of the caller, by the key that they stand for. None is left out.
+        values: Argument `set` of the call: values by their dotted keys. None if there are none.
+        **arguments: Other arguments of the call, by the key that they set. An argument that is None is left out.
+
+    Returns:
+        The overrides: first those of `arguments`, then those of `values`.
 
     Raises:
-        ConfigError: `values` is no mapping of keys.
+        ConfigError: `values` is not a mapping with text keys.
     """
     if values is None:
         values = {}
@@ -30,14 +33,14 @@ def list_overrides(values: Mapping[str, Any] | None, **arguments: Any) -> list[O
     for key, value in arguments.items():
         if value is not None:
             flag = f"{key.removesuffix('_s')}={value!r:.60}"
-            overrides.append(Override(key, _to_plain(value), flag))
+            overrides.append(Override(key, _convert_to_plain_value(value), flag))
     for key, value in values.items():
         flag = f"set={{{key!r}: {value!r:.60}}}"
-        overrides.append(Override(key, _to_plain(value), flag))
+        overrides.append(Override(key, _convert_to_plain_value(value), flag))
     return overrides
 
 
-def _to_plain(value: Any) -> Any:
+def _convert_to_plain_value(value: Any) -> Any:
     """Return a NumPy number or array as a Python one, and a path as text."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
@@ -46,30 +49,31 @@ def _to_plain(value: Any) -> Any:
     return value
 
 
-def load_checked(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
-    """Return the configuration of a run, for which all plugins are there.
+def load_and_validate_config(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
+    """Load a scenario with overrides, check that all its plugins are installed, and return the configuration.
 
     Args:
-        scenario: Name of a shipped scenario, or path of a file.
+        scenario: Name of a shipped scenario, or path of a scenario file.
         overrides: Values that replace those of the scenario.
-        processes: Whether the run has processes of its own. In one process the clock mode is lockstep.
+        processes: Whether HAL host and services run in processes of their own. If False, they run in this process, and
+            the clock mode is lockstep.
 
     Raises:
         ConfigError: A value is wrong, a plugin is missing, or the clock mode is not possible.
     """
-    clock_mode = next((override for override in overrides if override.key == "clock_mode"), None)
-    if clock_mode is None and not processes:
+    clock_override = next((override for override in overrides if override.key == "clock_mode"), None)
+    if clock_override is None and not processes:
         overrides = [*overrides, Override("clock_mode", "lockstep", "one process")]
-    loaded = load(scenario, overrides)
-    if clock_mode is not None and not processes and loaded.config.clock_mode != "lockstep":
+    loaded = load_scenario(scenario, overrides)
+    if clock_override is not None and not processes and loaded.config.clock_mode != "lockstep":
         raise ConfigError(
-            f"{clock_mode.flag}: in one process the clock mode is lockstep; leave it out, or add processes=True",
+            f"{clock_override.flag}: in one process the clock mode is lockstep; leave it out, or add processes=True",
             code="backend/wrong-clock-mode",
         )
-    config = check_plugins(loaded.config, loaded.table)
-    if clock_mode is not None and config.clock_mode != clock_mode.value:
+    config = validate_and_complete_config(loaded.config, loaded.table)
+    if clock_override is not None and config.clock_mode != clock_override.value:
         raise ConfigError(
-            f"{clock_mode.flag}: backend {config.backend!r} cannot keep this clock mode, only {config.clock_mode}",
+            f"{clock_override.flag}: backend {config.backend!r} cannot keep this clock mode, only {config.clock_mode}",
             code="backend/wrong-clock-mode",
         )
     return config

@@ -14,17 +14,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim.chart import Chart, framed
+from snakesim.chart import Chart, embed_in_iframe
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.results.page.charts import Line, lines
+from snakesim_operator.results.page.charts import Line, make_line_chart
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.signals import arrays, select_columns, table, unit_of
-from snakesim_operator.results.summary import RunSummary, distance_m
+from snakesim_operator.results.signals import compute_signals, find_unit, make_signal_columns, select_columns
+from snakesim_operator.results.summary import RunSummary, get_distance_m
 
-PLAYBACK_PX = 580
-SPAN_S = (0.0, math.inf)
+PLAYBACK_HEIGHT_PX = 580
+WHOLE_RUN_SPAN_S = (0.0, math.inf)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,12 +42,12 @@ class Result:
     @cached_property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All signals by name, each (ticks,), (ticks, width), or (ticks, links or obstacles, 3)."""
-        return arrays(self.record)
+        return compute_signals(self.record)
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
         """All signals split into columns by name, each (ticks,), as in the tables of `snakesim recording export`."""
-        return table(self.record)
+        return make_signal_columns(self.record)
 
     @property
     def signal_names(self) -> list[str]:
@@ -57,7 +57,7 @@ class Result:
     @cached_property
     def units(self) -> dict[str, str]:
         """The SI unit of each signal by its name. "1" for plain numbers."""
-        return {name: unit_of(name, self.record) for name in self.signal_names}
+        return {name: find_unit(name, self.record) for name in self.signal_names}
 
     @property
     def joints(self) -> list[str]:
@@ -94,7 +94,7 @@ class Result:
         return self.status == COMPLETE
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return a signal.
+        """Return a signal, a column of a signal, or a part of a signal.
 
         Args:
             name: A name in `signal_names`, such as "angle_rad" or "angle_rad.joint_3", or a part of a signal, such as
@@ -105,16 +105,16 @@ class Result:
         """
         if name in self.arrays:
             return self.arrays[name]
-        found = select_columns(name, self.columns)
-        if not found:
+        selected_columns = select_columns(name, self.columns)
+        if not selected_columns:
             raise ConfigError(
                 f"no signal {shorten(str(name))!r}; {suggest_word(str(name), self.signal_names)}there are "
                 f"{', '.join(self.arrays)}, and columns of them such as angle_rad.{self.joints[0]}: see `signal_names`",
                 code="recording/unknown-signal",
             )
-        if name in found:
-            return found[name]
-        return np.stack(list(found.values()), axis=1)
+        if name in selected_columns:
+            return selected_columns[name]
+        return np.stack(list(selected_columns.values()), axis=1)
 
     def to_pandas(self) -> Any:
         """Return a pandas DataFrame of all columns, with the time in s as its index.
@@ -145,7 +145,7 @@ class Result:
         Raises:
             ConfigError: There is no such signal.
         """
-        figures = [self._figure(name) for name in signals or ("angle_rad", "torque_nm")]
+        figures = [self._make_figure(name) for name in signals or ("angle_rad", "torque_nm")]
         return Chart(self.summary.scenario, figures, len(self.joints))
 
     def report(self, path: str | os.PathLike[str]) -> Path:
@@ -160,9 +160,9 @@ class Result:
         Raises:
             ConfigError: The file cannot be written.
         """
-        from snakesim_operator.results.report import page
+        from snakesim_operator.results.report import render_report
 
-        write_text(Path(path), page(self._linkless_record, self.summary))
+        write_text(Path(path), render_report(self._record_for_report, self.summary))
         return Path(path)
 
     def video(
@@ -173,17 +173,17 @@ class Result:
         height: int = 720,
         fps: float = 30.0,
         speed: float = 1.0,
-        span_s: tuple[float, float] = SPAN_S,
+        span_s: tuple[float, float] = WHOLE_RUN_SPAN_S,
     ) -> Path:
-        """Film the run.
+        """Render the run as a film, and write it to a file.
 
         Args:
             path: The file to write, with the suffix .mp4 or .gif.
-            width: Width of a picture in pixels.
-            height: Height of a picture in pixels.
-            fps: Pictures in a second of the film.
+            width: Width of the film in pixels.
+            height: Height of the film in pixels.
+            fps: Number of pictures in a second of the film.
             speed: Seconds of robot time in a second of the film.
-            span_s: Begin and end of the part of the run to film, in s.
+            span_s: Start and end of the part of the run to film, in s.
 
         Returns:
             The path of the file.
@@ -191,9 +191,9 @@ class Result:
         Raises:
             ConfigError: The run has no pose, or the extra `report` is not installed.
         """
-        from snakesim_operator.playback.video import film
+        from snakesim_operator.playback.video import film_record
 
-        film(
+        film_record(
             self.record,
             Path(path),
             size=(width, height),
@@ -206,14 +206,14 @@ class Result:
 
     def compare(self, other: "Result") -> str:
         """Return the differences between this run and another one, as `snakesim study compare` prints them."""
-        from snakesim_operator.results.compare.difference import differ
-        from snakesim_operator.results.compare.table import table as format_table
+        from snakesim_operator.results.compare.difference import compute_difference
+        from snakesim_operator.results.compare.table import format_comparison as format_table
 
-        return "\n".join(format_table(differ(self.record, other.record)))
+        return "\n".join(format_table(compute_difference(self.record, other.record)))
 
     def __repr__(self) -> str:
         summary = self.summary
-        moved_m = distance_m(summary)
+        moved_m = get_distance_m(summary)
         moved = "" if moved_m is None else f", moved {moved_m:.3f} m"
         configuration = f"{summary.scenario}, {summary.controller}, {summary.backend}"
         slow = "".join(f", {part}" for part in summary.too_slow)
@@ -221,27 +221,27 @@ class Result:
         return f"<Result {configuration}: {summary.duration_s:g} s{moved}, {summary.ended}{slow}, digest {digest}>"
 
     def _repr_html_(self) -> str:
-        from snakesim_operator.results.report import playback_page
+        from snakesim_operator.results.report import render_playback_page
 
-        return framed(playback_page(self.record, self.summary), PLAYBACK_PX)
+        return embed_in_iframe(render_playback_page(self.record, self.summary), PLAYBACK_HEIGHT_PX)
 
     @property
-    def _linkless_record(self) -> RunRecord:
-        """The record; if its folder is gone, one whose pages link to no files in the folder."""
-        if self.record.folder.exists():
+    def _record_for_report(self) -> RunRecord:
+        """The run record. If its folder was deleted, a copy from which pages do not link to files in the folder."""
+        if self.record.path.exists():
             return self.record
         return dataclasses.replace(self.record, config_path=None)
 
-    def _figure(self, name: str) -> dict[str, Any]:
+    def _make_figure(self, name: str) -> dict[str, Any]:
         """Return the figure of a signal over time."""
         if name not in self.signal_names:
             self[name]  # raises ConfigError, unless it is a part of a signal
-        unit = unit_of(name, self.record)
+        unit = find_unit(name, self.record)
         title = name if unit == "1" else f"{name}, {unit}"
         end_s = float(self.time_s[-1]) if len(self.time_s) else 0.0
-        return lines(f"{name} over time", title, self._lines(name), end_s)
+        return make_line_chart(f"{name} over time", title, self._make_lines(name), end_s)
 
-    def _lines(self, name: str) -> Sequence[Line]:
+    def _make_lines(self, name: str) -> Sequence[Line]:
         """Return a line for each column of a signal."""
         columns = select_columns(name, self.columns)
         if list(columns) == [name]:

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, suggest_word
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.controller import positions
+from snakesim_hal.controller import make_position_setpoints
 from snakesim_hal.network.commanding import READABLE_KEYS, CommandingClient
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.robot_mismatch import find_mismatch
@@ -46,10 +46,10 @@ from snakesim_operator.robot_commands.command import request_while_driving
 from snakesim_operator.robot_commands.parameters import (
     Parameter,
     change_parameters,
-    read_parameters,
+    parse_parameters,
     read_parameters_in_force,
 )
-from snakesim_operator.robot_commands.stop import estop
+from snakesim_operator.robot_commands.stop import stop_robots
 
 CONNECT_TIMEOUT_S = 5.0  # a robot may be starting
 FIRST_MESSAGE_TIMEOUT_S = 1.0  # from the first read of a key until its first message
@@ -82,16 +82,16 @@ class Robot:
             NotConnectedError: The endpoint does not answer, or the robot publishes no description or status.
         """
         self._link = link
-        self._opened = ExitStack()
-        self._session: Session = self._opened.enter_context(open_session(link, CONNECT_TIMEOUT_S))
+        self._exit_stack = ExitStack()
+        self._session: Session = self._exit_stack.enter_context(open_session(link, CONNECT_TIMEOUT_S))
 
-        # Messages, by key.
-        self._readers: dict[str, Reader[Any]] = {}
-        self._newest: dict[str, Any] = {}
+        # Messages.
+        self._reader_by_key: dict[str, Reader[Any]] = {}
+        self._newest_by_key: dict[str, Any] = {}
 
-        # The right to command.
-        self._control: CommandingClient | None = None
-        self._armed = False  # by this connection
+        # The right to command. The client exists from the first command on.
+        self._command_client: CommandingClient | None = None
+        self._is_armed_by_us = False  # whether this connection armed the robot
 
         try:
             self.description: Description = self._require_newest(keys.DESCRIPTION, Description)
@@ -99,7 +99,7 @@ class Robot:
             # In lockstep the clock publishes nothing while a controller computes, so its first message is not required.
             self._read_newest(keys.CLOCK, Clock, 0.0)
         except NotConnectedError:
-            self._opened.close()
+            self._exit_stack.close()
             raise
 
     @staticmethod
@@ -122,16 +122,16 @@ class Robot:
             NotConnectedError: No robot answers within CONNECT_TIMEOUT_S.
             RefusedError: Several robots answer.
         """
-        selection = _select_robot(endpoint, name, session)
+        selection = _make_robot_selection(endpoint, name, session)
         deadline = time.monotonic() + CONNECT_TIMEOUT_S
         links = find_robots(selection)
         while not links and time.monotonic() < deadline:
             time.sleep(POLL_INTERVAL_S)
             links = find_robots(selection)
         if not links:
-            named = "" if selection.namespace is None else f" named {selection.namespace}"
+            name_phrase = "" if selection.namespace is None else f" named {selection.namespace}"
             raise NotConnectedError(
-                f"no robot{named} on {', '.join(selection.endpoints())}; is its HAL host running?",
+                f"no robot{name_phrase} on {', '.join(selection.list_endpoints())}; is its HAL host running?",
                 code="network/no-robot",
             )
         if len(links) > 1:
@@ -148,10 +148,10 @@ class Robot:
     def close(self) -> None:
         """Disarm the robot if this connection armed it, and close the session."""
         try:
-            if self._armed:
+            if self._is_armed_by_us:
                 self.disarm()
         finally:
-            self._opened.close()
+            self._exit_stack.close()
 
     @property
     def joint_names(self) -> list[str]:
@@ -185,7 +185,7 @@ class Robot:
     @property
     def time_s(self) -> float:
         """Robot time of the current tick in s. Before the first command, of the newest tick."""
-        return self._clock.timestamp_ns * 1e-9
+        return self._current_clock.timestamp_ns * 1e-9
 
     def age_s(self, message: Any) -> float:
         """Return the age of a message in s of robot time.
@@ -209,21 +209,22 @@ class Robot:
         Raises:
             ConfigError: There is no such key.
         """
-        if self._control is not None and key in READABLE_KEYS:
-            return self._control.read(key)
-        message = keys.find_message(key)
-        if message is None or "*" in key:
+        if self._command_client is not None and key in READABLE_KEYS:
+            return self._command_client.read(key)
+        message_type = keys.find_message(key)
+        if message_type is None or "*" in key:
             known = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
             raise ConfigError(
                 f"no key {key!r} in the key space; {suggest_word(key, known)}see schemas/keys.md",
                 code="network/unknown-key",
             )
-        message = find_message_type(key, self.description) or message
-        may_wait = key not in self._readers and self._control is None
-        return self._read_newest(key, message, FIRST_MESSAGE_TIMEOUT_S if may_wait else 0.0)
+        message_type = find_message_type(key, self.description) or message_type
+        # A robot that this connection commands needs its next command in time, so it does not wait for a message then.
+        may_wait = key not in self._reader_by_key and self._command_client is None
+        return self._read_newest(key, message_type, FIRST_MESSAGE_TIMEOUT_S if may_wait else 0.0)
 
     def wait(self) -> float:
-        """Wait for the next tick.
+        """Wait for the next tick. If this connection commands the robot, the lease is renewed meanwhile.
 
         Returns:
             Robot time of the tick in s.
@@ -232,11 +233,11 @@ class Robot:
             StalledError: No tick came within TICK_TIMEOUT_S.
             RefusedError: This connection armed the robot, and the robot is not armed any more.
         """
-        if self._control is None:
-            return self._wait_for_clock()
-        clock = self._control.wait()
-        if self._armed and clock.lifecycle != "armed":
-            self._armed = False
+        if self._command_client is None:
+            return self._wait_for_clock_tick()
+        clock = self._command_client.wait_for_tick()
+        if self._is_armed_by_us and clock.lifecycle != "armed":
+            self._is_armed_by_us = False
             raise RefusedError(
                 f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.reason}",
                 code="robot/not-armed",
@@ -247,8 +248,8 @@ class Robot:
         """Send a setpoint for every joint in this tick. The first command takes the lease.
 
         Args:
-            angles_rad: (joints,) angles in rad, tail to head; or `RequestedSetpoints`, which also choose the mode and
-                the torque limit of each joint.
+            angles_rad: An angle for each joint in rad, tail to head, (joints,). Or `RequestedSetpoints`, which also
+                choose the mode and the torque limit of each joint.
 
         Raises:
             ConfigError: The values are not one finite number for each joint.
@@ -257,10 +258,10 @@ class Robot:
         if isinstance(angles_rad, RequestedSetpoints):
             setpoints = angles_rad
         else:
-            setpoints = positions(self.description, list(angles_rad))
-        self._check_values("target", setpoints.target)
-        self._check_values("torque_limit_nm", setpoints.torque_limit_nm)
-        self._start_commanding().send(setpoints)
+            setpoints = make_position_setpoints(self.description, list(angles_rad))
+        self._validate_joint_values("target", setpoints.target)
+        self._validate_joint_values("torque_limit_nm", setpoints.torque_limit_nm)
+        self._get_command_client().send_setpoints(setpoints)
 
     def arm(self, *, unchecked: bool = False) -> None:
         """Take the lease and arm the robot. It holds its pose until the first command.
@@ -271,20 +272,22 @@ class Robot:
         Raises:
             RefusedError: The robot is not ready within ARM_TIMEOUT_S, or refuses, or disarms at once.
         """
-        control = self._start_commanding()
+        control = self._get_command_client()
 
         def explain_not_armed() -> str:
             return f"not armed: {self.status.reason}"
 
-        control.turn_until(lambda: self.status.ready_to_arm, ARM_TIMEOUT_S, explain_not_armed)
-        previous_session = self._clock.arm_session
-        self._send_request(make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed")
-        control.turn_until(lambda: self._clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed)
-        if self._clock.lifecycle != "armed":
+        control.command_until(lambda: self.status.ready_to_arm, ARM_TIMEOUT_S, explain_not_armed)
+        previous_session = self._current_clock.arm_session
+        self._request_and_wait(make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed")
+        control.command_until(
+            lambda: self._current_clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed
+        )
+        if self._current_clock.lifecycle != "armed":
             raise RefusedError(
-                f"not armed any more, but {self._clock.lifecycle}: {self.status.reason}", code="robot/not-armed"
+                f"not armed any more, but {self._current_clock.lifecycle}: {self.status.reason}", code="robot/not-armed"
             )
-        self._armed = True
+        self._is_armed_by_us = True
 
     def disarm(self) -> None:
         """Disarm the robot. Its joints become passive.
@@ -292,8 +295,8 @@ class Robot:
         Raises:
             RefusedError: The robot refuses, or does not confirm.
         """
-        self._send_request(LifecycleRequest(action="disarm", requester=get_user_name()), "disarmed")
-        self._armed = False
+        self._request_and_wait(LifecycleRequest(action="disarm", requester=get_user_name()), "disarmed")
+        self._is_armed_by_us = False
 
     def reset_fault(self) -> None:
         """Reset a fault or an emergency stop. The robot is disarmed afterwards.
@@ -301,7 +304,7 @@ class Robot:
         Raises:
             RefusedError: The cause is still present, or the robot does not confirm.
         """
-        self._send_request(LifecycleRequest(action="reset", requester=get_user_name()), "reset")
+        self._request_and_wait(LifecycleRequest(action="reset", requester=get_user_name()), "reset")
 
     def estop(self) -> None:
         """Trigger the emergency stop, over the stop port and over the network.
@@ -310,9 +313,9 @@ class Robot:
             RefusedError: The robot does not confirm the stop.
         """
         output: list[str] = []
-        self._armed = False
+        self._is_armed_by_us = False
         selection = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
-        exit_code = estop(selection, output.append)
+        exit_code = stop_robots(selection, output.append)
         if exit_code:
             raise RefusedError(*output, code="robot/not-confirmed")
 
@@ -323,7 +326,7 @@ class Robot:
         Raises:
             NotConnectedError: No controller is running.
         """
-        parameters = read_parameters(read_parameters_in_force(self._session))
+        parameters = parse_parameters(read_parameters_in_force(self._session))
         return {f"control.{parameter.name}": parameter for parameter in parameters}
 
     def set(self, changes: Mapping[str, Any]) -> None:
@@ -349,31 +352,32 @@ class Robot:
         Raises:
             ConfigError: The file exists already, or cannot be written.
         """
-        ended = threading.Event()
-        started = threading.Event()
+        should_stop = threading.Event()
+        has_started = threading.Event()
         link = replace(self._link, max_bytes=MAX_IMAGE_BYTES)
         with ThreadPoolExecutor(1) as executor:
             recording = executor.submit(
-                record_to_file, link, Path(path), lambda: not ended.is_set(), lambda *_: started.set()
+                record_to_file, link, Path(path), lambda: not should_stop.is_set(), lambda *_: has_started.set()
             )
             try:
                 deadline = time.monotonic() + RECORDING_START_TIMEOUT_S
-                while not started.is_set() and not recording.done() and time.monotonic() < deadline:
-                    self._let_time_pass()
+                # Ticks must continue while the recorder starts and ends, or an armed robot would lose its lease.
+                while not has_started.is_set() and not recording.done() and time.monotonic() < deadline:
+                    self._tick_or_sleep()
                 yield Path(path)
             finally:
-                ended.set()
+                should_stop.set()
                 while not recording.done():
-                    self._let_time_pass()
+                    self._tick_or_sleep()
                 recording.result()
 
-    def _start_commanding(self) -> CommandingClient:
-        """Return what sends commands; the first call takes the lease."""
-        if self._control is None:
-            self._control = CommandingClient(self._session, self.description, self.status.clock_mode)
-        return self._control
+    def _get_command_client(self) -> CommandingClient:
+        """Return the client that sends commands. The first call creates it, and it takes the lease."""
+        if self._command_client is None:
+            self._command_client = CommandingClient(self._session, self.description, self.status.clock_mode)
+        return self._command_client
 
-    def _check_values(self, name: str, values: Sequence[float]) -> None:
+    def _validate_joint_values(self, name: str, values: Sequence[float]) -> None:
         """Raise ConfigError unless there is one finite number for each joint."""
         count = len(self.joint_names)
         expected = f"{name} is {values!r:.80}, must be {count} finite numbers, tail to head"
@@ -382,77 +386,79 @@ class Robot:
         if not all(math.isfinite(value) for value in values):
             raise ConfigError(expected, code="python/invalid-argument")
 
-    def _send_request(self, request: LifecycleRequest, done: str) -> None:
-        """Send a lifecycle request and wait for its effect, while the lease is renewed."""
-        request_while_driving(self._session, request, done, self._link, self._let_time_pass)
+    def _request_and_wait(self, request: LifecycleRequest, done: str) -> None:
+        """Send a lifecycle request and wait until the robot confirms it. The lease is renewed meanwhile."""
+        request_while_driving(self._session, request, done, self._link, self._tick_or_sleep)
 
-    def _let_time_pass(self) -> None:
+    def _tick_or_sleep(self) -> None:
         """Run one tick if this connection commands the robot, so that its lease stays valid; otherwise sleep."""
-        if self._control is None:
+        if self._command_client is None:
             time.sleep(POLL_INTERVAL_S)
         else:
-            self._control.command_tick()
+            self._command_client.command_tick()
 
     @property
-    def _clock(self) -> Clock:
-        if self._control is not None and self._control.clock is not None:
-            return self._control.clock
+    def _current_clock(self) -> Clock:
+        if self._command_client is not None and self._command_client.clock is not None:
+            return self._command_client.clock
         return self._require_newest(keys.CLOCK, Clock)
 
-    def _wait_for_clock(self) -> float:
-        """Wait for the next tick without the right to command; return its robot time in s."""
-        previous_tick = self._clock.tick
+    def _wait_for_clock_tick(self) -> float:
+        """Wait for the next tick of a robot that this connection does not command, and return its robot time in s."""
+        previous_tick = self._current_clock.tick
         deadline = time.monotonic() + TICK_TIMEOUT_S
-        clock = self._clock
+        clock = self._current_clock
         while clock.tick == previous_tick:
             if time.monotonic() > deadline:
                 raise StalledError(f"no tick of {self._link.namespace} for {TICK_TIMEOUT_S:g} s")
             time.sleep(POLL_INTERVAL_S)
-            clock = self._clock
+            clock = self._current_clock
         return clock.timestamp_ns * 1e-9
 
-    def _require_newest(self, key: str, message: type[Message]) -> Any:
+    def _require_newest(self, key: str, message_type: type[Message]) -> Any:
         """Return the newest message of a key that every robot publishes. Raises NotConnectedError."""
-        newest = self._read_newest(key, message, CONNECT_TIMEOUT_S)
+        newest = self._read_newest(key, message_type, CONNECT_TIMEOUT_S)
         if newest is None:
             raise NotConnectedError(
                 f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?", code="network/no-robot"
             )
         return newest
 
-    def _read_newest(self, key: str, message: type[Message], first_timeout_s: float) -> Any:
-        """Return the newest message of a key, or None. Only the first one is waited for."""
-        reader = self._reader(key, message)
-        timeout_s = 0.0 if key in self._newest else first_timeout_s
+    def _read_newest(self, key: str, message_type: type[Message], first_message_timeout_s: float) -> Any:
+        """Return the newest message of a key, or None. Wait only for the first message of a key."""
+        reader = self._get_reader(key, message_type)
+        timeout_s = 0.0 if key in self._newest_by_key else first_message_timeout_s
         deadline = time.monotonic() + timeout_s
-        newest = reader.newest(self._is_of_this_robot)
+        newest = reader.pop_newest(self._fits_robot)
         while newest is None and time.monotonic() < deadline:
             time.sleep(POLL_INTERVAL_S)
-            newest = reader.newest(self._is_of_this_robot)
+            newest = reader.pop_newest(self._fits_robot)
         if newest is not None:
-            self._newest[key] = newest
-        return self._newest.get(key)
+            self._newest_by_key[key] = newest
+        return self._newest_by_key.get(key)
 
-    def _reader(self, key: str, message: type[Message]) -> Reader[Any]:
+    def _get_reader(self, key: str, message_type: type[Message]) -> Reader[Any]:
         """Return the reader of a key; the first call subscribes to it."""
-        reader = self._readers.get(key)
+        reader = self._reader_by_key.get(key)
         if reader is None:
             row = keys.find_row(key)
             if row is not None and row.kind == "latched":
-                reader = self._session.latched_reader(key, message)
+                reader = self._session.declare_latched_reader(key, message_type)
             else:
-                reader = self._session.reader(key, message)
-            self._readers[key] = reader
+                reader = self._session.declare_reader(key, message_type)
+            self._reader_by_key[key] = reader
         return reader
 
-    def _is_of_this_robot(self, message: Message) -> bool:
+    def _fits_robot(self, message: Message) -> bool:
         """Whether a message fits the robot's description, as far as the description is known."""
-        robot = self._newest.get(keys.DESCRIPTION)
+        robot = self._newest_by_key.get(keys.DESCRIPTION)
         return robot is None or find_mismatch(message, robot) is None
 
 
-def _select_robot(endpoint: str | None, name: str | None, session: str | os.PathLike[str] | None) -> RobotSelection:
-    """Return which robots the arguments of `Robot.connect` allow. Raises ConfigError."""
+def _make_robot_selection(
+    endpoint: str | None, name: str | None, session: str | os.PathLike[str] | None
+) -> RobotSelection:
+    """Convert the arguments of `Robot.connect` to a selection of robots. Raises ConfigError if one is not valid."""
     if endpoint is not None:
         check_endpoint(endpoint, "endpoint")
     if name is not None:
@@ -465,4 +471,4 @@ def _select_robot(endpoint: str | None, name: str | None, session: str | os.Path
             code="command/conflicting-options",
         )
     file = read_session(Path(session))
-    return RobotSelection(file.endpoints[0], file.namespace_for(name), file)
+    return RobotSelection(file.endpoints[0], file.resolve_namespace(name), file)

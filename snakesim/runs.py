@@ -9,19 +9,19 @@ from typing import Any
 
 import msgspec
 
-from snakesim.configuration import list_overrides, load_checked
-from snakesim.controllers import ControllerArgument, name_controller
+from snakesim.configuration import load_and_validate_config, make_overrides
+from snakesim.controllers import ControllerArgument, resolve_controller
 from snakesim.result import Result
 from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError, shorten
-from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
+from snakesim_hal.model.plugins import CONTROLLERS, register_plugin_temporarily
 from snakesim_hal.model.scenario import Override, RunConfig
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import SUMMARY
-from snakesim_operator.results.summary import RunSummary, summarise
-from snakesim_operator.run.conclusion import INTERRUPTED
+from snakesim_operator.results.run_reader import SUMMARY_FILENAME
+from snakesim_operator.results.summary import RunSummary, summarize_run
+from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
 from snakesim_operator.run.in_process import simulate
 from snakesim_operator.run.run import RunRequest
-from snakesim_operator.run.run import run as run_processes
+from snakesim_operator.run.run import run_in_processes as run_processes
 
 
 def run(
@@ -62,10 +62,10 @@ def run(
             f"run({scenario!r:.60}): give a scenario's name, such as 'triplet', or the path of its file",
             code="python/invalid-argument",
         )
-    overrides = list_overrides(set, duration_s=duration, seed=seed, backend=backend)
+    overrides = make_overrides(set, duration_s=duration, seed=seed, backend=backend)
     with contextlib.ExitStack() as opened:
         if controller is not None:
-            name, plugin = name_controller(controller)
+            name, plugin = resolve_controller(controller)
             overrides.insert(0, Override("controller", name, f"controller={shorten(name)}"))
             if plugin is not None:
                 if processes:
@@ -74,8 +74,8 @@ def run(
                         "this program; save it in a file, and give its path, such as controller='./mine.py:Mine'",
                         code="python/invalid-argument",
                     )
-                opened.enter_context(offer_plugin(CONTROLLERS, name, plugin))
-        config = load_checked(os.fspath(scenario), overrides, processes=processes)
+                opened.enter_context(register_plugin_temporarily(CONTROLLERS, name, plugin))
+        config = load_and_validate_config(os.fspath(scenario), overrides, processes=processes)
         folder = None if out is None else Path(out)
         if processes:
             return _run_in_processes(config, folder)
@@ -95,7 +95,7 @@ def load(path: str | os.PathLike[str]) -> Result:
         ConfigError: It is neither of both, or damaged.
     """
     record = RunRecord.load(Path(path))
-    return Result(record, summarise(record, record.ending))
+    return Result(record, summarize_run(record, record.ending))
 
 
 def _run_here(config: RunConfig, out: Path | None) -> Result:
@@ -115,9 +115,9 @@ def _run_in_processes(config: RunConfig, out: Path | None) -> Result:
     """Run in several processes. Raises SnakesimError when the run leaves no record."""
     with TemporaryDirectory(prefix="snakesim-") as scratch:
         folder = out or Path(scratch) / "run"
-        if run_processes(RunRequest(config, out=folder)) == INTERRUPTED:
+        if run_processes(RunRequest(config, out=folder)) == EXIT_INTERRUPTED:
             raise KeyboardInterrupt
-        if not (folder / SUMMARY).is_file():
+        if not (folder / SUMMARY_FILENAME).is_file():
             raise SnakesimError("the run left no record; see the output of its processes above")
-        summary = msgspec.json.decode((folder / SUMMARY).read_bytes(), type=RunSummary)
+        summary = msgspec.json.decode((folder / SUMMARY_FILENAME).read_bytes(), type=RunSummary)
         return Result(RunRecord.load(folder), summary)

@@ -13,12 +13,12 @@ from snakesim_hal.programs.arguments import (
     add_scenario_name,
     add_seed,
     add_set,
-    number_type,
+    make_number_parser,
 )
 
 DEFAULT_CHANNEL = "vcan0"
 DEFAULT_POSE = "127.0.0.1:7450"
-EXPANDED = "snakesim-expanded.dbc"
+EXPANDED_DBC_FILENAME = "snakesim-expanded.dbc"
 MIN_RATE_HZ = 20.0
 MAX_RATE_HZ = 5000.0  # of a scenario
 CHANNEL_ABOUT = "SocketCAN interface such as can0, or INTERFACE:CHANNEL such as slcan:/dev/ttyACM0"
@@ -28,7 +28,7 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a scan of a CAN bus."""
     add_channels(parser, CHANNEL_ABOUT)
     _add_bit_rate(parser)
-    add_duration(parser, "seconds to listen on each bus (default: 1)", number_type(0.001, 3600, "s"), 1.0)
+    add_duration(parser, "seconds to listen on each bus (default: 1)", make_number_parser(0.001, 3600, "s"), 1.0)
     parser.add_argument("--anyway", action="store_true", help="send requests also where others use the bus")
 
 
@@ -41,7 +41,7 @@ def add_canopen_scan(parser: argparse.ArgumentParser) -> None:
 def _add_bit_rate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--bit-rate",
-        type=number_type(10_000, 1_000_000, "bit/s"),
+        type=make_number_parser(10_000, 1_000_000, "bit/s"),
         default=1_000_000,
         metavar="BIT/S",
         help="of an adapter (default: 1000000)",
@@ -54,14 +54,14 @@ def add_module_load(parser: argparse.ArgumentParser) -> None:
     add_set(parser)
     parser.add_argument(
         "--joints",
-        type=number_type(1, LAST_NODE, "joints"),
+        type=make_number_parser(1, LAST_NODE, "joints"),
         nargs="+",
         metavar="N",
         help="print a table: for a robot with this many joints",
     )
     parser.add_argument(
         "--hz",
-        type=number_type(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
+        type=make_number_parser(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
         nargs="+",
         metavar="HZ",
         help="print a table: for these control rates",
@@ -90,7 +90,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 
 def add_dbc(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that write the DBC file."""
-    add_out(parser, f"the DBC file (default: {EXPANDED})")
+    add_out(parser, f"the DBC file (default: {EXPANDED_DBC_FILENAME})")
 
 
 def add_module_emulation(parser: argparse.ArgumentParser) -> None:

@@ -7,14 +7,14 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-from snakesim_can_backend.arguments import EXPANDED
-from snakesim_can_backend.bus.adapter import check_channel, open_bus, open_wire
+from snakesim_can_backend.arguments import EXPANDED_DBC_FILENAME
+from snakesim_can_backend.bus.adapter import open_bus, open_wire, validate_channel
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.bus.load import (
     MAX_LOAD,
     ReportSchedule,
-    bus_load,
     busiest_period_s,
+    compute_bus_load,
     explain_load,
     format_bit_rate,
     is_feasible,
@@ -26,26 +26,26 @@ from snakesim_can_backend.bus.load import (
 from snakesim_can_backend.bus.read_log import BusLog
 from snakesim_can_backend.bus.unknown_frames import UnknownFrames, listen_for_unknown_frames
 from snakesim_can_backend.driver.bring_up import ModuleBus, ModuleIdentity, find_modules
-from snakesim_can_backend.driver.modules import answer_limit_s
+from snakesim_can_backend.driver.modules import compute_response_timeout_s
 from snakesim_can_backend.driver.offline import LogReplay, compare_with_run_log
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
-from snakesim_can_backend.protocol.expanded import expanded_dbc
+from snakesim_can_backend.protocol.expanded import make_expanded_dbc
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns, discard_line, print_json, print_line
-from snakesim_hal.model.files import Table, decode
-from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
-from snakesim_hal.model.scenario import load as load_scenario
+from snakesim_hal.model.files import ConfigTable, decode_table
+from snakesim_hal.model.scenario import LoadedScenario, Override, RunConfig, parse_set_option
+from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.run_log.black_box import read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX
 
 OK, FAILED = 0, 1
-MODULES = "can"  # the backend of joint modules
-LISTEN_S = 0.3  # for others on a bus; most devices send something five times a second or more
+MODULE_BACKEND = "can"  # the backend of joint modules
+LISTEN_DURATION_S = 0.3  # for others on a bus; most devices send something five times a second or more
 COLUMNS = (
     *("channel", "node", "serial", "firmware", "protocol", "emulated", "state", "faults", "uptime"),
     *("voltage", "motor", "board", "shaft"),
@@ -57,10 +57,14 @@ UNKNOWN = "-"
 
 
 def print_load(arguments: argparse.Namespace) -> int:
-    """Print the worst-case load of a scenario's buses. Returns 1 if it does not fit."""
-    overrides = [Override("backend", "can", "drive load can"), *(parse_set(text) for text in arguments.set)]
+    """Run `snakesim drive load can`: print the worst-case load of the buses of joint modules.
+
+    Returns:
+        Exit code 0; 1 if a bus of the scenario cannot carry its load.
+    """
+    overrides = [Override("backend", "can", "drive load can"), *(parse_set_option(text) for text in arguments.set)]
     loaded = load_scenario(arguments.scenario, overrides)
-    settings = settings_of(loaded)
+    settings = load_can_settings(loaded)
     config = loaded.config
     if arguments.joints is None and arguments.hz is None:
         return _print_scenario_load(config, settings, as_json=arguments.json)
@@ -68,7 +72,7 @@ def print_load(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({"loads": list(_list_loads(config, settings, joints, arguments.hz))})
         return OK
-    for line in table(config, settings, joints, arguments.hz):
+    for line in format_load_table(config, settings, joints, arguments.hz):
         print_line(line)
     return OK
 
@@ -79,7 +83,7 @@ def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: b
     if as_json:
         channels = settings.channels or ["one bus"]
         buses = [
-            {"channel": channel, "joints": bus[0], "load": bus_load(*bus), "fits": is_feasible(*bus)}
+            {"channel": channel, "joints": bus[0], "load": compute_bus_load(*bus), "fits": is_feasible(*bus)}
             for channel, bus in zip(channels, plan_buses(config, settings), strict=True)
         ]
         print_json({"rate_hz": config.rate_hz, "buses": buses, "fits": all_fit})
@@ -92,7 +96,7 @@ def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: b
 def _list_loads(
     config: RunConfig, settings: CanSettings, joints: Sequence[int], rates_hz: Sequence[float] | None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the load of the fullest bus for every number of joints and every rate."""
+    """Yield the load of the bus with the most joints for every number of joints and every rate."""
     buses = max(len(settings.channels), 1)
     for count in joints:
         on_fullest = ceil(count / buses)
@@ -101,16 +105,16 @@ def _list_loads(
             yield {
                 "joints": count,
                 "rate_hz": rate_hz,
-                "load": bus_load(on_fullest, reports),
+                "load": compute_bus_load(on_fullest, reports),
                 "fits": is_feasible(on_fullest, reports),
             }
 
 
-def settings_of(loaded: Loaded) -> CanSettings:
-    """Return the section `backends.can` of a scenario. Raises ConfigError."""
+def load_can_settings(loaded: LoadedScenario) -> CanSettings:
+    """Decode the section `backends.can` of a scenario; raise ConfigError if it is invalid."""
     table = loaded.table
-    section = Table(loaded.config.backends.get("can", {}), table.source, table.origin)
-    return decode(section, CanSettings, "backends.can")
+    section = ConfigTable(loaded.config.backends.get("can", {}), table.source, table.origin_by_key)
+    return decode_table(section, CanSettings, "backends.can")
 
 
 def describe_bus_loads(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
@@ -125,23 +129,30 @@ def describe_bus_loads(config: RunConfig, settings: CanSettings) -> tuple[list[s
     return [*lines, f"Refused. {suggest_alternatives([joints for joints, _ in buses], config, settings)}"], False
 
 
-def table(
+def format_load_table(
     config: RunConfig, settings: CanSettings, joints: Sequence[int], rates_hz: Sequence[float] | None = None
 ) -> Iterator[str]:
-    """The load of the fullest bus for every number of joints and every rate, as lines."""
+    """Yield the lines of a table with the load of the bus with the most joints.
+
+    Args:
+        config: Configuration of the run.
+        settings: Settings of the backend.
+        joints: Numbers of joints, one for each row.
+        rates_hz: Control rates, one for each column; None for the rate of the scenario.
+    """
     buses = max(len(settings.channels), 1)
     rates = rates_hz or [config.rate_hz]
     yield "joints" + "".join(f"{f'{rate:g} Hz':>16}" for rate in rates)
     for count in joints:
-        cells = [_cell(ceil(count / buses), plan_reports_at(rate, config, settings)) for rate in rates]
+        cells = [_format_load_cell(ceil(count / buses), plan_reports_at(rate, config, settings)) for rate in rates]
         yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
     on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
     of = format_bit_rate(settings.bit_rate)
     yield f"Worst-case load of {on}, {of}; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
 
 
-def _cell(joints: int, reports: ReportSchedule) -> str:
-    return f"{100 * bus_load(joints, reports):.1f} %" + ("" if is_feasible(joints, reports) else " refused")
+def _format_load_cell(joints: int, reports: ReportSchedule) -> str:
+    return f"{100 * compute_bus_load(joints, reports):.1f} %" + ("" if is_feasible(joints, reports) else " refused")
 
 
 # --- scan --------------------------------------------------------------------------------------------------
@@ -153,10 +164,10 @@ def scan_channels(arguments: argparse.Namespace) -> int:
     Nothing is sent on a bus that unknown nodes use, unless `--anyway` is given.
 
     Args:
-        arguments: the parsed command line.
+        arguments: Parsed command line.
 
     Returns:
-        The exit code: 0; 1 if no module answers.
+        Exit code 0; 1 if no module responds.
     """
     all_rows: list[dict[str, str]] = []  # of all buses, by column
     channels_in_use: list[str] = []
@@ -164,7 +175,7 @@ def scan_channels(arguments: argparse.Namespace) -> int:
     for channel in arguments.channel:
         unknown_senders: list[UnknownFrames] = []
         if not arguments.anyway:
-            unknown_senders = list_unknown_senders(channel, arguments.bit_rate)
+            unknown_senders = find_unknown_senders(channel, arguments.bit_rate)
         if unknown_senders:
             channels_in_use.append(channel)
             print_text(
@@ -187,29 +198,39 @@ def scan_channels(arguments: argparse.Namespace) -> int:
     return OK if all_rows else FAILED
 
 
-def list_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
-    """Listen to a bus, without sending, and return what it carries that is not from joint modules."""
-    check_channel(channel)
+def find_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
+    """Listen to a bus without sending, and return the frames that are not from joint modules, by sender."""
+    validate_channel(channel)
     bus = open_bus(channel, bit_rate)
     try:
-        return listen_for_unknown_frames(bus, LISTEN_S)
+        return listen_for_unknown_frames(bus, LISTEN_DURATION_S)
     finally:
         bus.shutdown()
 
 
 def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
-    """Discover the modules on a bus. It sends only identify. Returns a row for each module, as text by `COLUMNS`."""
-    reading = ModuleReports(LAST_NODE)
-    everybody = ModuleBus(wire, range(FIRST_NODE, LAST_NODE + 1))
-    return [_row(identity, reading) for identity in find_modules([everybody], seconds, reading.process_frame)]
-
-
-def _row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
-    """Return a module's row of the scan, by column; values that it has not reported are UNKNOWN.
+    """Discover the joint modules on a bus, by sending requests for their identity only.
 
     Args:
-        identity: the module's answer to the request for its identity.
-        reading: the reports of all modules that arrived during the scan.
+        wire: Open bus.
+        seconds: Duration to listen for responses.
+
+    Returns:
+        A row for each module, as text by the names in `COLUMNS`.
+    """
+    reading = ModuleReports(LAST_NODE)
+    all_nodes_bus = ModuleBus(wire, range(FIRST_NODE, LAST_NODE + 1))
+    return [
+        _make_scan_row(identity, reading) for identity in find_modules([all_nodes_bus], seconds, reading.process_frame)
+    ]
+
+
+def _make_scan_row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str, str]:
+    """Return the row of a scan for one module, by column; values that the module has not reported are UNKNOWN.
+
+    Args:
+        identity: Response of the module to the request for its identity.
+        reading: Reports of all modules that arrived during the scan.
     """
     if identity.stepped:
         emulated = "stepped"
@@ -254,32 +275,33 @@ def replay_log(arguments: argparse.Namespace) -> int:
     """Run `snakesim drive replay can`: compare the log of a bus with the run log of the same run.
 
     Args:
-        arguments: the parsed command line, with the log and the folder of the run.
+        arguments: Parsed command line, with the log and the folder of the run.
 
     Returns:
-        The exit code: 0; 1 if the joint states differ or the log has no Sync.
+        Exit code 0; 1 if the joint states differ or the log has no Sync.
 
     Raises:
-        ConfigError: the run has another backend, or a file cannot be read.
+        ConfigError: The run has another backend, or a file cannot be read.
     """
     loaded = load_scenario(str(arguments.run / "config.json"), [])
     config = loaded.config
-    if config.backend != MODULES:
+    if config.backend != MODULE_BACKEND:
         raise ConfigError(
             f"{arguments.run}: is a run with the backend {config.backend!r}, and `snakesim drive replay can` "
-            f"reads the protocol of joint modules: give it a run with the backend {MODULES!r} and the log of that run",
+            f"reads the protocol of joint modules: give it a run with the backend {MODULE_BACKEND!r} and the log of "
+            "that run",
             code="recording/missing-data",
         )
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
-    settings = settings_of(loaded)
+    settings = load_can_settings(loaded)
     replay = LogReplay(
-        Mounting(config.robot.joint_table), plan_reports(config, settings), answer_limit_s(config, settings)
+        Mounting(config.robot.joint_table), plan_reports(config, settings), compute_response_timeout_s(config, settings)
     )
     log = BusLog(arguments.log)
     replay.read(log)
     if not replay.joints:
         finding = f"{replay.frames} frames, and no Sync among them: the log of another bus"
-        print_line(f"{arguments.log}: {finding}{looks(replay.other_protocol_frames)}")
+        print_line(f"{arguments.log}: {finding}{describe_frame_origin(replay.other_protocol_frames)}")
         return FAILED
     print_line(f"{arguments.log}: {replay.frames} frames, {len(replay.joints)} Syncs")
     for line in log.report():
@@ -287,7 +309,7 @@ def replay_log(arguments: argparse.Namespace) -> int:
     for name, silent_syncs in zip(layout.joints, replay.unanswered_syncs, strict=True):
         if silent_syncs:
             print_line(f"  {name} did not answer {silent_syncs} Syncs in time")
-    for node, frame_count in sorted(replay.reports.unknown_nodes.items()):
+    for node, frame_count in sorted(replay.reports.unknown_node_frame_counts.items()):
         print_line(f"  {frame_count} frames of node {node}, which is not of this robot")
     comparison = compare_with_run_log(replay, layout, rows)
     if comparison.first_wrong:
@@ -297,8 +319,15 @@ def replay_log(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def looks(other_protocol_frames: Counter[str]) -> str:
-    """Return whose the frames look like that are none of joint modules; empty if that is not known."""
+def describe_frame_origin(other_protocol_frames: Counter[str]) -> str:
+    """Return a text with the most frequent kind of frames that joint modules do not send.
+
+    Args:
+        other_protocol_frames: Number of frames by what they look like, such as "as CANopen of node 3".
+
+    Returns:
+        A text to be appended to a message; empty if no frame looks like those of a known protocol.
+    """
     kinds: Counter[str] = Counter()
     for looks_as, count in other_protocol_frames.items():
         kinds[looks_as.partition(" of node")[0].removeprefix("as ")] += count
@@ -312,7 +341,7 @@ def looks(other_protocol_frames: Counter[str]) -> str:
 
 def write_dbc(arguments: argparse.Namespace) -> int:
     """Write the DBC file with every message of every node, and return the exit code."""
-    path = arguments.out or Path(EXPANDED)
-    write_text(path, expanded_dbc(), encoding="cp1252")
+    path = arguments.out or Path(EXPANDED_DBC_FILENAME)
+    write_text(path, make_expanded_dbc(), encoding="cp1252")
     print_line(str(path))
     return OK

@@ -22,10 +22,10 @@ class Mounting:
     """How the drives of some joints are mounted, as the robot file describes it."""
 
     def __init__(self, joints: Sequence[Joint]) -> None:
-        """Read the mounting of joints.
+        """Read sign, zero and gear of every joint.
 
         Args:
-            joints: `RobotFile.joint_table`, or those joints that one bus has.
+            joints: All joints of a robot, or those of one bus, from tail to head.
         """
         self.sign: Floats = np.array([float(joint.drive.sign) for joint in joints])
         self.zero_rad: Floats = np.array([joint.drive.zero_rad for joint in joints])
@@ -54,13 +54,13 @@ class Mounting:
         """Convert targets of joints to targets of the drives' shafts.
 
         Args:
-            modes: The mode of every joint.
-            targets: The target of every joint in rad, rad/s or N·m, by its mode.
+            modes: Mode of every joint.
+            targets: Target of every joint in rad, rad/s or N·m, by its mode.
 
         Returns:
-            (n_joints,) in the same units; 0 for passive joints.
+            Targets of the shafts in the same units, (n_joints,); 0 for passive joints.
         """
-        mode_numbers = np.array(modes, dtype=np.intp)
+        mode_numbers = np.array(modes, dtype=np.intp)  # indices into `target_by_mode`
         joint_targets = np.array(targets)
         target_by_mode = (
             np.zeros(len(joint_targets)),
@@ -89,12 +89,12 @@ def to_joint_target(drive: Drive, mode: Mode, target: float) -> float:
     """Convert the target of one drive's shaft to that of its joint.
 
     Args:
-        drive: How the drive is mounted.
-        mode: The mode of the target.
-        target: At the shaft, in rad, rad/s or N·m.
+        drive: Sign, zero and gear of the drive.
+        mode: Mode of the target.
+        target: Target at the shaft in rad, rad/s or N·m, by the mode.
 
     Returns:
-        The target at the joint, in the same unit; 0 if passive.
+        Target at the joint in the same unit; 0 for a passive joint.
     """
     ratio = drive.sign * drive.gear
     match mode:

@@ -38,7 +38,7 @@ import msgspec
 
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.joints import DriveMode
-from snakesim_hal.model.robot import RobotFile, with_modes
+from snakesim_hal.model.robot import RobotFile, restrict_drive_modes
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode, Description, Fault, JointState, LifecycleState, Message, Mode
 
@@ -59,11 +59,13 @@ class SafeSetpoints:
 
 @dataclass(frozen=True)
 class Samples:
-    """Sensor samples of one tick. `others` holds only those that were due: key -> message."""
+    """Sensor samples of one tick. Besides the joint state they contain only samples that were due."""
 
     joints: JointState  # in every tick
-    others: Mapping[str, Message] = field(default_factory=dict[str, Message])  # of the other sensors, by key
-    encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # of `others` (filled in by the host)
+    by_key: Mapping[str, Message] = field(default_factory=dict[str, Message])  # of the other sensors, by key
+    encoded_by_key: Mapping[str, bytes] = field(
+        default_factory=dict[str, bytes]
+    )  # encoded `by_key`, filled in by the host
 
 
 class Backend(ABC):
@@ -111,7 +113,7 @@ class Backend(ABC):
         """
         if cls.supported_modes is None:
             return robot
-        return with_modes(robot, cls.supported_modes)
+        return restrict_drive_modes(robot, cls.supported_modes)
 
     def __init__(self, config: RunConfig, settings: Any) -> None:
         """Open the robot. No motor is switched on. May take seconds or minutes.

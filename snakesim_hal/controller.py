@@ -12,10 +12,10 @@ from typing import Any, ClassVar, Generic, TypeVar
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.files import FileStruct, Table, decode
+from snakesim_hal.model.files import ConfigTable, FileStruct, decode_table
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.plugins import CONTROLLERS, describe_plugin, find_plugin, require_base_class
-from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, find_start_pose
+from snakesim_hal.model.plugins import CONTROLLERS, describe_plugin, load_plugin, require_base_class
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, compute_start_pose
 from snakesim_hal.wire.messages import (
     Description,
     JointState,
@@ -40,7 +40,7 @@ class Task:
     @staticmethod
     def from_config(config: RunConfig) -> "Task":
         """Return the task of a run."""
-        start = find_start_pose(config)
+        start = compute_start_pose(config)
         x, y = start.position_w
         return Task((x, y, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad), config.mission.goal)
 
@@ -131,7 +131,7 @@ class Controller(ABC, Generic[ParametersT]):
                     self.start_rad = observation.joints.angle_rad
                 swing_rad = self.parameters.amplitude_rad * math.sin(observation.time_s)
                 angles_rad = [start_rad + swing_rad for start_rad in self.start_rad]
-                return snakesim.ControllerCommand(snakesim.positions(self.robot, angles_rad))
+                return snakesim.ControllerCommand(snakesim.make_position_setpoints(self.robot, angles_rad))
 
     Run it with `--controller ./swing.py:Swing`, or name the class in an entry point of the group
     `snakesim.controllers`. Every class attribute below is a declaration that a subclass may override. Those that it
@@ -186,11 +186,12 @@ class Controller(ABC, Generic[ParametersT]):
         is constructed for it.
 
         Args:
-            robot: description of the robot.
-            parameters: the parameters as configured. Their types and bounds are checked already.
+            robot: Description of the robot.
+            parameters: The parameters as configured. Their types and bounds are checked already.
 
         Raises:
-            ConfigError: They do not agree. The text names the parameter, its value and what is allowed.
+            ConfigError: The robot and the parameters do not agree. The text names the parameter, its value and what is
+                allowed.
         """
 
     def __init__(self, robot: Description, parameters: ParametersT) -> None:
@@ -200,11 +201,11 @@ class Controller(ABC, Generic[ParametersT]):
         effects: control also constructs an object to test a change of parameters, and drops it again.
 
         Args:
-            robot: description of the robot. Its joints are in the order tail to head.
-            parameters: an object of `Parameters`.
+            robot: Description of the robot. Its joints are in the order tail to head.
+            parameters: An object of `Parameters`.
 
         Raises:
-            ConfigError: the parameters do not fit the robot. At an arming, this ends the run.
+            ConfigError: The parameters do not fit the robot. At an arming, this ends the run.
         """
         self.robot = robot
         self.parameters = parameters
@@ -223,7 +224,7 @@ class Controller(ABC, Generic[ParametersT]):
         field and the value.
 
         Args:
-            observation: the inputs of this tick.
+            observation: The inputs of this tick.
 
         Returns:
             One mode, target (rad, rad/s or N·m, by the mode) and torque limit (N·m) for each joint, tail to head.
@@ -232,24 +233,24 @@ class Controller(ABC, Generic[ParametersT]):
 
 def load_controller(name: str) -> type[Controller[Any]]:
     """Return the class of a controller by its name; a file is loaded, which runs its code. Raises ConfigError."""
-    return require_base_class(find_plugin(CONTROLLERS, name), Controller, f"controller {shorten(name)!r}")
+    return require_base_class(load_plugin(CONTROLLERS, name), Controller, f"controller {shorten(name)!r}")
 
 
 def decode_parameters(
     controller: type[Controller[Any]],
     section: dict[str, Any],
     source: str,
-    where: str,
-    origin: dict[str, str] | None = None,
+    section_key: str,
+    origin_by_key: dict[str, str] | None = None,
 ) -> Any:
-    """Return the parameters of a controller from its section of a configuration or of a request.
+    """Decode and check the parameters of a controller from a section of a configuration or of a request.
 
     Args:
-        controller: the class, whose `Parameters` checks the values.
-        section: the values as read.
-        source: where they come from, for errors.
-        where: dotted key of the section, for errors.
-        origin: file or flag of each dotted key, as far as known.
+        controller: Class of the controller, whose `Parameters` checks the values.
+        section: Values as read.
+        source: File or request that the values come from, for errors.
+        section_key: Dotted key of the section, for errors.
+        origin_by_key: File or flag that sets a dotted key, as far as it is known. None if it is not known for any key.
 
     Returns:
         An object of `controller.Parameters`.
@@ -262,21 +263,21 @@ def decode_parameters(
             f"{describe_plugin(controller)}: `Parameters` is {shorten(repr(controller.Parameters))}, must be a class "
             "that derives from snakesim.Parameters"
         )
-    return decode(Table(section, source, origin or {}), controller.Parameters, where)
+    return decode_table(ConfigTable(section, source, origin_by_key or {}), controller.Parameters, section_key)
 
 
 def is_motion_requested(observation: Observation) -> bool:
-    """Return whether there is a path, a speed along it, and a world to move in; without them a controller holds."""
+    """Return whether world and trajectory are known, and the requested speed is not 0. Otherwise a controller holds."""
     return (
         observation.world is not None and observation.trajectory is not None and observation.trajectory.speed_m_s != 0.0
     )
 
 
-def positions(robot: Description, angles_rad: Sequence[float]) -> RequestedSetpoints:
+def make_position_setpoints(robot: Description, angles_rad: Sequence[float]) -> RequestedSetpoints:
     """Return setpoints that move every joint to an angle in position mode, with its full torque.
 
     Args:
-        robot: description of the robot.
+        robot: Description of the robot.
         angles_rad: (n_joints,) tail to head.
     """
     return RequestedSetpoints(

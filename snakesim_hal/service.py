@@ -16,7 +16,7 @@ from snakesim_hal.base.errors import NotConnectedError, ServiceError, SnakesimEr
 from snakesim_hal.faults.allowed import create_service_faults
 from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.network.client import Client
-from snakesim_hal.network.process_entries import own_entry, show_process
+from snakesim_hal.network.process_entries import make_own_entry, publish_process_entry
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, Message
@@ -93,18 +93,19 @@ class ServiceLoop:
         service_type: type[Service],
         config: RunConfig,
         session: Session,
-        should_continue: Callable[[], bool] = lambda: False,
+        should_retry: Callable[[], bool] = lambda: False,
     ) -> None:
         """Construct the service, and wait for its robot.
 
         Args:
-            service_type: class of the service.
-            config: configuration of the run.
-            session: connection to the network.
-            should_continue: called after each attempt that found no robot; returns whether to try again.
+            service_type: Class of the service.
+            config: Configuration of the run.
+            session: Connection to the network.
+            should_retry: Function that is called after each attempt that found no robot. It returns whether to try
+                again.
 
         Raises:
-            NotConnectedError: There is no robot.
+            NotConnectedError: The robot is not found.
             ServiceError: The service raised an error. The error names the service.
         """
         name = service_type.name
@@ -114,107 +115,124 @@ class ServiceLoop:
         self._label = f"service {schedule.plugin or name} (class {service_type.__name__})"
         self._module = service_type.__module__
 
-        # The service, which subscribes in its constructor, before the robot is there.
+        # The service, which subscribes in its constructor, before the robot is known.
         client = Client(session, name, decimation=schedule.decimation, clock_mode=config.clock_mode)
         self._client = client
-        with self._errors_named("__init__"):
+        with self._name_service_in_errors("__init__"):
             self.service = service_type(client, config)
-        robot = _wait_for_robot(client, should_continue)
-        with self._errors_named("configure"):
+        robot = _wait_for_robot(client, should_retry)
+        with self._name_service_in_errors("configure"):
             self.service.configure(robot)
         self._faults = create_service_faults(name, config, session, robot, lambda: client.newest_clock)
-        self._due_ticks = client.ticks(0.0, pauses=True)
+        self._due_ticks = client.iterate_ticks(0.0, include_paused=True)
 
         # What other processes see of it.
         self._session = session
-        self._entry = own_entry(name, config)
+        self._entry = make_own_entry(name, config)
 
-    def join(self) -> None:
+    def connect(self) -> None:
         """Announce the service. From now on the robot may be armed, perhaps before the first tick arrives here."""
         clock = self._client.wait_for_clock(SILENCE_S)
         if clock is not None:
             self._faults.update(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
-        self._shown = show_process(self._session, self._entry)
+        self._entry_publisher = publish_process_entry(self._session, self._entry)
         self._client.announce()
 
-    def run(self, over: Callable[[], bool] = lambda: False) -> None:
-        """Act on every tick, for as long as this process lives, or until `over` returns True."""
-        for clock in self._client.ticks(SILENCE_S, pauses=True):
-            if over():
+    def run(self, should_stop: Callable[[], bool] = lambda: False) -> None:
+        """Process every clock as long as this process lives, or until a function returns True.
+
+        Args:
+            should_stop: Function that is called at each clock, and after each second without a clock.
+        """
+        for clock in self._client.iterate_ticks(SILENCE_S, include_paused=True):
+            if should_stop():
                 return
             if clock is None:
-                self._act_on_silence()
+                self._process_silence()
             else:
-                self._act(clock)
+                self._process_clock(clock)
 
-    def act(self) -> None:
-        """Act on the ticks that are due now, and return."""
+    def step(self) -> None:
+        """Process the clocks that have arrived, and return."""
         while (clock := next(self._due_ticks)) is not None:
-            self._act(clock)
+            self._process_clock(clock)
 
     def close(self) -> None:
         """Drop the messages that injected faults still delay."""
         self._faults.close()
 
-    def _act_on_silence(self) -> None:
+    def _process_silence(self) -> None:
+        """Answer requests for faults, and publish what the service publishes without a clock."""
         self._faults.answer_requests()
-        with self._errors_named("silence"):
+        with self._name_service_in_errors("silence"):
             for key, message in self.service.silence():
                 self._client.publish(key, message)
 
-    def _act(self, clock: Clock) -> None:
-        """Let the service act on a clock: publish its outputs for the tick, and report the tick done.
+    def _process_clock(self, clock: Clock) -> None:
+        """Compute and publish the outputs of the service for a tick, and report the tick as done.
 
-        Until the robot is armed, the host sends the same tick again and again, and each time it is answered again. A
-        paused clock is no tick, and has no outputs.
+        Until the robot is armed, the host repeats the same tick, and each repetition is answered. A paused clock is not
+        a tick, and has no outputs.
 
         Args:
-            clock: clock of a tick that is due, or of a paused simulator.
+            clock: Clock of a tick that is due, or of a paused simulator.
         """
         if clock.paused:
             self._faults.answer_requests()
-            with self._errors_named("pause"):
+            with self._name_service_in_errors("pause"):
                 self.service.pause(clock)
             return
         self._faults.update(clock.timestamp_ns, clock.arm_session, clock.lifecycle)
-        robot = self._client.new_description()
+        robot = self._client.fetch_changed_description()
         if robot is not None:
-            with self._errors_named("configure"):
+            with self._name_service_in_errors("configure"):
                 self.service.configure(robot)
-        with self._errors_named("outputs"):
+        with self._name_service_in_errors("outputs"):
             outputs = self.service.outputs(clock)
             if clock.lifecycle != "armed":
-                outputs = self._outputs_before_arming(outputs)
+                outputs = self._filter_outputs_before_arming(outputs)
             if outputs is None:
                 return
             for key, message in outputs:
                 self._client.publish(key, message)
         self._client.report_done(clock.tick)
 
-    def _outputs_before_arming(self, outputs: list[tuple[str, Message]] | None) -> list[tuple[str, Message]] | None:
-        """Return the outputs that count before the robot is armed, and show what the service waits for.
+    def _filter_outputs_before_arming(
+        self, outputs: list[tuple[str, Message]] | None
+    ) -> list[tuple[str, Message]] | None:
+        """Return the outputs to publish before the robot is armed, and publish the keys that the service waits for.
 
-        A service without joint states has no output, even if it can do without them: they come in every tick, and once
-        the robot is armed it would be too late to find out that they do not arrive.
+        Without joint states a service has no output, even if it does not need them. They are published in every tick,
+        and after the arming it would be too late to detect that they do not arrive.
+
+        Args:
+            outputs: Outputs of the service. None if it has no output yet.
+
+        Returns:
+            The same outputs, or None if joint states are missing.
         """
-        missing = self._client.missing
+        missing = self._client.missing_keys
         if keys.JOINTS in missing:
             outputs = None
         if outputs is None:
-            self._show_waiting(sorted(missing)[:MAX_SHOWN_KEYS])
+            self._publish_awaited_keys(sorted(missing)[:MAX_SHOWN_KEYS])
         else:
-            self._show_waiting([])
+            self._publish_awaited_keys([])
         return outputs
 
-    def _show_waiting(self, missing: list[str]) -> None:
+    def _publish_awaited_keys(self, missing: list[str]) -> None:
         """Publish the keys that this service waits for, so that the host can name them."""
         if missing != self._entry.waits_for:
             self._entry = msgspec.structs.replace(self._entry, waits_for=missing)
-            self._shown.put(self._entry)
+            self._entry_publisher.put(self._entry)
 
     @contextlib.contextmanager
-    def _errors_named(self, method: str) -> Iterator[None]:
-        """Turn exceptions of a method into errors that name the service, which may be third-party code."""
+    def _name_service_in_errors(self, method: str) -> Iterator[None]:
+        """Convert exceptions of a method of the service into errors that name the service and the method.
+
+        Args:
+            method: Name of the method, which may be third-party code.
+        """
         try:
             yield
         except WireError as error:
@@ -226,11 +244,15 @@ class ServiceLoop:
             raise ServiceError(f"{self._label}: {method}() {describe_exception(error, self._module)}") from error
 
 
-def _wait_for_robot(client: Client, should_continue: Callable[[], bool]) -> Description:
-    """Return the description of the robot. Raises NotConnectedError if `should_continue` returns False before."""
+def _wait_for_robot(client: Client, should_retry: Callable[[], bool]) -> Description:
+    """Wait for the description of the robot, and return it.
+
+    Raises:
+        NotConnectedError: The robot is not found, and `should_retry` returns False.
+    """
     while True:
         try:
-            return client.description(CONNECT_ATTEMPT_S)
+            return client.wait_for_description(CONNECT_ATTEMPT_S)
         except NotConnectedError:
-            if not should_continue():
+            if not should_retry():
                 raise

@@ -11,10 +11,10 @@ Python version where no library can be loaded, for example because the computer 
 
 To add a C file, put it into the folder of a library. To add a library, make a folder and add it to `LIBRARIES`. Then:
 
-    from snakesim_native.libraries import LAWS
-    from snakesim_native.load import load
+    from snakesim_native.libraries import LAWS_LIBRARY
+    from snakesim_native.load import load_shared_library
 
-    handle = load(LAWS).handle  # a ctypes.CDLL, or None: use the Python version
+    library = load_shared_library(LAWS_LIBRARY).library  # a ctypes.CDLL; None: use the Python version
 
 This package imports nothing of SnakeSIM.
 """

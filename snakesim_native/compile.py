@@ -47,22 +47,22 @@ class Target:
     libc: str  # "gnu" or "musl", as zig names it; "gnu.2.28" needs no newer version
 
     @property
-    def zig_name(self) -> str:
+    def zig_target_name(self) -> str:
         """Return the target's name for zig, such as "x86_64-linux-gnu"."""
         return f"{self.machine}-linux-{self.libc}"
 
 
-def find_this_target() -> Target:
+def get_this_target() -> Target:
     """Return the target for this computer's Python."""
     host = sysconfig.get_config_var("HOST_GNU_TYPE") or ""
     return Target(platform.machine(), "musl" if "musl" in host else "gnu")
 
 
 def list_compilers(target: Target | None = None) -> list[list[str]]:
-    """Return the commands of the C compilers of this computer, the first choice first.
+    """Return the commands of the C compilers that are installed on this computer, the first choice first.
 
     Args:
-        target: what to compile for; only zig compiles for other computers. None: this computer.
+        target: Computer to compile for; None for this computer. Only zig compiles for other computers.
     """
     commands: list[list[str]] = []
     if target is None:
@@ -70,9 +70,11 @@ def list_compilers(target: Target | None = None) -> list[list[str]]:
             return [shlex.split(os.environ["CC"])]
         commands += [[name] for name in COMPILERS if shutil.which(name)]
     if importlib.util.find_spec("ziglang") is not None:
-        zig_target = target or find_this_target()
+        zig_target = target or get_this_target()
         # Without a target, zig would use all instructions of this computer's processor.
-        commands.append([sys.executable, "-m", "ziglang", "cc", "-target", zig_target.zig_name, "-mcpu=baseline"])
+        commands.append(
+            [sys.executable, "-m", "ziglang", "cc", "-target", zig_target.zig_target_name, "-mcpu=baseline"]
+        )
     return commands
 
 
@@ -82,16 +84,16 @@ def compile_library(
     """Compile a library into a folder, and remove older builds of it from there.
 
     Args:
-        library: the library.
-        folder: where to write it.
-        target: what to compile for; None: this computer.
-        extra_flags: further options of the compiler.
+        library: The library.
+        folder: Folder in which the compiled library is written.
+        target: Computer to compile for; None for this computer.
+        extra_flags: Further options of the compiler.
 
     Returns:
         The compiled file.
 
     Raises:
-        CannotCompileError: there is no compiler, no MuJoCo, or no compiler accepts the sources.
+        CannotCompileError: There is no compiler, no MuJoCo, or no compiler accepts the sources.
     """
     mujoco = find_mujoco()
     if library.uses_mujoco and mujoco is None:
@@ -99,7 +101,7 @@ def compile_library(
     compilers = list_compilers(target)
     if not compilers:
         raise CannotCompileError(NO_COMPILER)
-    machine = (target or find_this_target()).machine
+    machine = (target or get_this_target()).machine
     key = compute_build_key(library, mujoco.version if mujoco else "")
     file = folder / make_file_name(library, key, machine)
     problems: list[str] = []
@@ -122,19 +124,31 @@ def _run_compiler(
     *,
     is_foreign: bool,
 ) -> str:
-    """Compile a library. Returns what is wrong; empty: nothing."""
-    words = [*command, *FLAGS, f'-DSNAKESIM_BUILD_KEY="{key}"']
-    words += [str(source) for source in library.list_sources()]
+    """Compile a library with one compiler, and move it to its place when it is complete.
+
+    Args:
+        command: Command of the compiler with its options.
+        library: The library to compile.
+        key: Build key of the library, which is compiled into it.
+        mujoco: Files of the installed MuJoCo; None if it is not installed.
+        file: Path of the compiled library.
+        is_foreign: Whether the library is compiled for another computer than this one.
+
+    Returns:
+        What went wrong; an empty text if the library was compiled.
+    """
+    arguments = [*command, *FLAGS, f'-DSNAKESIM_BUILD_KEY="{key}"']
+    arguments += [str(source) for source in library.list_sources()]
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=file.parent, prefix=".") as temporary:
             if library.uses_mujoco and mujoco is not None:
-                linked = mujoco.library
+                mujoco_library = mujoco.library
                 if is_foreign:
-                    linked = _make_placeholder(command, mujoco, Path(temporary))
-                words += ["-isystem", str(mujoco.include_folder), "-Wl,--no-as-needed", str(linked)]
+                    mujoco_library = _make_placeholder_library(command, mujoco, Path(temporary))
+                arguments += ["-isystem", str(mujoco.include_folder), "-Wl,--no-as-needed", str(mujoco_library)]
             compiled = Path(temporary, file.name)
-            problem = _call([*words, "-lm", "-o", str(compiled)])
+            problem = _run_and_get_error([*arguments, "-lm", "-o", str(compiled)])
             if not problem:
                 compiled.replace(file)
             return problem
@@ -142,7 +156,7 @@ def _run_compiler(
         return str(error)
 
 
-def _make_placeholder(command: list[str], mujoco: MujocoFiles, folder: Path) -> Path:
+def _make_placeholder_library(command: list[str], mujoco: MujocoFiles, folder: Path) -> Path:
     """Compile an empty library with the name of MuJoCo's, and return its file.
 
     The MuJoCo that is installed here was made for this computer. To link for another one, its name is enough.
@@ -150,26 +164,26 @@ def _make_placeholder(command: list[str], mujoco: MujocoFiles, folder: Path) -> 
     source = folder / "empty.c"
     source.write_text("")
     file = folder / mujoco.library.name
-    problem = _call([*command, "-shared", f"-Wl,-soname,{file.name}", str(source), "-o", str(file)])
+    problem = _run_and_get_error([*command, "-shared", f"-Wl,-soname,{file.name}", str(source), "-o", str(file)])
     if problem:
         raise OSError(problem)
     return file
 
 
-def _call(words: list[str]) -> str:
-    """Run a compiler. Returns the first error that it prints; empty: it succeeded."""
+def _run_and_get_error(arguments: list[str]) -> str:
+    """Run a compiler command, and return the first error that it prints; an empty text if it succeeded."""
     try:
-        finished = subprocess.run(
-            words, capture_output=True, text=True, errors="replace", check=False, timeout=COMPILE_TIMEOUT_S
+        completed = subprocess.run(
+            arguments, capture_output=True, text=True, errors="replace", check=False, timeout=COMPILE_TIMEOUT_S
         )
     except subprocess.TimeoutExpired as error:
         return str(error)
-    if finished.returncode == 0:
+    if completed.returncode == 0:
         return ""
-    return _pick_error(finished.stderr) or f"exit code {finished.returncode}"
+    return _find_first_error(completed.stderr) or f"exit code {completed.returncode}"
 
 
-def _pick_error(printed: str) -> str:
+def _find_first_error(printed: str) -> str:
     """Return the first error that a compiler printed, in one line."""
     lines = [line.strip() for line in printed.splitlines() if line.strip()]
     errors = [line for line in lines if "error" in line]
@@ -184,8 +198,15 @@ def _remove_older_builds(library: NativeLibrary, machine: str, newest: Path) -> 
 
 
 def compile_all(folder: Path) -> list[str]:
-    """Compile the libraries whose sources have changed. Returns a sentence for each that cannot be compiled here."""
-    sentences: list[str] = []
+    """Compile the libraries whose sources have changed.
+
+    Args:
+        folder: Folder in which the compiled libraries are written.
+
+    Returns:
+        A sentence for each library that cannot be compiled here, with the reason and the consequence.
+    """
+    warnings: list[str] = []
     mujoco = find_mujoco()
     for library in LIBRARIES:
         key = compute_build_key(library, mujoco.version if mujoco else "")
@@ -194,14 +215,14 @@ def compile_all(folder: Path) -> list[str]:
         try:
             compile_library(library, folder)
         except CannotCompileError as error:
-            sentences.append(f"without the C library `{library.name}` {library.python_cost}: {error}")
-    return sentences
+            warnings.append(f"without the C library `{library.name}` {library.python_cost}: {error}")
+    return warnings
 
 
 def main() -> int:
-    """Compile all libraries into this package. Returns the exit code: 0 also without a compiler."""
-    for sentence in compile_all(SHIPPED_FOLDER):
-        print(f"setup: {sentence}")
+    """Compile all libraries into this package, and return the exit code, which is 0 even without a compiler."""
+    for warning in compile_all(SHIPPED_FOLDER):
+        print(f"setup: {warning}")
     return 0
 
 

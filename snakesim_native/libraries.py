@@ -36,17 +36,17 @@ class NativeLibrary:
         return sorted(self.folder.glob("*.h"))
 
 
-LAWS = NativeLibrary(
+LAWS_LIBRARY = NativeLibrary(
     name="laws",
     uses_mujoco=True,
     python_cost="a physics step takes about three times as long",
 )
-PLANNER = NativeLibrary(
+PLANNER_LIBRARY = NativeLibrary(
     name="planner",
     uses_mujoco=False,
     python_cost="a search of the path planner takes about seven times as long",
 )
-LIBRARIES = (LAWS, PLANNER)
+LIBRARIES = (LAWS_LIBRARY, PLANNER_LIBRARY)
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ def make_file_name(library: NativeLibrary, key: str, machine: str = "") -> str:
     """Return the file name of a compiled library. Files of other sources, versions or processors have other names.
 
     Args:
-        library: the library.
-        key: its build key.
-        machine: the processor as `uname -m` prints it; empty: this computer's.
+        library: The library.
+        key: Build key of the library.
+        machine: Processor architecture as `uname -m` prints it; empty for that of this computer.
     """
     return f"{library.name}-{machine or platform.machine()}-{key}.so"

@@ -5,8 +5,8 @@ import os
 import sys
 
 
-def _leave_out_working_folder() -> None:
-    """Keep files in the working folder from replacing the modules that are imported below."""
+def _remove_working_folder_from_search_path() -> None:
+    """Remove the working folder from the module search path, so that its files replace no module imported below."""
     if __name__ == "__main__" and not sys.flags.safe_path:
         del sys.path[0]  # `python -m` has put that folder there
     search_path = os.environ.get("PYTHONPATH", "")
@@ -18,13 +18,13 @@ def _leave_out_working_folder() -> None:
         sys.path.sort(key=folder.__eq__)  # to the end: Python looks there last
 
 
-_leave_out_working_folder()
+_remove_working_folder_from_search_path()
 
 import resource  # noqa: E402
 import signal  # noqa: E402
 
-from snakesim_hal.base.arithmetic import pin  # noqa: E402
-from snakesim_hal.base.process import protect_children  # noqa: E402
+from snakesim_hal.base.arithmetic import pin_common_arithmetic  # noqa: E402
+from snakesim_hal.base.process import isolate_children_from_working_folder  # noqa: E402
 from snakesim_hal.base.terminal import print_stderr  # noqa: E402
 
 
@@ -38,8 +38,8 @@ def main() -> int:
     _open_closed_streams()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    protect_children()
-    pin(one_thread=True)  # before NumPy is imported
+    isolate_children_from_working_folder()
+    pin_common_arithmetic(one_thread=True)  # before NumPy is imported
     try:
         from snakesim_operator.cli import main as command
 

@@ -1,8 +1,9 @@
 """The `snakesim` command: its parser, made of the commands that all packages register.
 
 Each package lists its commands as `snakesim_hal.programs.commands` describes. This package names its most important
-lists in `BUILT_IN`; all others are found by entry points in the group `snakesim.commands`. Entry points are looked up
-only for the help, completion, and a command that is not built in: an emergency stop does not wait for them.
+lists in `BUILT_IN_COMMANDS`; all others are found by entry points in the group `snakesim.commands`. Entry points are
+looked up only for the help, for completion, and for a command that is not built in: an emergency stop does not wait
+for them.
 """
 
 import argparse
@@ -30,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command of `snakesim`, and report its errors on stderr.
 
     Args:
-        argv: the arguments; None for those of this process, which runs nothing but this command then.
+        argv: Arguments of the command. If None, the arguments of this process are used, and the command may change the
+            state of the process, such as its signal handlers.
 
     Returns:
         The exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 3 an incomplete record, 130 interrupted.
@@ -39,9 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return run_tool("snakesim", lambda: _run_command(words, owns_process=argv is None), as_json="--json" in words)
     except ModuleNotFoundError as error:
-        from snakesim_operator.base.extras import explained
+        from snakesim_operator.base.extras import explain_missing_package
 
-        explanation = explained(error)
+        explanation = explain_missing_package(error)
         if explanation is None:
             raise
         report_error(explanation, "snakesim")
@@ -63,23 +65,34 @@ def _report_os_error(error: OSError) -> int:
 
 
 def _run_command(words: list[str], *, owns_process: bool) -> int:
-    """Find the command, parse its arguments and run it. Raises ConfigError for wrong input."""
+    """Find the command that some words name, parse its arguments and run it.
+
+    Args:
+        words: Words of the command line, without the name of the program.
+        owns_process: Whether this process runs nothing but this command.
+
+    Returns:
+        The exit code of the command.
+
+    Raises:
+        ConfigError: There is no such command, or its arguments are wrong.
+    """
     if not words:
         make_parser().print_help()
         return OK
-    _refuse_empty_words(words)
+    _reject_empty_words(words)
     parser = MainParser()
     if not parser.has_command(words):
-        parser.add_installed()
-        _refuse_unknown_command(words[0], parser)
+        parser.add_installed_commands()
+        _reject_unknown_command(words[0], parser)
     arguments, unknown = parser.parse_known_args(words)
     if unknown:
-        _refuse_unknown_word(unknown[0], parser.find_parser(words))
+        _reject_unknown_argument(unknown[0], parser.find_parser(words))
     arguments.owns_process = owns_process
-    return arguments.act(arguments)
+    return arguments.act(arguments)  # `act` is the command's function, which `_add_command` has set
 
 
-def _refuse_empty_words(words: list[str]) -> None:
+def _reject_empty_words(words: list[str]) -> None:
     """Raise ConfigError for an empty word, or an option without its value, as of a shell variable that is not set."""
     for previous, word in zip(["", *words], words, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):
@@ -87,9 +100,9 @@ def _refuse_empty_words(words: list[str]) -> None:
             raise ConfigError(f"{option}: empty; give a value, or leave it out", code="command/invalid-option")
 
 
-def _refuse_unknown_command(name: str, parser: "MainParser") -> None:
+def _reject_unknown_command(name: str, parser: "MainParser") -> None:
     """Raise ConfigError if the first word is no command."""
-    names = list(parser.commands.choices)
+    names = list(parser.subparsers.choices)
     if name.startswith("-") or name in names:
         return
     raise ConfigError(
@@ -98,18 +111,18 @@ def _refuse_unknown_command(name: str, parser: "MainParser") -> None:
     )
 
 
-def _refuse_unknown_word(word: str, parser: argparse.ArgumentParser) -> NoReturn:
+def _reject_unknown_argument(argument: str, parser: argparse.ArgumentParser) -> NoReturn:
     """Raise ConfigError for an argument that the command does not have."""
     options = [option for action in parser._actions for option in action.option_strings]
-    hint = suggest_word(word.partition("=")[0], options) if word.startswith("-") else ""
+    hint = suggest_word(argument.partition("=")[0], options) if argument.startswith("-") else ""
     command = parser.prog.removeprefix("snakesim ")
     raise ConfigError(
-        f"{command}: unknown argument {shorten(word)!r}; {hint}see `{parser.prog} --help`",
+        f"{command}: unknown argument {shorten(argument)!r}; {hint}see `{parser.prog} --help`",
         code="command/unknown-argument",
     )
 
 
-class HelpFormatter(argparse.HelpFormatter):
+class CommandHelpFormatter(argparse.HelpFormatter):
     """Wraps each line of a description or an epilog by itself; an indented line stays as it is."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
@@ -137,36 +150,43 @@ class MainParser(CommandParser):
     """The parser of all commands. Its help lists the commands by heading."""
 
     def __init__(self) -> None:
-        """Add the commands that are built in."""
+        """Create the parser with the built-in commands."""
         super().__init__(
             prog="snakesim",
             description="Snake robots that push themselves off obstacles: one controller, simulator or robot.",
             epilog="`snakesim COMMAND --help` explains a command. Begin with: snakesim run triplet --console",
         )
-        self.add_argument("--version", action=_Version, nargs=0, help="print the version")
-        self.commands: Any = self.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
-        self._nouns: dict[str, Any] = {"": self.commands}  # the commands below each noun
-        self._headings: dict[str, list[argparse.Action]] = {heading: [] for heading in HEADINGS}
-        for registered in BUILT_IN:
-            self._add_all(registered)
+        self.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version")
+        self.subparsers: Any = self.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
+        self._subparsers_by_noun: dict[str, Any] = {"": self.subparsers}  # the commands below each noun
+        self._actions_by_heading: dict[str, list[argparse.Action]] = {heading: [] for heading in HEADINGS}
+        for registered in BUILT_IN_COMMANDS:
+            self._add_commands(registered)
 
-    def add_installed(self) -> None:
+    def add_installed_commands(self) -> None:
         """Add the commands of entry points. A package that cannot be loaded is reported, and the others are added."""
-        from snakesim_hal.model.plugins import COMMANDS, find_plugin, list_installed
+        from snakesim_hal.model.plugins import COMMANDS, list_installed_plugins, load_plugin
 
-        for name in list_installed(COMMANDS):
+        for name in list_installed_plugins(COMMANDS):
             try:
-                self._add_all(find_plugin(COMMANDS, name))
+                self._add_commands(load_plugin(COMMANDS, name))
             except ConfigError as error:
                 report_error(error, "snakesim")
 
-    def _add_all(self, registered: Commands) -> None:
-        """Add nouns and commands. Those that are there already stay as they are. Raises ConfigError."""
+    def _add_commands(self, registered: Commands) -> None:
+        """Add nouns and commands to the parser. Those that have been added before stay as they are.
+
+        Args:
+            registered: Nouns and commands, each noun before its commands.
+
+        Raises:
+            ConfigError: The noun of a command is missing.
+        """
         for entry in registered:
             noun, _, word = entry.name.rpartition(" ")
-            if noun not in self._nouns:
+            if noun not in self._subparsers_by_noun:
                 raise ConfigError(f"command {entry.name!r} cannot be added: no Noun {noun!r} is registered before it")
-            siblings = self._nouns[noun]
+            siblings = self._subparsers_by_noun[noun]
             if word in siblings.choices:
                 continue
             if isinstance(entry, Noun):
@@ -174,34 +194,36 @@ class MainParser(CommandParser):
             else:
                 _add_command(entry, siblings, word)
             if not noun:
-                self._headings.setdefault(entry.heading, []).append(siblings._choices_actions[-1])
+                self._actions_by_heading.setdefault(entry.heading, []).append(siblings._choices_actions[-1])
 
     def _add_noun(self, noun: Noun, siblings: Any, word: str) -> None:
-        parser = siblings.add_parser(word, help=_begin_small(noun.help), description=noun.help)
+        parser = siblings.add_parser(word, help=_format_list_entry(noun.help), description=noun.help)
         parser.epilog = f"`{parser.prog} COMMAND --help` explains a command."
-        self._nouns[noun.name] = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
+        self._subparsers_by_noun[noun.name] = parser.add_subparsers(
+            required=True, metavar="COMMAND", parser_class=CommandParser
+        )
 
-    def commands_by_heading(self) -> list[tuple[str, list[argparse.Action]]]:
+    def list_commands_by_heading(self) -> list[tuple[str, list[argparse.Action]]]:
         """Return the headings of the help, each with its nouns and commands."""
-        return [(heading, actions) for heading, actions in self._headings.items() if actions]
+        return [(heading, actions) for heading, actions in self._actions_by_heading.items() if actions]
 
     def has_command(self, words: Sequence[str]) -> bool:
         """Return whether the words begin with a command that has been added, not only with a noun."""
         noun = ""
         for word in words:
             path = f"{noun} {word}".strip()
-            if path not in self._nouns:
-                return word in self._nouns[noun].choices
+            if path not in self._subparsers_by_noun:
+                return word in self._subparsers_by_noun[noun].choices
             noun = path
         return False
 
     def find_parser(self, words: Sequence[str]) -> argparse.ArgumentParser:
-        """Return the parser of the command, or of the noun, that the words begin with."""
+        """Return the parser of the command or noun with which the words begin; this parser if there is none."""
         parser: argparse.ArgumentParser = self
         for word in words:
-            below = find_subparsers(parser)
-            if word in below:
-                parser = below[word]
+            subparsers = find_subparsers(parser)
+            if word in subparsers:
+                parser = subparsers[word]
         return parser
 
     def format_help(self) -> str:
@@ -209,7 +231,7 @@ class MainParser(CommandParser):
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
-        for heading, actions in self.commands_by_heading():
+        for heading, actions in self.list_commands_by_heading():
             formatter.start_section(heading)
             formatter.add_arguments(actions)
             formatter.end_section()
@@ -221,37 +243,40 @@ def _add_command(command: Command, siblings: Any, word: str) -> None:
     """Add the parser of a command."""
     parser = siblings.add_parser(
         word,
-        help=_begin_small(command.help),
+        help=_format_list_entry(command.help),
         description=command.help,
-        epilog=_describe_examples(command),
-        formatter_class=HelpFormatter,
+        epilog=_format_epilog(command),
+        formatter_class=CommandHelpFormatter,
     )
     command.add(parser)
     parser.set_defaults(act=command.run)
 
 
-def _begin_small(sentence: str) -> str:
-    """Return a sentence as an entry of a list: it begins with a small letter, and has no full stop."""
+def _format_list_entry(sentence: str) -> str:
+    """Return a sentence as an entry of a list: with a small first letter, and without a full stop.
+
+    A first word in capitals, such as an abbreviation, stays as it is.
+    """
     first_word = sentence.partition(" ")[0]
     text = sentence.removesuffix(".")
     return text if first_word.isupper() else text[0].lower() + text[1:]
 
 
-def _describe_examples(command: Command) -> str:
-    """Return what stands below the options: details, and the examples, one a line."""
+def _format_epilog(command: Command) -> str:
+    """Return the text below the options in the help of a command: details, and the examples, one a line."""
     lines = [command.details, ""] if command.details else []
     return "\n".join([*lines, "examples:", *(f"  snakesim {example}" for example in command.examples)])
 
 
 def find_subparsers(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
-    """Return the parsers below a parser, by name; none below a command."""
+    """Return the parsers of a parser's subcommands by name; empty for a command without subcommands."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             return action.choices
     return {}
 
 
-class _Version(argparse.Action):
+class _PrintVersion(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
 
@@ -262,7 +287,7 @@ class _Version(argparse.Action):
 def make_parser() -> MainParser:
     """Return the parser of all commands, with those of entry points."""
     parser = MainParser()
-    parser.add_installed()
+    parser.add_installed_commands()
     return parser
 
 
@@ -270,10 +295,10 @@ def _add_completion(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shell", choices=["bash", "zsh"], help="shell that reads the script")
 
 
-def _completion(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.this_computer.completion import write_completion
+def _print_completion_script(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.this_computer.completion import generate_completion_script
 
-    for line in write_completion(make_parser(), arguments.shell):
+    for line in generate_completion_script(make_parser(), arguments.shell):
         print_line(line)
     return OK
 
@@ -283,11 +308,11 @@ COMPLETION = Command(
     heading="files and computers",
     help="Print a script for tab completion.",
     add=_add_completion,
-    run=_completion,
+    run=_print_completion_script,
     details="Add to ~/.bashrc: source <(snakesim completion bash)",
     examples=("completion bash", "completion zsh"),
 )
-BUILT_IN: tuple[Commands, ...] = (
+BUILT_IN_COMMANDS: tuple[Commands, ...] = (
     run.COMMANDS,
     playback.COMMANDS,
     watching.COMMANDS,

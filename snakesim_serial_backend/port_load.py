@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_serial_backend.wire import BITS_A_BYTE, USB_LATENCY_S
+from snakesim_serial_backend.wire import BITS_PER_BYTE, USB_LATENCY_S
 
 MAX_LOAD = 0.8  # of a period
 REQUESTS = 2  # in a cycle that are answered; each waits once for the adapter
@@ -15,7 +15,7 @@ class PortLoad:
     """Bytes, time and rate of a cycle on a port, by one protocol."""
 
     rates: Sequence[int]  # possible baud rates in bit/s
-    cycle_bytes: Callable[[int], int]  # on the wire, in both directions, from the number of servos
+    count_cycle_bytes: Callable[[int], int]  # on the wire, in both directions, from the number of servos
     cycle: str  # the requests of a cycle, in words
 
     @property
@@ -28,9 +28,9 @@ class PortLoad:
 
     def cycle_s(self, servos: int, baud: int) -> float:
         """Return how long a port is busy, or waits, in a cycle."""
-        return self.cycle_bytes(servos) * BITS_A_BYTE / baud + REQUESTS * USB_LATENCY_S
+        return self.count_cycle_bytes(servos) * BITS_PER_BYTE / baud + REQUESTS * USB_LATENCY_S
 
-    def fits_hz(self, servos: int, baud: int) -> int:
+    def compute_max_rate_hz(self, servos: int, baud: int) -> int:
         """Return the fastest possible control rate, in whole Hz."""
         return int(MAX_LOAD / self.cycle_s(servos, baud))
 
@@ -38,20 +38,20 @@ class PortLoad:
         """Check that a port can carry its servos.
 
         Args:
-            servos: their number on the port.
-            rate_hz: rate of the control cycle.
-            baud: of the port, in bit/s.
-            section: where its settings are in the scenario.
+            servos: Number of servos on the port.
+            rate_hz: Rate of the control cycle.
+            baud: Baud rate of the port in bit/s.
+            section: Dotted name of the settings section, used in error messages.
 
         Raises:
-            ConfigError: a cycle takes too much of a period.
+            ConfigError: A cycle takes more than `MAX_LOAD` of a control period.
         """
         busy_s = self.cycle_s(servos, baud)
         if busy_s * rate_hz > MAX_LOAD:
             raise ConfigError(
-                f"{servos} servos at {rate_hz:g} Hz: a cycle of {self.cycle_bytes(servos)} bytes takes "
+                f"{servos} servos at {rate_hz:g} Hz: a cycle of {self.count_cycle_bytes(servos)} bytes takes "
                 f"{busy_s * 1e3:.1f} ms at {baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
-                f"most {MAX_LOAD:.0%}: use rate_hz = {self.fits_hz(servos, baud)}, a higher `{section}.baud`, or more "
-                f"`{section}.ports`",
+                f"most {MAX_LOAD:.0%}: use rate_hz = {self.compute_max_rate_hz(servos, baud)}, a higher "
+                f"`{section}.baud`, or more `{section}.ports`",
                 code="bus/overloaded",
             )

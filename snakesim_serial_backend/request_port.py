@@ -15,12 +15,12 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 from snakesim_serial_backend.wire import SerialWire
 
 CHUNK_BYTES = 64  # that an adapter passes on at once
-PATIENT_GAP_S = 0.25  # silence that ends the wait for an answer before the control cycle runs
+EXTENDED_GAP_S = 0.25  # silence that ends the wait for an answer before the control cycle runs
 SECOND_ANSWER_GAP_S = 0.02  # silence that ends the wait for a second answer: a return delay is 0.5 ms at most
 IDLE_S = 0.05  # silence after which the line is idle
 MAX_DRAIN_S = 1.0  # for a line that never becomes idle
 ATTEMPTS = 3  # to read or write registers before the control cycle runs
-LATE_S = 2.0  # after which an answer does not arrive any more
+MAX_RESPONSE_DELAY_S = 2.0  # after which an answer does not arrive any more
 
 
 class Status(Protocol):
@@ -50,7 +50,7 @@ class StatusDecoder(Protocol[StatusT_co]):
         ...
 
     def feed_statuses(self, data: bytes) -> Iterator[StatusT_co]:
-        """Take in bytes, and yield the statuses that are complete now."""
+        """Add received bytes, and yield the statuses that are complete now."""
         ...
 
 
@@ -58,7 +58,9 @@ class Answers(NamedTuple, Generic[StatusT]):
     """Everything that arrived after one request to one servo."""
 
     statuses: list[StatusT]  # of that servo: answers to this request
-    surplus: int  # answers of that servo to which no request belongs: two servos have its id, one answers after another
+    surplus_count: (
+        int  # answers of that servo to which no request belongs: two servos have its id, one answers after another
+    )
     garbled: bool  # bytes arrived that are no packet: two servos answer at the same time, or the line is disturbed
 
 
@@ -66,16 +68,18 @@ class RequestPort(ABC, Generic[StatusT]):
     """Sends one request after another, because the bus is half duplex. A protocol derives its port from it.
 
     Attributes:
-        wire: the serial port.
+        wire: The serial port.
     """
 
-    def __init__(self, wire: SerialWire, gap_s: float) -> None:
+    def __init__(self, wire: SerialWire, response_gap_s: float) -> None:
         """gap_s: silence that ends an answer, besides the time that bytes and adapter take."""
         self.wire = wire
-        self._gap_s = gap_s
-        self._second_gap_s = gap_s
+        self._response_gap_s = response_gap_s
+        self._next_response_gap_s = response_gap_s
         self._received = bytearray()  # since the newest request
-        self._unanswered_s: dict[int, deque[float]] = defaultdict(deque)  # when each servo was asked, the oldest first
+        self._pending_request_times_s: dict[int, deque[float]] = defaultdict(
+            deque
+        )  # when each servo was asked, the oldest first
 
     @abstractmethod
     def _make_decoder(self) -> StatusDecoder[StatusT]:
@@ -102,10 +106,10 @@ class RequestPort(ABC, Generic[StatusT]):
         """Write registers of a servo, and return its answer; its `error` is 0 if the servo accepted them."""
 
     @abstractmethod
-    def write_all(self, address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> None:
+    def write_all(self, address: int, data_by_id: Sequence[tuple[int, bytes]]) -> None:
         """Write the same registers of several servos at once; they do not answer.
 
-        data_of_ids: id and data of each servo, all equally long.
+        data_by_id: id and data of each servo, all equally long.
         """
 
     def try_to_read(self, id_: int, address: int, size: int) -> StatusT | None:
@@ -117,117 +121,117 @@ class RequestPort(ABC, Generic[StatusT]):
         return None
 
     @contextlib.contextmanager
-    def wait_patiently(self) -> Iterator[None]:
-        """Wait longer for answers, because no control cycle depends on them yet."""
-        gap_s = self._gap_s
-        second_gap_s = self._second_gap_s
-        self._gap_s = max(gap_s, PATIENT_GAP_S)
-        self._second_gap_s = max(second_gap_s, SECOND_ANSWER_GAP_S)
+    def extended_timeouts(self) -> Iterator[None]:
+        """Wait longer for responses within this context, in which no control cycle depends on them yet."""
+        response_gap_s = self._response_gap_s
+        next_response_gap_s = self._next_response_gap_s
+        self._response_gap_s = max(response_gap_s, EXTENDED_GAP_S)
+        self._next_response_gap_s = max(next_response_gap_s, SECOND_ANSWER_GAP_S)
         try:
             yield
         finally:
-            self._gap_s = gap_s
-            self._second_gap_s = second_gap_s
+            self._response_gap_s = response_gap_s
+            self._next_response_gap_s = next_response_gap_s
 
     def wait_until_idle(self) -> None:
         """Receive late answers until the line is idle, and assign them to the requests that they belong to."""
         decoder = self._make_decoder()
-        end_s = time.monotonic() + MAX_DRAIN_S
-        while time.monotonic() < end_s:
+        deadline_s = time.monotonic() + MAX_DRAIN_S
+        while time.monotonic() < deadline_s:
             data = self.wire.receive(IDLE_S)
             if not data:
                 return
             for packet in decoder.feed_statuses(data):
-                self._match_answer(packet.id)
+                self._match_response(packet.id)
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _request_one(self, id_: int, request: bytes, size: int) -> StatusT | None:
+    def _request_single_response(self, id_: int, request: bytes, size: int) -> StatusT | None:
         """Send a request to one servo, and return its answer. size: bytes of data in it."""
-        answers = self._request_all_answers(id_, request, size, 1)
-        if not answers.statuses:
+        responses = self._request_all_responses(id_, request, size, 1)
+        if not responses.statuses:
             return None
-        return answers.statuses[0]
+        return responses.statuses[0]
 
-    def _request_all_answers(self, id_: int, request: bytes, size: int, max_answers: int) -> Answers[StatusT]:
-        """Send a request to one servo, and return its answers.
+    def _request_all_responses(self, id_: int, request: bytes, size: int, max_responses: int) -> Answers[StatusT]:
+        """Send a request to one servo, and return all responses that arrive until the bus is silent.
 
         Args:
-            id_: the servo.
-            request: the packet to it.
-            size: bytes of data in an answer; others are late answers to other requests.
-            max_answers: number of answers after which to stop waiting.
+            id_: Id of the servo.
+            request: Encoded request packet.
+            size: Number of data bytes in a response; responses of another length are late ones to other requests.
+            max_responses: Number of responses after which to stop waiting.
         """
-        self._note_request([id_])
+        self._record_request([id_])
         decoder = self._make_decoder()
         statuses: list[StatusT] = []
-        surplus = 0
-        for status in self._request(decoder, request, self._gap_s, self._second_gap_s):
-            is_expected = self._match_answer(status.id)
+        surplus_count = 0
+        for status in self._send_request(decoder, request, self._response_gap_s, self._next_response_gap_s):
+            is_expected = self._match_response(status.id)
             if status.id != id_:
                 continue
             if not is_expected:
-                surplus += 1
+                surplus_count += 1
             if len(status.data) == size:
                 statuses.append(status)
-            if len(statuses) >= max_answers:
+            if len(statuses) >= max_responses:
                 break
-        return Answers(statuses, surplus, decoder.garbled)
+        return Answers(statuses, surplus_count, decoder.garbled)
 
-    def _request_each(self, ids: Collection[int], request: bytes, size: int) -> list[StatusT]:
+    def _sync_read(self, ids: Collection[int], request: bytes, size: int) -> list[StatusT]:
         """Send a sync read, and return the answers, of which each servo sends one.
 
         A servo that seems to answer twice is left out, so that the driver reads it alone, and finds why.
         """
-        self._note_request(ids)
-        doubled: set[int] = set()
+        self._record_request(ids)
+        doubled_ids: set[int] = set()
         statuses: list[StatusT] = []
-        for status in self._request(self._make_decoder(), request, self._gap_s, self._gap_s):
-            if not self._match_answer(status.id):
-                doubled.add(status.id)
+        for status in self._send_request(self._make_decoder(), request, self._response_gap_s, self._response_gap_s):
+            if not self._match_response(status.id):
+                doubled_ids.add(status.id)
             elif status.id in ids and len(status.data) == size:
                 statuses.append(status)
             if len(statuses) >= len(ids):
                 break
-        return [status for status in statuses if status.id not in doubled]
+        return [status for status in statuses if status.id not in doubled_ids]
 
-    def _request(
-        self, decoder: StatusDecoder[StatusT], request: bytes, gap_s: float, next_gap_s: float
+    def _send_request(
+        self, decoder: StatusDecoder[StatusT], request: bytes, response_gap_s: float, next_response_gap_s: float
     ) -> Iterator[StatusT]:
         """Send a request, and yield the statuses that arrive until the bus is silent.
 
         Args:
-            decoder: of the bytes that arrive.
-            request: the packet to send.
-            gap_s: silence that ends the wait for the first status.
-            next_gap_s: silence that ends the wait for a further one.
+            decoder: Decoder of the received bytes.
+            request: Encoded request packet.
+            response_gap_s: Silence that ends the wait for the first status.
+            next_response_gap_s: Silence that ends the wait for a further status.
         """
         wire = self.wire
         self._received.clear()
         wire.send(request)
-        busy_s = wire.time_s(len(request) + CHUNK_BYTES) + wire.latency_s
-        while data := wire.receive(gap_s + busy_s):
+        transmission_s = wire.compute_transmission_s(len(request) + CHUNK_BYTES) + wire.latency_s
+        while data := wire.receive(response_gap_s + transmission_s):
             self._received += data
             for status in decoder.feed_statuses(data):
-                gap_s = next_gap_s
+                response_gap_s = next_response_gap_s
                 yield status
 
-    def _note_request(self, ids: Collection[int]) -> None:
+    def _record_request(self, ids: Collection[int]) -> None:
         """Remember that these servos are being asked."""
         for id_ in ids:
-            self._forget_unanswered(id_)
-            self._unanswered_s[id_].append(time.monotonic())
+            self._forget_expired_requests(id_)
+            self._pending_request_times_s[id_].append(time.monotonic())
 
-    def _match_answer(self, id_: int) -> bool:
+    def _match_response(self, id_: int) -> bool:
         """Assign an answer to the oldest request to a servo without one; return False if there is no such request."""
-        if not self._unanswered_s[id_]:
+        if not self._pending_request_times_s[id_]:
             return False
-        self._unanswered_s[id_].popleft()
+        self._pending_request_times_s[id_].popleft()
         return True
 
-    def _forget_unanswered(self, id_: int) -> None:
+    def _forget_expired_requests(self, id_: int) -> None:
         """Forget the requests to a servo whose answers do not arrive any more."""
-        unanswered_s = self._unanswered_s[id_]
-        oldest_s = time.monotonic() - LATE_S
-        while unanswered_s and (self.wire.answers_at_once or unanswered_s[0] < oldest_s):
-            unanswered_s.popleft()
+        pending_request_times_s = self._pending_request_times_s[id_]
+        oldest_s = time.monotonic() - MAX_RESPONSE_DELAY_S
+        while pending_request_times_s and (self.wire.has_immediate_responses or pending_request_times_s[0] < oldest_s):
+            pending_request_times_s.popleft()

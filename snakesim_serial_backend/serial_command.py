@@ -22,7 +22,18 @@ class Scan:
 
 
 def scan_ports(arguments: argparse.Namespace, scan: Scan) -> int:
-    """List the servos that answer on some ports. Returns 1 if none answers. Raises ConfigError for a wrong rate."""
+    """Run `snakesim drive scan` for a protocol: list the servos that respond on some ports at any of its baud rates.
+
+    Args:
+        arguments: Parsed command line.
+        scan: How to scan a port for servos of the protocol.
+
+    Returns:
+        Exit code 0; 1 if no servo responds.
+
+    Raises:
+        ConfigError: The servos do not have a baud rate of the command line, or a port does not exist.
+    """
     missing = [baud for baud in arguments.baud or () if baud not in scan.rates]
     if missing:
         possible = ", ".join(map(str, scan.rates))

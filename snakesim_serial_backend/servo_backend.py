@@ -12,8 +12,8 @@ from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_settings import answer_limit_s, assign_ports, make_body
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, group_by_port
+from snakesim_drivers.kit.drive_settings import assign_ports, compute_response_timeout_s, make_emulated_body
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.drives import Drives
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.joints import Joint
@@ -43,12 +43,12 @@ class OpenedPort(Generic[EmulatorT]):
     """A serial port that is open, with all that the servos on it need."""
 
     wire: SerialWire
-    gap_s: float  # silence that ends an answer
+    response_gap_s: float  # silence that ends an answer
     joints: Sequence[Joint]  # those on this port, from tail to head
     settings: Any  # an instance of the driver type's own `Settings`
     readings: DriveReadings
     emulator: EmulatorT | None  # the servos, if they are emulated in this process
-    answer_s: float  # time that a reading waits for answers
+    response_timeout_s: float  # time that a reading waits for answers
     clock_ns: Callable[[], int]
 
 
@@ -62,7 +62,7 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
 
     @classmethod
     @abstractmethod
-    def open_servos(cls, opened: OpenedPort[EmulatorT]) -> Drives:
+    def open_servos(cls, opened_port: OpenedPort[EmulatorT]) -> Drives:
         """Return the drives of a port. Nothing is sent yet."""
 
     @classmethod
@@ -73,30 +73,30 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
         """Make emulated servos for joints.
 
         Args:
-            joints: the joints, from tail to head.
-            settings: an instance of `Settings`.
-            body: what the servos move.
-            ptys: the pseudo terminal of every joint's servo.
-            clock: the time of the servos.
+            joints: The joints, from tail to head.
+            settings: An instance of `Settings`.
+            body: What the servos move.
+            ptys: The pseudo terminal of every joint's servo.
+            clock: The time of the servos.
         """
 
     @classmethod
     def make_robot_emulator(
-        cls, config: RunConfig, settings: Any, ptys: list[Pty], clock: DriverClock, pose: str | None
+        cls, config: RunConfig, settings: Any, ptys: list[Pty], clock: DriverClock, pose_address: str | None
     ) -> EmulatorT:
         """Make emulated servos for a whole robot.
 
         Args:
-            config: configuration of the run, with the robot and the settings of its backend.
-            settings: the scenario's section of this driver type.
-            ptys: a pseudo terminal for each of its ports.
-            clock: the time of the servos.
-            pose: where motion capture sends poses, HOST:PORT; None: nowhere.
+            config: Configuration of the run, with the robot and the settings of its backend.
+            settings: The scenario's section of this driver type.
+            ptys: A pseudo terminal for each of its ports.
+            clock: The time of the servos.
+            pose_address: HOST:PORT to which motion capture sends poses; None if it does not send.
         """
         joints = config.robot.joint_table
-        body = make_body(config, settings, cls.name, pose)
-        pty_of_joint = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
-        return cls.make_emulator(joints, settings, body, pty_of_joint, clock)
+        body = make_emulated_body(config, settings, cls.name, pose_address)
+        pty_by_joint = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
+        return cls.make_emulator(joints, settings, body, pty_by_joint, clock)
 
     @classmethod
     def list_ports(cls, settings: Any) -> Sequence[str]:
@@ -109,11 +109,13 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
         return {"cut"}
 
     @classmethod
-    def check_port_load(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
+    def validate_port_load(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
         """Raise ConfigError when a port cannot carry its servos."""
-        bus_of_joint = assign_ports(joints, settings.ports)
-        fullest = max(bus_of_joint.count(bus) for bus in set(bus_of_joint))
-        cls.port_load.check(fullest, config.rate_hz / settings.decimation, settings.baud, f"backends.{cls.name}")
+        bus_by_joint = assign_ports(joints, settings.ports)
+        max_servo_count = max(bus_by_joint.count(bus) for bus in set(bus_by_joint))
+        cls.port_load.check(
+            max_servo_count, config.rate_hz / settings.decimation, settings.baud, f"backends.{cls.name}"
+        )
 
     @classmethod
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
@@ -124,8 +126,14 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
         body = context.body
         log = open_log(settings.log, f"backends.{cls.name}.log")
 
-        def open_drives(port_name: str, numbers: Sequence[int], readings: DriveReadings) -> Drives:
-            """Open a port with the servos of these joints; emulated servos are on a pseudo terminal."""
+        def open_drives(port_name: str, joint_indices: Sequence[int], readings: DriveReadings) -> Drives:
+            """Open a port with the servos of some joints; emulated servos are on a pseudo terminal.
+
+            Args:
+                port_name: Name of the serial port; not used for emulated servos.
+                joint_indices: Indices in the robot of the joints with servos on this port.
+                readings: Object that stores the values that the servos report.
+            """
             emulator = None
             if body is None:
                 wire = SerialWire(port_name, settings.baud, log)
@@ -134,22 +142,22 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
                 emulator = cls.make_emulator(list(joints.values()), settings, body, [pty] * len(joints), clock)
                 wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
             gap_per_period = EMULATED_GAP_PER_PERIOD if is_emulated(wire.port) else GAP_PER_PERIOD
-            opened = OpenedPort(
+            opened_port = OpenedPort(
                 wire=wire,
-                gap_s=max(MIN_GAP_S, gap_per_period * config.period_ns * 1e-9),
-                joints=[joints[number] for number in numbers],
+                response_gap_s=max(MIN_GAP_S, gap_per_period * config.period_ns * 1e-9),
+                joints=[joints[number] for number in joint_indices],
                 settings=settings,
                 readings=readings,
                 emulator=emulator,
-                answer_s=answer_limit_s(config, settings.decimation),
+                response_timeout_s=compute_response_timeout_s(config, settings.decimation),
                 clock_ns=clock.now_ns,
             )
-            return cls.open_servos(opened)
+            return cls.open_servos(opened_port)
 
         ports = settings.ports
         if body is not None:
             ports = [cls.name]
-        return group_by_port(joints, settings, ports, open_drives)
+        return make_bus_specs_by_port(joints, settings, ports, open_drives)
 
 
 def find_travel_rad(joint: Joint) -> tuple[float, float]:

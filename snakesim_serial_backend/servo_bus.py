@@ -20,10 +20,10 @@ from snakesim_serial_backend.wire import Pty, is_emulated
 
 BOOT_NS = 2_000_000_000  # in which the silence of a servo that restarts is no fault
 INJECTABLE = {("bus", "cut"), *(("joint", kind) for kind in FAULTS)}
-MAX_BAD_ANSWERS = 2  # in a row, doubled or garbled, until that is a fault: before `drive_silent`, which comes after 3
+MAX_BAD_RESPONSES = 2  # in a row, doubled or garbled, until that is a fault: before `drive_silent`, which comes after 3
 BUS_CUT = "nothing gets through; check the adapter, its cable and its power"
 # Two servos with one id: their answers follow each other if their return delays differ, and collide if they do not.
-ANSWERS_TWICE = "is duplicated: it answers one question twice; give each servo its own id"
+RESPONDS_TWICE = "is duplicated: it answers one question twice; give each servo its own id"
 GARBLED = (
     "a second servo has its id, or the line is disturbed; give each servo its own id, one after the other alone on the "
     "bus, and check cables and terminators"
@@ -46,24 +46,24 @@ class SerialServo(Generic[PortT]):
     enabled: bool = False  # whether its torque is on
     errors: int = 0  # bits of its hardware errors
     alert: bool = False  # whether it has errors that it has not named yet
-    health_ns: int = -1  # when its state was last read
+    health_read_ns: int = -1  # when its state was last read
     answered_twice: int = 0  # requests in a row
     garbled: int = 0  # requests in a row that were answered by garbled bytes alone
 
     # What was sent to it.
-    follows: bool = False  # whether its torque was switched on
-    switched_ns: int = -1  # when its torque was switched on or off
-    booting_ns: int = -1  # when it was restarted, until it answers again
+    is_torque_requested: bool = False  # whether its torque was switched on
+    torque_switched_ns: int = -1  # when its torque was switched on or off
+    boot_start_ns: int = -1  # when it was restarted, until it answers again
 
     @property
     def label(self) -> str:
         """The name of the servo in messages."""
         return f"{self.name} (id {self.id} on {self.port.wire.port})"
 
-    def record_switch(self, *, follows: bool, now_ns: int) -> None:
+    def record_switch(self, *, is_torque_requested: bool, now_ns: int) -> None:
         """Record that its torque was switched on or off."""
-        self.follows = follows
-        self.switched_ns = now_ns
+        self.is_torque_requested = is_torque_requested
+        self.torque_switched_ns = now_ns
         self.enabled = False  # until it reports otherwise
 
 
@@ -85,7 +85,7 @@ class ServoBusContext(Generic[ServoT, StatusT]):
     port: RequestPort[StatusT]  # sends and receives packets
     readings: DriveReadings
     emulator: DriveEmulator[Pty] | None  # the servos, if they are emulated in this process
-    answer_s: float  # time that a reading waits for answers
+    response_timeout_s: float  # time that a reading waits for answers
     clock_ns: Callable[[], int]
 
 
@@ -98,55 +98,55 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
     torque_enable: ClassVar[int]  # address of the register that switches the torque
 
     def __init__(self, context: ServoBusContext[ServoT, StatusT]) -> None:
-        """Take over the servos of a port that is open; nothing is sent."""
+        """Prepare to drive the servos of a port that is open; nothing is sent."""
         self._emulator = context.emulator
         self.servos = list(context.servos)
         self.emulated = is_emulated(context.port.wire.port)
         self._port = context.port
         self._readings = context.readings
         self._clock_ns = context.clock_ns
-        self._answer_s = context.answer_s
-        self._silent: set[int] = set()  # read one by one, as they would silence others in a sync read
-        self._cycle = 0
+        self._response_timeout_s = context.response_timeout_s
+        self._silent_servos: set[int] = set()  # read one by one, as they would silence others in a sync read
+        self._cycle_count = 0
         self._read_deadline_s = 0.0
-        self._may_write = False  # until bring-up has checked that these are the servos of the robot
+        self._is_brought_up = False  # until bring-up has checked that these are the servos of the robot
 
     # --- what a driver type implements ------------------------------------------------------------------------
 
     @abstractmethod
-    def handle_answer(self, i: int, status: StatusT) -> None:
+    def handle_response(self, i: int, status: StatusT) -> None:
         """Put what a servo measures, the registers `motion`, into the readings."""
 
     @abstractmethod
-    def _take_over_health(self, i: int, status: StatusT) -> None:
+    def _store_health(self, i: int, status: StatusT) -> None:
         """Put a servo's supply and temperature, of the registers `health`, into the readings, and store its state."""
 
     @abstractmethod
-    def _take_over_state(self, i: int, status: StatusT) -> None:
+    def _store_state(self, i: int, status: StatusT) -> None:
         """Store whether a servo's torque is on, and what has switched it off, of the registers `state`."""
 
     @abstractmethod
-    def _find_state(self, i: int) -> Finding | None:
+    def _find_stop_reason(self, i: int) -> Finding | None:
         """Return what has switched a servo's torque off, if anything."""
 
     # --- reading ----------------------------------------------------------------------------------------------
 
     def read(self) -> None:
         """Read all servos at once, one of the silent ones alone, and the health of one."""
-        self._read_deadline_s = time.monotonic() + self._answer_s
-        self._cycle += 1
-        silent = sorted(self._silent)
-        answering = [i for i in range(len(self.servos)) if i not in self._silent]
+        self._read_deadline_s = time.monotonic() + self._response_timeout_s
+        self._cycle_count += 1
+        silent_servos = sorted(self._silent_servos)
+        answering = [i for i in range(len(self.servos)) if i not in self._silent_servos]
         self._read_states([i for i in answering if i in self._readings.drives_to_check])
-        self._read_motion(answering)
-        if silent:
-            self._read_silent(silent[self._cycle % len(silent)])
-        self._read_next_health([i for i in answering if i not in self._silent])
+        self._read_all_motion(answering)
+        if silent_servos:
+            self._read_silent_servo(silent_servos[self._cycle_count % len(silent_servos)])
+        self._read_next_health([i for i in answering if i not in self._silent_servos])
         for i, servo in enumerate(self.servos):
-            if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOT_NS:
+            if servo.boot_start_ns >= 0 and self._clock_ns() - servo.boot_start_ns < BOOT_NS:
                 self._readings.skip_request(i)
 
-    def _read_motion(self, indices: list[int]) -> None:
+    def _read_all_motion(self, indices: list[int]) -> None:
         """Read the motion of these servos at once.
 
         A silent servo silences all behind it. So the first one without an answer is left out, and the others are read
@@ -155,56 +155,56 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
         missing = indices
         while missing and time.monotonic() < self._read_deadline_s:
             ids = [self.servos[i].id for i in missing]
-            answers = self._port.read_all(ids, *self.motion)
+            responses = self._port.read_all(ids, *self.motion)
             for i in missing:
-                answer = answers.get(self.servos[i].id)
-                if answer is not None:
-                    self.handle_answer(i, answer)
-            missing = [i for i in missing if self.servos[i].id not in answers]
+                response = responses.get(self.servos[i].id)
+                if response is not None:
+                    self.handle_response(i, response)
+            missing = [i for i in missing if self.servos[i].id not in responses]
             if missing:
-                self._silent.add(missing.pop(0))
+                self._silent_servos.add(missing.pop(0))
 
-    def _read_silent(self, i: int) -> None:
+    def _read_silent_servo(self, i: int) -> None:
         """Read the motion of a silent servo alone, and count answers that are doubled or garbled."""
         servo = self.servos[i]
-        answers = servo.port.read_alone(servo.id, *self.motion)
-        if answers.surplus:
+        responses = servo.port.read_alone(servo.id, *self.motion)
+        if responses.surplus_count:
             servo.answered_twice += 1
         else:
             servo.answered_twice = 0
-        if answers.garbled and not answers.statuses:
+        if responses.garbled and not responses.statuses:
             servo.garbled += 1
         else:
             servo.garbled = 0
-        if answers.statuses and not answers.surplus:
-            self._silent.clear()  # perhaps others answer again, too
-            self.handle_answer(i, answers.statuses[-1])  # an earlier one is a late answer to an earlier request
+        if responses.statuses and not responses.surplus_count:
+            self._silent_servos.clear()  # perhaps others answer again, too
+            self.handle_response(i, responses.statuses[-1])  # an earlier one is a late answer to an earlier request
 
     def _read_states(self, indices: Sequence[int]) -> None:
         """Read at once whether these servos have stopped by themselves; a silent one is read again later."""
-        answers = self._port.read_all([self.servos[i].id for i in indices], *self.state)
+        responses = self._port.read_all([self.servos[i].id for i in indices], *self.state)
         for i in indices:
-            status = answers.get(self.servos[i].id)
+            status = responses.get(self.servos[i].id)
             if status is not None:
-                self._take_over_state(i, status)
+                self._store_state(i, status)
 
     def _read_next_health(self, indices: list[int]) -> None:
         """Read the health of one of these servos: first of those with an alert whose error is unknown, in turn."""
-        alarmed = [i for i in indices if self.servos[i].alert and not self.servos[i].errors]
-        candidates = alarmed or indices
+        servos_with_unknown_error = [i for i in indices if self.servos[i].alert and not self.servos[i].errors]
+        candidates = servos_with_unknown_error or indices
         if not candidates:
             return
-        i = candidates[self._cycle % len(candidates)]
+        i = candidates[self._cycle_count % len(candidates)]
         servo = self.servos[i]
         status = servo.port.read(servo.id, *self.health)
         if status is not None:
-            self._take_over_health(i, status)
+            self._store_health(i, status)
 
     def poll(self) -> None:
-        """Let servos that are emulated in this process run up to the present time."""
+        """Let servos that are emulated in this process run up to the current time."""
         self._port.wire.run_emulated_drives()
 
-    def _write_same(self, address: int, indices: Sequence[int], data: bytes) -> None:
+    def _write_to_servos(self, address: int, indices: Sequence[int], data: bytes) -> None:
         """Write the same data to registers of several servos."""
         self._port.write_all(address, [(self.servos[i].id, data) for i in indices])
 
@@ -217,26 +217,26 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
         if error:
             findings.append(Finding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
         for i, servo in enumerate(self.servos):
-            for finding in (_answer_finding(i, servo), self._find_state(i)):
+            for finding in (_find_response_problem(i, servo), self._find_stop_reason(i)):
                 if finding is not None:
                     findings.append(finding)
         return findings
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault of emulated servos here, or of their bus. Returns whether it is possible."""
+        """Start or end a fault of emulated servos here, or of their bus. Returns whether it is possible."""
         if self._emulator is None or (injection.target_type, injection.kind) not in INJECTABLE:
             return False
         if injection.target_type == "joint":
             self._emulator.inject(injection, begins=begins)
         else:
-            self._port.wire.cut(begins=begins)
+            self._port.wire.set_cut(begins=begins)
         return True
 
     def close(self) -> None:
         """Switch the torque off, as far as the bus still works, and close the port."""
         try:
-            if self._may_write:
-                self._write_same(self.torque_enable, range(len(self.servos)), b"\0")
+            if self._is_brought_up:
+                self._write_to_servos(self.torque_enable, range(len(self.servos)), b"\0")
                 self._port.wire.run_emulated_drives()
         finally:
             self._port.wire.close()
@@ -244,11 +244,11 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
             self._emulator.close()
 
 
-def _answer_finding(i: int, servo: SerialServo[Any]) -> Finding | None:
+def _find_response_problem(i: int, servo: SerialServo[Any]) -> Finding | None:
     """Return what is wrong with a servo's answers, if anything."""
-    if servo.answered_twice >= MAX_BAD_ANSWERS:
+    if servo.answered_twice >= MAX_BAD_RESPONSES:
         # It concerns the whole robot: which of the two servos is where is unknown.
-        return Finding("duplicate_node", f"{servo.label} {ANSWERS_TWICE}", i)
-    if servo.garbled >= MAX_BAD_ANSWERS:
-        return Finding("drive_silent", f"{servo.label} sends garbled bytes: {GARBLED}", i, alone=True)
+        return Finding("duplicate_node", f"{servo.label} {RESPONDS_TWICE}", i)
+    if servo.garbled >= MAX_BAD_RESPONSES:
+        return Finding("drive_silent", f"{servo.label} sends garbled bytes: {GARBLED}", i, affects_only_joint=True)
     return None

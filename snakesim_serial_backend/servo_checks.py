@@ -2,35 +2,39 @@
 
 from typing import Any
 
-from snakesim_serial_backend.servo_bus import ANSWERS_TWICE, GARBLED, Registers, SerialServo
+from snakesim_serial_backend.servo_bus import GARBLED, RESPONDS_TWICE, Registers, SerialServo
 
-READS = 3  # to distinguish a second servo from a single disturbance
+MAX_READS = 3  # to distinguish a second servo from a single disturbance
 MIN_DOUBLED = 2  # reads with an answer too many that show a second servo
 NO_ANSWER = "does not answer: it is off, or has another id or baud rate"
 
 
 def find_shared_id(servo: SerialServo[Any], registers: Registers) -> str:
-    """Return why another servo seems to have the same id; empty if only one answers.
+    """Detect a second servo with the same id by reading registers several times.
 
-    A ping does not show it: two servos of one model answer it with the same bytes at the same time. Late answers to
-    earlier requests do not show it, either: the port assigns them to those requests.
+    A ping does not show a second servo: two servos of one model respond with the same bytes at the same time. Late
+    responses to earlier requests are not mistaken for those of a second servo: the port assigns them to their requests.
 
     Args:
-        servo: the servo.
-        registers: those in which two servos differ, such as position, voltage and temperature.
+        servo: Servo to check.
+        registers: Registers in which two servos differ, such as position, voltage and temperature.
+
+    Returns:
+        The reason why the id seems to be shared, or bytes are garbled, to be put after the servo's name; an empty
+        string if a single servo responds, or none.
     """
-    doubled = 0
+    double_response_count = 0
     garbled = 0
-    for _ in range(READS):
-        answers = servo.port.read_alone(servo.id, registers.address, registers.size)
-        if answers.surplus:
-            doubled += 1
-        elif answers.statuses:
+    for _ in range(MAX_READS):
+        responses = servo.port.read_alone(servo.id, registers.address, registers.size)
+        if responses.surplus_count:
+            double_response_count += 1
+        elif responses.statuses:
             return ""
-        garbled += answers.garbled
+        garbled += responses.garbled
         servo.port.wait_until_idle()
-    if doubled >= MIN_DOUBLED:
-        return ANSWERS_TWICE
+    if double_response_count >= MIN_DOUBLED:
+        return RESPONDS_TWICE
     if garbled:
-        return f"sends garbled bytes, in {garbled} of {READS} answers: {GARBLED}"
+        return f"sends garbled bytes, in {garbled} of {MAX_READS} answers: {GARBLED}"
     return ""

@@ -22,7 +22,7 @@ class StreamDecoder(ABC, Generic[PacketT]):
         """Return the length of a packet in bytes, or None if it is impossible.
 
         Args:
-            start: the first `bytes_before` bytes of the packet, which begin with the header.
+            start: The first `bytes_before` bytes of the packet, which begin with the header.
         """
 
     @abstractmethod
@@ -30,7 +30,7 @@ class StreamDecoder(ABC, Generic[PacketT]):
         """Return the packet that these bytes are; None if they are damaged."""
 
     def feed(self, data: bytes) -> Iterator[PacketT]:
-        """Take in bytes, and yield the packets that are complete now."""
+        """Add received bytes, and yield the packets that are complete now."""
         self._bytes += data
         while True:
             self._skip_to_header()
@@ -50,14 +50,14 @@ class StreamDecoder(ABC, Generic[PacketT]):
         return self.skipped > 0 or len(self._bytes) > 0
 
     def _skip_to_header(self) -> None:
-        """Skip bytes up to the next header, or up to bytes that may be the begin of one."""
+        """Skip bytes up to the next header, or up to bytes that may be the start of one."""
         start = self._bytes.find(self.header)
         if start < 0:
             start = max(len(self._bytes) - len(self.header) + 1, 0)
         self._skip(start)
 
     def _find_length(self) -> int | None:
-        """Return the length of the packet at the begin of the bytes; None if more bytes are needed to know it.
+        """Return the length of the packet at the start of the bytes; None if more bytes are needed to know it.
 
         A header that is followed by an impossible length is skipped.
         """

@@ -18,13 +18,13 @@ import serial
 
 from snakesim_hal.base.errors import BackendError, ConfigError
 
-BITS_A_BYTE = 10  # with start and stop bit
+BITS_PER_BYTE = 10  # with start and stop bit
 USB_LATENCY_S = 0.001  # of an adapter whose driver does not report it: one frame of USB
-KERNEL_LIMIT_S = 5.0  # in which a pseudo terminal passes on what was written
+KERNEL_TIMEOUT_S = 5.0  # in which a pseudo terminal passes on what was written
 REOPEN_PERIOD_S = 0.5  # between two attempts to open a port that is gone
 READ_BYTES = 4096
-WRITE_LIMIT_S = 1.0
-GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
+WRITE_TIMEOUT_S = 1.0
+DISCONNECTED_EVENTS = select.POLLHUP | select.POLLERR | select.POLLNVAL
 IO_ERRORS = (OSError, termios.error, ValueError)  # of pyserial and of `select`, on a port that is gone
 
 # Runs the drives that are emulated in this process: they handle what was sent to them, answer, and let time pass.
@@ -35,9 +35,9 @@ class Pty:
     """A pseudo terminal. Emulated drives are at its one end; at the other is the program that opens `path`.
 
     Attributes:
-        path: name of the end for the driver.
-        expected_bytes: how many bytes were written to it so far and must arrive; None if this process does not know.
-        sent_bytes: how many bytes the emulated drives have sent.
+        path: Name of the end for the driver.
+        expected_bytes: How many bytes were written to it so far and must arrive; None if this process does not know.
+        sent_bytes: How many bytes the emulated drives have sent.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class Pty:
         """Return what has arrived. Waits for all expected bytes, which the kernel may pass on late."""
         data = self._read()
         while self.expected_bytes is not None and self._received_bytes < self.expected_bytes:
-            readable, _, _ = select.select([self._master], [], [], KERNEL_LIMIT_S)
+            readable, _, _ = select.select([self._master], [], [], KERNEL_TIMEOUT_S)
             if not readable:
                 raise BackendError(
                     f"{self.path}: the kernel has not handed on what was written to it", code="bus/io-failed"
@@ -98,18 +98,18 @@ class SerialWire:
         pty: Pty | None = None,
         run_drives: RunDrives | None = None,
     ) -> None:
-        """Open a port.
+        """Open a serial port.
 
         Args:
-            port: name of the serial port, or path of a pseudo terminal.
-            baud: baud rate in bit/s.
-            log: gets a line for everything that is sent or received.
-            pty: the pseudo terminal, if its drives are emulated in this process.
-            run_drives: runs these drives.
+            port: Name of the serial port, or path of a pseudo terminal.
+            baud: Baud rate in bit/s.
+            log: Text file to which a line is written for everything that is sent or received; None for no log.
+            pty: Pseudo terminal, if its drives are emulated in this process; otherwise None.
+            run_drives: Function that runs the drives that are emulated in this process; otherwise None.
 
         Raises:
-            ConfigError: there is no such port.
-            BackendError: the port cannot be opened.
+            ConfigError: There is no such port.
+            BackendError: The port cannot be opened.
         """
         self.port = port
         self.baud = baud
@@ -122,7 +122,9 @@ class SerialWire:
         self._received_bytes = 0
 
         # State of the port.
-        self._last_try_s: float | None = None  # when a port that is gone was last tried; None: the port is open
+        self._last_reopen_attempt_s: float | None = (
+            None  # when a port that is gone was last tried; None: the port is open
+        )
         self._is_cut = False  # by an injected fault
         if not Path(port).exists():
             raise ConfigError(
@@ -138,8 +140,14 @@ class SerialWire:
         self.latency_s = latency_s(port)
 
     def send(self, data: bytes) -> None:
-        """Send a request. Answers to earlier ones that came too late are thrown away first."""
-        if self._is_cut or not self._is_open_again():
+        """Send a request, after discarding late responses to earlier requests.
+
+        Nothing is sent while the port is cut or gone; a port that is gone is tried again now and then.
+
+        Args:
+            data: Encoded request packet.
+        """
+        if self._is_cut or not self._try_to_reopen():
             return
         self._discard_late_answers()
         self._write_log("out", data)
@@ -157,17 +165,23 @@ class SerialWire:
             self._pty.expected_bytes = self._sent_bytes
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return what has arrived, and wait for the first byte of it.
+        """Wait for the first byte, and return all bytes that have arrived.
 
-        Empty: the time is over, the port is gone, or no drive that is emulated in this process has answered.
+        Args:
+            timeout_s: Maximum duration to wait for the first byte; not used for drives that are emulated in this
+                process.
+
+        Returns:
+            The received bytes; empty after the timeout, if the port is cut or gone, or if no drive that is emulated
+            in this process has responded.
         """
-        if self._is_cut or self._last_try_s is not None:
+        if self._is_cut or self._last_reopen_attempt_s is not None:
             return b""
         if self._run_drives is not None and self._pty is not None:
             self._run_drives()
             if self._received_bytes == self._pty.sent_bytes:
                 return b""
-            timeout_s = KERNEL_LIMIT_S
+            timeout_s = KERNEL_TIMEOUT_S
         try:
             data = self._read(timeout_s)
         except IO_ERRORS:
@@ -178,12 +192,12 @@ class SerialWire:
             self._write_log("in", data)
         return data
 
-    def time_s(self, size: int) -> float:
+    def compute_transmission_s(self, size: int) -> float:
         """Return how long this number of bytes takes on the bus."""
-        return size * BITS_A_BYTE / self.baud
+        return size * BITS_PER_BYTE / self.baud
 
     @property
-    def answers_at_once(self) -> bool:
+    def has_immediate_responses(self) -> bool:
         """Whether no answer is late, because the drives are emulated in this process."""
         return self._run_drives is not None
 
@@ -196,12 +210,12 @@ class SerialWire:
         """Return why nothing can be sent now; empty if it can."""
         if self._is_cut:
             return "it is cut"
-        if self._last_try_s is not None:
+        if self._last_reopen_attempt_s is not None:
             return "it is gone: the adapter was unplugged, or its driver has failed"
         return ""
 
-    def cut(self, *, begins: bool) -> None:
-        """Begin or end an injected fault, in which nothing is sent or received."""
+    def set_cut(self, *, begins: bool) -> None:
+        """Start or end an injected fault, in which nothing is sent or received."""
         self._is_cut = begins
 
     def close(self) -> None:
@@ -214,7 +228,7 @@ class SerialWire:
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _open(self) -> serial.Serial:
-        port = serial.Serial(self.port, self.baud, timeout=0, write_timeout=WRITE_LIMIT_S, exclusive=True)
+        port = serial.Serial(self.port, self.baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
         with contextlib.suppress(*IO_ERRORS):  # pseudo terminals and some adapters do not have this mode
             port.set_low_latency_mode(True)
         return port
@@ -222,15 +236,15 @@ class SerialWire:
     def _read(self, timeout_s: float) -> bytes:
         """Return what has arrived, or arrives in time. Now and then the kernel reports data before there is any."""
         descriptor = self._serial.fileno()
-        end_s = time.monotonic() + timeout_s
+        deadline_s = time.monotonic() + timeout_s
         poll = select.poll()
         poll.register(descriptor, select.POLLIN)
         while True:
-            events = poll.poll(max(end_s - time.monotonic(), 0.0) * 1000)
+            events = poll.poll(max(deadline_s - time.monotonic(), 0.0) * 1000)
             if not events:
                 return b""
             _, event = events[0]
-            if event & GONE:
+            if event & DISCONNECTED_EVENTS:
                 raise OSError("disconnected")
             data = os.read(descriptor, READ_BYTES)
             if data:
@@ -239,30 +253,30 @@ class SerialWire:
     def _discard_late_answers(self) -> None:
         if self._pty is not None:
             while self._received_bytes < self._pty.sent_bytes:
-                if not self.receive(KERNEL_LIMIT_S):
+                if not self.receive(KERNEL_TIMEOUT_S):
                     return
             return
         with contextlib.suppress(*IO_ERRORS):
             self._serial.reset_input_buffer()
 
     def _close_lost_port(self) -> None:
-        self._last_try_s = time.monotonic()
+        self._last_reopen_attempt_s = time.monotonic()
         with contextlib.suppress(OSError):
             self._serial.close()
 
-    def _is_open_again(self) -> bool:
+    def _try_to_reopen(self) -> bool:
         """Return whether the port is open. One that is gone is tried again now and then."""
-        if self._last_try_s is None:
+        if self._last_reopen_attempt_s is None:
             return True
         now_s = time.monotonic()
-        if now_s - self._last_try_s < REOPEN_PERIOD_S:
+        if now_s - self._last_reopen_attempt_s < REOPEN_PERIOD_S:
             return False
-        self._last_try_s = now_s
+        self._last_reopen_attempt_s = now_s
         try:
             self._serial = self._open()
         except IO_ERRORS:
             return False
-        self._last_try_s = None
+        self._last_reopen_attempt_s = None
         return True
 
     def _write_log(self, direction: str, data: bytes) -> None:
@@ -290,11 +304,11 @@ def open_log(path: str, setting: str) -> TextIO | None:
     """Open the file for all bytes; None without a path.
 
     Args:
-        path: the file; it is overwritten.
-        setting: where the scenario names it, for messages.
+        path: The file; it is overwritten.
+        setting: Where the scenario names it, for messages.
 
     Raises:
-        BackendError: the file cannot be written.
+        BackendError: The file cannot be written.
     """
     if not path:
         return None

@@ -22,7 +22,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import Module, RobotFile
-from snakesim_hal.physics.motor import roll_off
+from snakesim_hal.physics.motor import compute_torque_roll_off
 from snakesim_hal.wire.messages import Mode
 
 # Indices of a dcmotor's parameters in actuator_gainprm; checked against the compiled model in `Motors`.
@@ -30,16 +30,16 @@ KP = 4
 KD = 6
 MAX_VOLTS = 7
 # Inputs of a motor in `ctrl`: position, velocity, feed-forward torque.
-INPUTS = 3
+INPUTS_PER_MOTOR = 3
 TORQUE_INPUT = 2
-INPUT_OF_MODE = {Mode.PASSIVE: TORQUE_INPUT, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: TORQUE_INPUT}
+INPUT_INDEX_BY_MODE = {Mode.PASSIVE: TORQUE_INPUT, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: TORQUE_INPUT}
 
 
 def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) -> None:
-    """Add the motor of one joint to a model; it starts passive."""
+    """Add the motor of one joint to a model. The motor starts in passive mode."""
     limits = joint.limits
     # With motor constant 1, volts are rad/s, and the torque at rest under full volts is speed limit / resistance.
-    stall_torque_nm = roll_off(joint, module, step_s) * limits.torque_nm
+    stall_torque_nm = compute_torque_roll_off(joint, module, step_s) * limits.torque_nm
     inputs = mujoco.mjtCtrlInput
     motor = spec.add_actuator(name=f"motor_{joint.name}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     motor.set_to_dcmotor(
@@ -52,8 +52,13 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) 
     )
 
 
-def _gains_by_mode(joint: Joint, scale: float) -> dict[Mode, tuple[float, float, float]]:
-    """Return kp, kd and volts (0: unbounded) of each mode that the joint's drive has. scale: of kp and kd."""
+def _make_gains_by_mode(joint: Joint, scale: float) -> dict[Mode, tuple[float, float, float]]:
+    """Return kp, kd and maximum volts of each mode that the joint's drive has. 0 V means no limit.
+
+    Args:
+        joint: Joint with its motor and drive.
+        scale: Factor on kp and kd.
+    """
     motor = joint.motor
     max_volts = joint.limits.speed_rad_s
     gains = {
@@ -81,67 +86,72 @@ class Motors:
     """All motors of a compiled model, tail to head.
 
     Attributes:
-        count: number of motors.
-        without_torque: joints whose drives do not measure their torque.
+        count: Number of motors.
+        joints_without_torque_sensor: Joints whose drives do not measure their torque.
     """
 
     def __init__(
         self, model: mujoco.MjModel, data: MotorData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
     ) -> None:
-        """Take over the motors of a compiled model, and switch them off.
+        """Take control of the motors of a compiled model, and switch them off.
 
         The inputs, limits and gains are views of MuJoCo's arrays, so that a tick copies nothing.
 
         Args:
-            model: the compiled model.
-            data: its state.
-            robot: the robot file, with the limits, gains and response times of all joints.
-            period_s: control period.
-            gain_scale: factor on the gains of the robot file.
+            model: Compiled model.
+            data: State of the simulation.
+            robot: Robot file, with the limits, gains and response times of all joints.
+            period_s: Duration of a control period in s.
+            gain_scale: Factor on the gains of the robot file.
         """
         joints = robot.joint_table
         self.count = len(joints)
-        self.without_torque = [i for i, joint in enumerate(joints) if "torque" not in joint.drive.measures]
+        self.joints_without_torque_sensor = [
+            i for i, joint in enumerate(joints) if "torque" not in joint.drive.measures
+        ]
         self._names = [joint.name for joint in joints]
-        self._gains_by_mode = [_gains_by_mode(joint, gain_scale) for joint in joints]
+        self._gains_by_mode = [_make_gains_by_mode(joint, gain_scale) for joint in joints]
 
         # Views of MuJoCo's arrays.
         self._gains = model.actuator_gainprm[: self.count]
         self._min_torque_nm = model.actuator_forcerange[: self.count, 0]
         self._max_torque_nm = model.actuator_forcerange[: self.count, 1]
-        self.use_state(data)
+        self.bind_state(data)
 
-        # Torque limits, (n_joints,) each: of the robot file, after derating, and with the command's.
+        # Torque limits, (n_joints,) each: of the robot file, after derating, and the minimum of that and the command's.
         self._full_limit_nm = np.array([joint.limits.torque_nm for joint in joints])
         self._derated_limit_nm = self._full_limit_nm
         self._limit_nm = self._full_limit_nm.copy()
         self._commanded_limit_nm: list[float] = self._limit_nm.tolist()
         self._limit_is_changing = False
-        self._decay = np.array([_decay(period_s, joint.motor.response_time_s) for joint in joints])
+        self._torque_decay = np.array(
+            [_compute_torque_decay(period_s, joint.motor.response_time_s) for joint in joints]
+        )
 
-        # Present modes, and where their inputs are in `ctrl`.
+        # Current modes, and the indices of their inputs in `ctrl`.
         self._modes: list[Mode] = []
         self._input_indices = np.empty(0, dtype=np.intp)
         self._passive_indices: list[int] = []
-        expected = [[1.0, 1.0, joint.limits.speed_rad_s] for joint in joints]
-        assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == expected)
+        # The gains of `add_motor` must be where the indices of this module say.
+        expected_gains = [[1.0, 1.0, joint.limits.speed_rad_s] for joint in joints]
+        assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == expected_gains)
         self.switch_off()
 
-    def use_state(self, data: MotorData) -> None:
+    def bind_state(self, data: MotorData) -> None:
         """Read and write the arrays of this state from now on."""
         self._torque_state = data.act  # empty when the motors have no lag
         self._applied_nm = data.actuator_force[: self.count]
-        self._inputs = data.ctrl[: INPUTS * self.count]
+        self._inputs = data.ctrl[: INPUTS_PER_MOTOR * self.count]
 
     def enact(self, setpoints: SafeSetpoints) -> None:
         """Apply setpoints, tail to head; they hold until the next call.
 
         Raises:
-            BackendError: a drive does not have the mode of its setpoint.
+            BackendError: A drive does not have the mode of its setpoint.
         """
-        self.drive(setpoints.mode, setpoints.target, setpoints.torque_limit_nm)
+        self.set_inputs(setpoints.mode, setpoints.target, setpoints.torque_limit_nm)
 
-    def drive(self, modes: list[Mode], targets: list[float], limits_nm: list[float]) -> None:
+    def set_inputs(self, modes: list[Mode], targets: list[float], limits_nm: list[float]) -> None:
         """Drive the simulated motors, as `enact` does; also before a run begins, when no limiter is there yet."""
         if modes != self._modes:
             self._change_modes(modes)
@@ -160,34 +170,37 @@ class Motors:
     def switch_off(self) -> None:
         """Make all joints passive."""
         zeros = [0.0] * self.count
-        self.drive([Mode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist())
+        self.set_inputs([Mode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist())
 
-    def before_steps(self) -> None:
-        """Apply a lowered limit as fast as the motor can follow, and end wind-up above it. Call it once a tick."""
+    def apply_pending_torque_limits(self) -> None:
+        """Lower the torque limits as fast as the motors can follow, and end wind-up above them.
+
+        Call this once in each tick, before the physics steps.
+        """
         if len(self._torque_state) == 0:
             if self._limit_is_changing:
                 self._set_range(self._limit_nm)
                 self._limit_is_changing = False
             return
         if self._limit_is_changing:
-            remaining_nm = np.abs(self._applied_nm) * self._decay
+            remaining_nm = np.abs(self._applied_nm) * self._torque_decay
             self._limit_is_changing = bool(np.any(remaining_nm > self._limit_nm))
             self._set_range(np.maximum(self._limit_nm, remaining_nm))
         np.minimum(self._torque_state, self._max_torque_nm, out=self._torque_state)
         np.maximum(self._torque_state, self._min_torque_nm, out=self._torque_state)
 
-    def applied_nm(self) -> Floats:
+    def get_applied_torque_nm(self) -> Floats:
         """Return a view of the torque of every motor over the last physics step, (n_joints,) float64."""
         return self._applied_nm
 
     @property
-    def limit_is_changing(self) -> bool:
-        """Return whether the torque limits have not reached their new values yet."""
+    def is_limit_changing(self) -> bool:
+        """Whether the torque limits have not reached their new values yet."""
         return self._limit_is_changing
 
     @property
     def torque_range_nm(self) -> tuple[Floats, Floats]:
-        """Return views of the minimum and maximum torque of every motor at present, (n_joints,) each."""
+        """Views of the current minimum and maximum torque of every motor, (n_joints,) each."""
         return self._min_torque_nm, self._max_torque_nm
 
     def _update_limit(self) -> None:
@@ -202,7 +215,7 @@ class Motors:
         """Set the gains of new modes, and find their inputs.
 
         Raises:
-            BackendError: a drive does not have a mode.
+            BackendError: A drive does not have a mode.
         """
         for gains, mode, name in zip(self._gains_by_mode, modes, self._names, strict=True):
             if mode not in gains:
@@ -211,13 +224,15 @@ class Motors:
         self._gains[:, [KP, KD, MAX_VOLTS]] = [
             gains[mode] for gains, mode in zip(self._gains_by_mode, modes, strict=True)
         ]
-        indices = [INPUTS * i + INPUT_OF_MODE[mode] for i, mode in enumerate(modes)]
+        indices = [INPUTS_PER_MOTOR * i + INPUT_INDEX_BY_MODE[mode] for i, mode in enumerate(modes)]
         self._input_indices = np.array(indices, dtype=np.intp)
-        self._passive_indices = [INPUTS * i + TORQUE_INPUT for i, mode in enumerate(modes) if mode == Mode.PASSIVE]
+        self._passive_indices = [
+            INPUTS_PER_MOTOR * i + TORQUE_INPUT for i, mode in enumerate(modes) if mode == Mode.PASSIVE
+        ]
         self._inputs[:] = 0.0
 
 
-def _decay(period_s: float, response_time_s: float) -> float:
+def _compute_torque_decay(period_s: float, response_time_s: float) -> float:
     """Return the fraction of its torque that a motor without demand still has after a control period."""
     if response_time_s > 0:
         return math.exp(-period_s / response_time_s)

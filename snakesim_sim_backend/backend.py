@@ -9,28 +9,28 @@ import numpy as np
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.model.fault_plan import check_backend_can
+from snakesim_hal.model.fault_plan import validate_faults_for_backend
 from snakesim_hal.model.robot import describe_robot
-from snakesim_hal.model.scenario import RunConfig, config_hash
-from snakesim_hal.physics.motor import check_gains
+from snakesim_hal.model.scenario import RunConfig, compute_config_hash
+from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import ClockMode, Description, Fault, LifecycleState
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.laws.version import LawsVersion
-from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, build, of_joints
+from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, build_sim_model, view_joint_states
 from snakesim_sim_backend.model.tether import TetherRope
 from snakesim_sim_backend.physics import Physics
-from snakesim_sim_backend.sensors.registry import check_models
+from snakesim_sim_backend.sensors.registry import check_sensor_models
 from snakesim_sim_backend.sensors.suite import Sensors
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.state.contacts import TouchReader
-from snakesim_sim_backend.state.divergence import MAX_SPEED, DivergenceWatch, log_warnings
-from snakesim_sim_backend.state.start import place_robot
+from snakesim_sim_backend.state.contacts import ObstacleContactReader
+from snakesim_sim_backend.state.divergence import MAX_SPEED, DivergenceWatch, log_mujoco_warnings
+from snakesim_sim_backend.state.start import place_and_settle_robot
 from snakesim_sim_backend.state.truth import TrueState
 
 NAME = "sim"
-CLOSED = "the simulation is closed; open a new backend"
-MOTORS_OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
+CLOSED_MESSAGE = "the simulation is closed; open a new backend"
+STATES_WITH_MOTORS_OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
 DIVERGED_SPEED_M_S = 10.0 * MAX_SPEED  # of the base, when a divergence is injected
 
 
@@ -41,74 +41,74 @@ class SimBackend(Backend):
 
     @classmethod
     def check(cls, config: RunConfig, settings: SimSettings) -> tuple[ClockMode, ...]:
-        """Check that this backend can run a scenario, before anything is started.
+        """Check that the simulator can run a configuration, before anything is started.
 
         Args:
-            config: configuration of the run.
-            settings: settings of this backend, which are not needed here.
+            config: Configuration of the run.
+            settings: Settings of the simulator, which are not needed here.
 
         Returns:
             The clock modes that the simulator supports, which are all of them.
 
         Raises:
-            ConfigError: a gain, a sensor or an injected fault of the run is not possible here.
+            ConfigError: The simulator does not support a gain, a sensor or an injected fault of the run.
         """
         del settings
-        check_gains(config.robot)
-        check_models(config.robot)
-        possible_faults = ["diverge"]
-        because = "the simulator has neither modules nor buses"
+        validate_position_gains(config.robot)
+        check_sensor_models(config.robot)
+        supported_faults = ["diverge"]
+        explanation = "the simulator has neither modules nor buses"
         if config.robot.sensors.power is not None:
-            possible_faults.append("overheat")
+            supported_faults.append("overheat")
         else:
-            because += ", and without [sensors.power] in the robot file heat would not be measured"
-        check_backend_can(config, does=possible_faults, buses=0, because=because)
+            explanation += ", and without [sensors.power] in the robot file heat would not be measured"
+        validate_faults_for_backend(config, supported_kinds=supported_faults, buses=0, reason=explanation)
         return ("lockstep", "realtime", "free")
 
     def __init__(self, config: RunConfig, settings: SimSettings, *, laws: LawsVersion | None = None) -> None:
-        """Build the scene, place the snake and let it come to rest.
+        """Build the scene, place the robot in it, and let it come to rest.
 
         Args:
-            config: the run, with its robot and its scene.
-            settings: parameters of the physics.
-            laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
+            config: Configuration of the run, with its robot and its scene.
+            settings: Parameters of the physics.
+            laws: Version of the laws that computes ground and friction. None for the C version if it can be loaded.
 
         Raises:
-            ConfigError: the settings do not match the robot or the scene.
+            ConfigError: The settings do not match the robot or the scene.
         """
         description = describe_robot(
             config.robot,
             backend=NAME,
             period_ns=config.period_ns,
             lease_ns=config.lease_ns,
-            config_hash=config_hash(config),
+            config_hash=compute_config_hash(config),
             emulated=True,
             simulated_time=True,
         )
-        log_warnings()
+        log_mujoco_warnings()
         self._tick = 0
         self._open = True
         self._period_s = config.period_ns * 1e-9
 
         # Physics and motors, with the snake at rest.
         has_contact_sensor = config.robot.sensors.contacts is not None
-        self._sim = build(config, settings, laws=laws, measures_force=has_contact_sensor)
+        self._sim = build_sim_model(config, settings, laws=laws, measures_force=has_contact_sensor)
         self._description = msgspec.structs.replace(description, laws=self._sim.laws)
         model = self._sim.model
         self._data = mujoco.MjData(model)
         self._physics = Physics(self._sim, self._data)
         self._motors = Motors(model, self._data, config.robot, self._period_s, settings.motor_gain_scale)
-        place_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
-        self._rope: TetherRope | None = None
+        place_and_settle_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
+        self._tether_rope: TetherRope | None = None
         if settings.tether is not None:
-            self._rope = TetherRope(model, self._data, settings.tether)
-            self._rope.tighten()
+            self._tether_rope = TetherRope(model, self._data, settings.tether)
+            self._tether_rope.tighten()
 
         # Heat and sensors.
         self._simulates_heat = config.robot.sensors.power is not None
         self._windings = Thermal(config.robot.joint_table)
         self._sensors = Sensors(self._sim, self._data, config, self._motors, self._physics, self._windings)
-        self._watch = DivergenceWatch(model, self._data, self._physics, self._sim.steps_per_tick)
+        self._divergence_watch = DivergenceWatch(model, self._data, self._physics, self._sim.steps_per_tick)
 
         # IMUs cost time, and only their values in the last step of a tick are read.
         self._flags_with_sensors = int(model.opt.disableflags)
@@ -126,25 +126,25 @@ class SimBackend(Backend):
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Return the sensor samples of `tick`; after a divergence, those of the last good state."""
         if not self._open:
-            raise BackendError(CLOSED, code="backend/closed")
+            raise BackendError(CLOSED_MESSAGE, code="backend/closed")
         return self._sensors.sample(tick, timestamp_ns)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Give the motors new setpoints. While disarmed they are off, whatever the setpoints."""
-        if lifecycle in MOTORS_OFF:
+        if lifecycle in STATES_WITH_MOTORS_OFF:
             self._motors.switch_off()
         else:
             self._motors.enact(setpoints)
 
     def advance(self) -> None:
-        """Step the physics through one control period.
+        """Step the physics through one control period, check for divergence, and update the winding temperatures.
 
         Raises:
-            BackendError: the simulation has diverged, or is closed.
+            BackendError: The simulation has diverged, or is closed.
         """
         if not self._open:
-            raise BackendError(CLOSED, code="backend/closed")
-        self._motors.before_steps()
+            raise BackendError(CLOSED_MESSAGE, code="backend/closed")
+        self._motors.apply_pending_torque_limits()
         self._tick += 1
         try:
             if self._steps_without_sensors:
@@ -152,18 +152,18 @@ class SimBackend(Backend):
                 self._physics.step(self._steps_without_sensors)
                 self._option.disableflags = self._flags_with_sensors
             self._physics.step(self._steps_with_sensors)
-            self._watch.check(self._tick)
+            self._divergence_watch.check(self._tick)
         except mujoco.FatalError as error:
             raise BackendError(
                 f"MuJoCo cannot go on at tick {self._tick}: {error}", code="simulator/diverged"
             ) from error
         if self._simulates_heat:
-            self._warm_windings()
+            self._update_winding_temperatures()
 
-    def _warm_windings(self) -> None:
-        """Let a period of heat pass, and derate hot joints. The torque of the last step stands for the period."""
-        self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
-        remaining_fraction = self._windings.remaining_fraction()
+    def _update_winding_temperatures(self) -> None:
+        """Heat the windings for a control period by the torque of its last step, and derate hot joints."""
+        self._windings.advance_temperatures(self._period_s, np.square(self._motors.get_applied_torque_nm()))
+        remaining_fraction = self._windings.compute_remaining_fractions()
         if remaining_fraction is not None:
             self._motors.derate(remaining_fraction)
 
@@ -172,10 +172,11 @@ class SimBackend(Backend):
 
         A divergence is raised by `advance`.
         """
-        if not self._sensors.late:
+        if not self._sensors.dropped_counts:
             return []
         return [
-            Fault(tick=self._tick, what="sample_late", cause=cause, reach="none") for cause in self._sensors.lateness()
+            Fault(tick=self._tick, what="sample_late", cause=cause, reach="none")
+            for cause in self._sensors.describe_dropped_samples()
         ]
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
@@ -186,7 +187,7 @@ class SimBackend(Backend):
         match injection.target_type, injection.kind:
             case "joint", "overheat" if self._simulates_heat:
                 hold = begins and injection.end_s != math.inf
-                self._windings.inject(injection.number, heat=begins, hold=hold)
+                self._windings.inject_heat(injection.target_index, heat=begins, hold=hold)
                 return True
             case "simulator", "diverge":
                 if begins:
@@ -222,14 +223,14 @@ class SimBackend(Backend):
     @property
     def tether_tension_n(self) -> float | None:
         """Force in the tether over the last physics step; None without a tether."""
-        if self._rope is None:
+        if self._tether_rope is None:
             return None
-        return self._rope.tension_n()
+        return self._tether_rope.measure_tension_n()
 
     def true_state(self) -> TrueState:
         """Return the exact state, without noise, rate or delay."""
         data = self._data
-        angles_rad, velocities_rad_s = of_joints(data, self._motors.count)
+        angles_rad, velocities_rad_s = view_joint_states(data, self._motors.count)
         return TrueState(
             time_s=data.time,
             base_position_w=data.qpos[:3].copy(),
@@ -237,6 +238,6 @@ class SimBackend(Backend):
             base_velocity_w=data.qvel[:3].copy(),
             angles_rad=angles_rad.copy(),
             velocities_rad_s=velocities_rad_s.copy(),
-            torques_nm=self._motors.applied_nm().copy(),
-            contacts=list(TouchReader(self._sim, data, self._physics.contacts).read()),
+            torques_nm=self._motors.get_applied_torque_nm().copy(),
+            contacts=list(ObstacleContactReader(self._sim, data, self._physics.contacts).read()),
         )

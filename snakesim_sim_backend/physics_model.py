@@ -15,19 +15,19 @@ from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model.build import FREE_DOFS, SimModel, build, of_joints
+from snakesim_sim_backend.model.build import FREE_DOFS, SimModel, build_sim_model, view_joint_states
 from snakesim_sim_backend.model.tether import TetherRope
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
-from snakesim_sim_backend.state.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
-from snakesim_sim_backend.state.loads import LoadReader
-from snakesim_sim_backend.state.start import place_robot
+from snakesim_sim_backend.state.divergence import MAX_ACCELERATION, DivergenceWatch, log_mujoco_warnings
+from snakesim_sim_backend.state.loads import LinkLoadReader
+from snakesim_sim_backend.state.start import place_and_settle_robot
 
 STEPS_PER_CHECK = 10  # the search for the cause of a divergence repeats them under the last torques
 MAX_ACCELERATION_SQUARED = MAX_ACCELERATION**2
-NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+DISABLE_SENSORS_FLAG = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
 class MujocoPhysicsModel(PhysicsModel):
@@ -40,42 +40,42 @@ class MujocoPhysicsModel(PhysicsModel):
     Settings = PhysicsModelSettings
 
     def __init__(self, config: RunConfig, settings: PhysicsModelSettings) -> None:
-        """Build the scene of a run without motors, and place the snake in it at rest, as `SimBackend` does.
+        """Build the scene of a run without motors, and place the robot in it at rest, as `SimBackend` does.
 
-        Emulated drives then move it by the torques that they compute.
+        Emulated drives then move the robot by the torques that they compute.
 
         Args:
-            config: the run, with its robot and its scene.
-            settings: parameters of the physics.
+            config: Configuration of the run, with its robot and its scene.
+            settings: Parameters of the physics.
 
         Raises:
-            ConfigError: the settings do not match the robot or the scene.
+            ConfigError: The settings do not match the robot or the scene.
         """
-        log_warnings()
-        self._sim = build(config, settings, motors=False)
+        log_mujoco_warnings()
+        self._sim = build_sim_model(config, settings, motors=False)
         self._model = self._sim.model
         self._data = mujoco.MjData(self._model)
         self.step_s: float = self._model.opt.timestep
-        self._data.qpos[:] = _compute_rest(config, settings, yields=bool(self._sim.yielding))
+        self._data.qpos[:] = _compute_rest_coordinates(config, settings, yields=bool(self._sim.yielding))
         self._physics = Physics(self._sim, self._data)
-        self._physics.begin()
+        self._physics.reset()
         if settings.tether is not None:
             TetherRope(self._model, self._data, settings.tether).tighten()
-        self._make_views(config)
+        self._bind_mujoco_arrays(config)
         self._make_sensors(config)
 
         # Detection of divergence.
         self._step_count = 0
         self._unchecked_steps = 0
-        self._diverged = False
-        self._watch = DivergenceWatch(self._model, self._data, self._physics, STEPS_PER_CHECK, "step")
+        self._has_diverged = False
+        self._divergence_watch = DivergenceWatch(self._model, self._data, self._physics, STEPS_PER_CHECK, "step")
 
-    def _make_views(self, config: RunConfig) -> None:
+    def _bind_mujoco_arrays(self, config: RunConfig) -> None:
         """Make the views of MuJoCo's arrays that a step reads and writes."""
         data = self._data
         count = config.robot.chain.modules
         joints = slice(FREE_DOFS, FREE_DOFS + count)
-        self._angles, self._velocities = of_joints(data, count)
+        self._angles, self._velocities = view_joint_states(data, count)
         self._motor_torques = data.qfrc_applied[joints]
         self._viscous_torques = data.qfrc_damper[joints]
         self._all_accelerations = data.qacc
@@ -90,14 +90,14 @@ class MujocoPhysicsModel(PhysicsModel):
 
     def _make_sensors(self, config: RunConfig) -> None:
         """Make the readers, and switch off what MuJoCo computes for IMUs: it costs more than all else; see `imu`."""
-        self._loads = LoadReader(self._sim, self._data, self._physics)
+        self._loads = LinkLoadReader(self._sim, self._data, self._physics)
         self._pose = PoseReader(self._data, PoseSensor(), np.zeros)
         self._imu = None
         if config.robot.sensors.imu is not None:
             links = config.robot.chain.modules + 1
             self._imu = ImuReader(self._data, ImuSensor(), links, np.zeros)
         self._flags_with_sensors = int(self._model.opt.disableflags)
-        self._flags_without_sensors = self._flags_with_sensors | NO_SENSORS
+        self._flags_without_sensors = self._flags_with_sensors | DISABLE_SENSORS_FLAG
         self._model.opt.disableflags = self._flags_without_sensors
 
     def advance(self, torque_nm: Floats) -> None:
@@ -107,10 +107,10 @@ class MujocoPhysicsModel(PhysicsModel):
             torque_nm: (n_joints,) torques during the step, tail to head.
 
         Raises:
-            BackendError: the simulation has diverged, in this step or before. Its state is the last good one.
+            BackendError: The simulation has diverged, in this step or before. Its state is the last good one.
         """
-        if self._diverged:
-            self._watch.check(self._step_count)  # raises again
+        if self._has_diverged:
+            self._divergence_watch.check(self._step_count)  # raises the same error again
         self._motor_torques[:] = torque_nm
         self._velocities_before_step[:] = self._all_velocities
         self._step_count += 1
@@ -122,19 +122,19 @@ class MujocoPhysicsModel(PhysicsModel):
             ) from error
         self._unchecked_steps += 1
         # Divergence shows here first. It is detected in the same step, because firmware would read NaN otherwise.
-        plausible = self._all_accelerations.dot(self._all_accelerations) < MAX_ACCELERATION_SQUARED
-        if self._unchecked_steps == STEPS_PER_CHECK or not plausible:
-            self._check_divergence()
+        is_plausible = self._all_accelerations.dot(self._all_accelerations) < MAX_ACCELERATION_SQUARED
+        if self._unchecked_steps == STEPS_PER_CHECK or not is_plausible:
+            self._check_and_store_state()
 
-    def _check_divergence(self) -> None:
-        """Keep a good state. Restore the last good one and raise BackendError if the simulation has diverged."""
-        self._diverged = True
+    def _check_and_store_state(self) -> None:
+        """Store a good state. If the simulation has diverged, restore the last good state and raise BackendError."""
+        self._has_diverged = True
         try:
-            self._watch.check(self._step_count)
+            self._divergence_watch.check(self._step_count)
         except BackendError:
             self._velocities_before_step[:] = self._all_velocities  # those of the state that the watch has restored
             raise
-        self._diverged = False
+        self._has_diverged = False
         self._unchecked_steps = 0
 
     @property
@@ -211,7 +211,7 @@ class MujocoPhysicsModel(PhysicsModel):
         return self._data
 
 
-def _compute_rest(config: RunConfig, settings: PhysicsModelSettings, *, yields: bool) -> Floats:
+def _compute_rest_coordinates(config: RunConfig, settings: PhysicsModelSettings, *, yields: bool) -> Floats:
     """Return the coordinates at which `SimBackend` comes to rest, (nq,): its motors hold the start angles until then.
 
     On rough ground they depend on the step by millimeters, so the step is the default one of `SimBackend`, unless
@@ -220,8 +220,8 @@ def _compute_rest(config: RunConfig, settings: PhysicsModelSettings, *, yields: 
     step_s = min(SimSettings().timestep_s, settings.contact_time_s / 2)
     if yields:
         step_s = min(step_s, settings.timestep_s)
-    sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))
+    sim = build_sim_model(config, msgspec.structs.replace(settings, timestep_s=step_s))
     data = mujoco.MjData(sim.model)
     motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9)
-    place_robot(sim, data, Physics(sim, data), config, motors, settings.settle_s)
+    place_and_settle_robot(sim, data, Physics(sim, data), config, motors, settings.settle_s)
     return data.qpos

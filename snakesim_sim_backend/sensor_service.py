@@ -13,8 +13,8 @@ from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, JointState, Message, Pose
-from snakesim_sim_backend.model.build import FREE_QPOS, build, of_joints
-from snakesim_sim_backend.sensors.registry import mounted_reader, own_noise
+from snakesim_sim_backend.model.build import FREE_QPOS, build_sim_model, view_joint_states
+from snakesim_sim_backend.sensors.registry import make_mounted_reader, make_sensor_rng
 from snakesim_sim_backend.sensors.scope import Reader, Scope
 from snakesim_sim_backend.settings import SimSettings
 
@@ -28,13 +28,13 @@ class SensorService(Service):
         """Build the scene.
 
         Raises:
-            ConfigError: the scene cannot be built.
+            ConfigError: The scene cannot be built.
         """
         self._client = client
         self._config = config
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._pose = client.subscribe(keys.POSE, Pose)
-        self._sim = build(config, SimSettings(), motors=False)
+        self._sim = build_sim_model(config, SimSettings(), motors=False)
         self._data = mujoco.MjData(self._sim.model)
         self._readers: list[tuple[str, Reader]] = []
 
@@ -42,10 +42,10 @@ class SensorService(Service):
         """Make a reader for each sensor of the robot file that the robot's HAL does not have."""
         published = {sensor.key for sensor in robot.sensors}
         self._readers = []
-        for key, sensor in self._config.robot.sensors.mounted():
+        for key, sensor in self._config.robot.sensors.iterate_mounted():
             if key not in published:
-                scope = Scope(self._config, self._sim, self._data, own_noise(key, self._config.seed))
-                self._readers.append((key, mounted_reader(key, sensor, scope)))
+                scope = Scope(self._config, self._sim, self._data, make_sensor_rng(key, self._config.seed))
+                self._readers.append((key, make_mounted_reader(key, sensor, scope)))
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """Return a sample of each sensor, in every cycle, whatever rate the robot file has.
@@ -64,6 +64,6 @@ class SensorService(Service):
         orientation = np.asarray(pose.orientation_wxyz)
         self._data.qpos[:3] = pose.position_w
         self._data.qpos[3:FREE_QPOS] = orientation / np.linalg.norm(pose.orientation_wxyz)
-        angles_rad, _ = of_joints(self._data, len(joints.angle_rad))
+        angles_rad, _ = view_joint_states(self._data, len(joints.angle_rad))
         angles_rad[:] = joints.angle_rad
         mujoco.mj_kinematics(self._sim.model, self._data)

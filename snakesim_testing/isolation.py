@@ -6,10 +6,10 @@ import shutil
 import signal
 import tempfile
 
-from snakesim_hal.base.arithmetic import pin
+from snakesim_hal.base.arithmetic import pin_common_arithmetic
 
 if "SNAKESIM_UNPINNED" not in os.environ:  # set by verification/computers/test_computers.py
-    pin(one_thread=True)  # so that what is computed in this process is what `snakesim` computes
+    pin_common_arithmetic(one_thread=True)  # so that what is computed in this process is what `snakesim` computes
 
 # What runs leave behind for this user (a latched stop, the list of live robots) must not meet that of other tests.
 _state = tempfile.mkdtemp(prefix="snakesim-tests-")

@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command
 from verification.mutation.trial import TRIED_BY
 
 ROOT = Path(__file__).parents[1]
@@ -131,7 +131,7 @@ def _run(name: str) -> bool:
     print(f"== {name}: {part.about}", flush=True)
     began_s = time.monotonic()
     words = part.command if part.script else ("-m", *part.command)
-    code = subprocess.run(python_command(*words), cwd=ROOT, env=child_environment(), check=False).returncode
+    code = subprocess.run(make_python_command(*words), cwd=ROOT, env=make_child_environment(), check=False).returncode
     print(f"== {name}: exit code {code} after {(time.monotonic() - began_s) / 60:.1f} min", flush=True)
     return code == 0
 

@@ -26,7 +26,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.model.checked import JointProperty
 from snakesim_hal.model.robot import describe_robot
-from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Imu, JointState, Mode
@@ -72,13 +72,13 @@ class CheckTrial:
     def blamed(self) -> list[str]:
         """Sound joints of which something is wrong."""
         rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
-        return [f"{row.joint}: {row.summary}" for row in rows if row.properties("wrong")]
+        return [f"{row.joint}: {row.summary}" for row in rows if row.list_properties("wrong")]
 
     @property
     def unsure(self) -> list[str]:
         """Sound joints of which something is unknown."""
         rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
-        return [f"{row.joint}: {row.summary}" for row in rows if row.properties("unknown")]
+        return [f"{row.joint}: {row.summary}" for row in rows if row.list_properties("unknown")]
 
 
 def check_trial(number: int, fault: str, *sets: str, modules: int = 8, seconds: float = 13.0) -> CheckTrial:
@@ -111,19 +111,19 @@ def check_trial(number: int, fault: str, *sets: str, modules: int = 8, seconds: 
 
 def _checked(*sets: str) -> list[JointVerdict]:
     """Run the joint check in this process, and judge it."""
-    config = load("joint_check", [parse_set(text) for text in sets]).config
+    config = load_scenario("joint_check", [parse_set_option(text) for text in sets]).config
     imus: list[Imu] = []
     with InProcessRun(config) as run:
-        reader = run.network.session().reader(keys.IMU, Imu)
+        reader = run.network.create_session().declare_reader(keys.IMU, Imu)
         box = run.host.black_box
         rows = b""
         for _ in run.iterate_ticks():
             imus += reader.drain()
             rows += box.read_rows(len(rows) // box.layout.row_bytes)[1]
-        columns = box.layout.arrays(rows)
+        columns = box.layout.decode_rows(rows)
         robot = run.host.description
     ticks = columns.pop("tick").tolist()
-    return judge_joints(collect_measurements(config, robot, ticks, columns, imus), straight=True)
+    return judge_joints(collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True)
 
 
 def check_table(first: int, trials: int, *sets: str) -> list[str]:
@@ -184,7 +184,7 @@ class IdentifyTrial:
                     continue
                 truth = getattr(self.truth[one.joint], name)
                 self.written += 1
-                self.covered += value.covers(truth)
+                self.covered += value.contains(truth)
                 self.constants_off += name == "torque_constant_nm_per_a" and abs(value.value / truth - 1) > 0.1
 
     @property
@@ -200,7 +200,7 @@ def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTr
     """
     pick = random.Random(number)
     texts = (*IDENTIFY_ROBOT, f"seed={number + 1}", *sets)
-    config = load("identify", [parse_set(text) for text in texts]).config
+    config = load_scenario("identify", [parse_set_option(text) for text in texts]).config
     truth: dict[str, Mounted] = {}
     latency_s: list[float] = []
     loose = pick.randrange(IDENTIFY_MODULES)

@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import simulate
 
@@ -46,7 +46,7 @@ ROWS = (
 def run_row(row: Row, seed: int) -> RunSummary:
     """Run one trial, and return its summary."""
     sets = (f"controller={row.gait}", f"duration_s={DURATION_S}", f"seed={seed}", *row.sets)
-    return simulate(load(row.scenario, [parse_set(text) for text in sets]).config).summary
+    return simulate(load_scenario(row.scenario, [parse_set_option(text) for text in sets]).config).summary
 
 
 def format_row(row: Row, summaries: Sequence[RunSummary]) -> str:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from snakesim_hal.base import arithmetic
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.run.in_process import simulate
 
 FILE = Path(__file__).parents[1] / "tests" / "golden.json"
@@ -19,7 +19,7 @@ GOLDEN: dict[str, str] = json.loads(FILE.read_text()) if FILE.exists() else {}
 
 def main() -> int:
     """Write the file. Exit code 1 when nobody else would get what this computer computes."""
-    if not arithmetic.common_environment():
+    if not arithmetic.make_common_arithmetic_env():
         print("this processor lacks AVX2 and FMA: nothing is written")
         return 1
     measured = arithmetic.measure_arithmetic()
@@ -32,7 +32,9 @@ def main() -> int:
         return 1
     found: dict[str, str] = {}
     for name in SCENARIOS:
-        found[name] = simulate(load(name, [parse_set(f"duration_s={SECONDS}")]).config).summary.command_digest[:16]
+        found[name] = simulate(
+            load_scenario(name, [parse_set_option(f"duration_s={SECONDS}")]).config
+        ).summary.command_digest[:16]
         print(f"{name:<12}{GOLDEN.get(name, 'new'):<18}{found[name]}{'' if GOLDEN.get(name) == found[name] else '  *'}")
     FILE.write_text(json.dumps(found, indent=2) + "\n")
     return 0

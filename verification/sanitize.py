@@ -10,10 +10,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from snakesim_hal.base.process import child_environment
+from snakesim_hal.base.process import make_child_environment
 from snakesim_native.compile import CannotCompileError, compile_library, list_compilers
 from snakesim_native.libraries import LIBRARIES
-from snakesim_native.load import SWITCH
+from snakesim_native.load import SWITCH_VARIABLE
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "build" / "sanitized"
@@ -40,12 +40,12 @@ def main() -> int:
         print(f"sanitize: {error}")
         return 1
     environment = {
-        SWITCH: str(FOLDER),
+        SWITCH_VARIABLE: str(FOLDER),
         "LD_PRELOAD": " ".join(find_sanitizers()),
         "ASAN_OPTIONS": "detect_leaks=0",  # Python frees little at its end
     }
     command = [sys.executable, "-m", "pytest", "-q", "--timeout", "1200", "-p", "no:cacheprovider", *arguments.tests]
-    return subprocess.call(command, cwd=ROOT, env=child_environment(environment))
+    return subprocess.call(command, cwd=ROOT, env=make_child_environment(environment))
 
 
 def find_sanitizers() -> list[str]:

@@ -19,10 +19,10 @@ from pathlib import Path
 
 from PIL import Image
 
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.browser import chromium
-from snakesim_testing.runs.command import running
+from snakesim_testing.operator.browser import open_chromium
+from snakesim_testing.runs.command import running_snakesim
 
 SETTLE_S = 6.0  # for the browser to draw, without a graphics card
 PHONE = 400, 800
@@ -46,7 +46,7 @@ def main() -> None:
     shown = recording(given.run, given.at) if recorded else live(given.run)
     if given.commission:
         shown = commissioning(given.run, given.commission)
-    with shown as address, chromium() as browser:
+    with shown as address, open_chromium() as browser:
         tab = browser.open(address, width, height)
         if given.phone:
             tab.size(width, height, scale=2.0, mobile=True)
@@ -84,7 +84,7 @@ def recording(folder: str, at_s: float) -> Iterator[str]:
 @contextlib.contextmanager
 def commissioning(arguments: str, file: str) -> Iterator[str]:
     """A host that is not armed, and the address of a console that may write into its robot file."""
-    endpoint, snakesim = free_endpoint(), [sys.executable, "-m", "snakesim_operator"]
+    endpoint, snakesim = find_free_endpoint(), [sys.executable, "-m", "snakesim_operator"]
     with tempfile.TemporaryDirectory() as state:
         own = {**os.environ, "XDG_STATE_HOME": state}
         host = subprocess.Popen([*snakesim, "host", *shlex.split(arguments), "--endpoint", endpoint], env=own)
@@ -106,7 +106,7 @@ def commissioning(arguments: str, file: str) -> Iterator[str]:
 def live(arguments: str) -> Iterator[str]:
     """A run with its console, and the address."""
     words = [*shlex.split(arguments), "--clock-mode", "realtime", "--console"]
-    with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "run", *words) as run:
+    with tempfile.TemporaryDirectory() as folder, running_snakesim(Path(folder) / "run", *words) as run:
         yield run.console()
         run.process.terminate()
         run.end()

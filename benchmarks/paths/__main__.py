@@ -57,7 +57,7 @@ def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(
         routers(way, stack, folder)
         log = folder / "ours.log"
         flags = [*scenario, "--duration", str(seconds)]
-        service = way.workstation.module(
+        service = way.workstation.start_module(
             "snakesim_hal.programs.service_program", "control", *flags, *way.service, log=log
         )
         stack.callback(_end, service)
@@ -72,7 +72,7 @@ def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(
                 "--parent-socket",
                 str(its.fileno()),
             ]
-            host = way.robot.module(
+            host = way.robot.start_module(
                 "snakesim_hal.programs.host_program", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
             )
         stack.callback(_end, host)
@@ -105,10 +105,10 @@ def raw(way: Way, seconds: float, folder: Path, state: bytes, command: bytes) ->
         routers(way, stack, folder)
         log, out = folder / "raw.log", folder / "times.json"
         sizes = ("--bytes", str(len(state)), "--rounds", str(round(seconds / PERIOD_S)), "--out", str(out))
-        ask = way.robot.module(_RAW, "ask", str(way.robot_file), *sizes, log=log)
+        ask = way.robot.start_module(_RAW, "ask", str(way.robot_file), *sizes, log=log)
         stack.callback(_end, ask)
         time.sleep(0.5)  # direct: it listens
-        answer = way.workstation.module(
+        answer = way.workstation.start_module(
             _RAW, "answer", str(way.workstation_file), "--bytes", str(len(command)), log=log
         )
         stack.callback(_end, answer)
@@ -124,7 +124,7 @@ _RAW = "benchmarks.paths.raw"
 def routers(way: Way, stack: ExitStack, folder: Path) -> None:
     """Start the routers of a way."""
     for machine, path in way.routers:
-        router = machine.module(_RAW, "router", str(path), log=folder / "router.log")
+        router = machine.start_module(_RAW, "router", str(path), log=folder / "router.log")
         stack.callback(_end, router)
     time.sleep(1.0 if way.routers else 0.0)
 
@@ -218,7 +218,7 @@ def watched(way: Way, seconds: float, folder: Path) -> tuple[Percentiles, float]
     seen = folder / "seen.json"
     with ExitStack() as stack:
         reading = ("--key", IMAGES, "--out", str(seen))
-        viewer = way.workstation.module(_RAW, "read", str(way.workstation_file), *reading, log=Path("/dev/null"))
+        viewer = way.workstation.start_module(_RAW, "read", str(way.workstation_file), *reading, log=Path("/dev/null"))
         stack.callback(_end, viewer)
         busy = ours(way, seconds, folder, CAMERA)
         _, size = json.loads(seen.read_text())

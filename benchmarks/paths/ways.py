@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from snakesim_testing.lab.machines import Machine, wire
+from snakesim_testing.lab.machines import Machine, connect_by_cable
 
 PORT = 7447
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
@@ -33,11 +33,11 @@ class Lab:
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
         self.robot, self.first, self.second, self.workstation = (Machine(stack) for _ in range(4))
-        wire(self.first, self.robot, "robot", "10.78.1")
-        wire(self.first, self.workstation, "desk", "10.78.2")
-        wire(self.first, self.second, "trunk", "10.78.3")
-        wire(self.second, self.workstation, "desk2", "10.78.4")
-        wire(self.robot, self.workstation, "direct", "10.78.5")
+        connect_by_cable(self.first, self.robot, "robot", "10.78.1")
+        connect_by_cable(self.first, self.workstation, "desk", "10.78.2")
+        connect_by_cable(self.first, self.second, "trunk", "10.78.3")
+        connect_by_cable(self.second, self.workstation, "desk2", "10.78.4")
+        connect_by_cable(self.robot, self.workstation, "direct", "10.78.5")
 
     def ways(self) -> list[Way]:
         """All of them."""

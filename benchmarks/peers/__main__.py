@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.echo import measure_echo_times_us
 from benchmarks.physics import encode_tick, load_config
 from benchmarks.whole import run
-from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.safety.authority import Authority
 
@@ -48,15 +48,15 @@ def main() -> int:
     if arguments.inside:
         return _measure(write=arguments.write)
     _install()
-    again = python_command("-m", "benchmarks.peers", "--inside", *(["--write"] if arguments.write else []))
+    again = make_python_command("-m", "benchmarks.peers", "--inside", *(["--write"] if arguments.write else []))
     user = () if os.geteuid() == 0 else ("--map-root-user",)
     shell = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
-    return subprocess.call([*ISOLATED, *user, *shell, *again], env=child_environment())
+    return subprocess.call([*ISOLATED, *user, *shell, *again], env=make_child_environment())
 
 
 def _install() -> None:
     if not (DORA / "bin/dora").exists():
-        subprocess.run(python_command("-m", "venv", str(DORA)), env=child_environment(), check=True)
+        subprocess.run(make_python_command("-m", "venv", str(DORA)), env=make_child_environment(), check=True)
         packages = ("dora-rs", "dora-rs-cli", "pyarrow", "numpy")
         subprocess.run([DORA / "bin/python", "-m", "pip", "install", "--quiet", *packages], check=True)
     if not _has_rospy():

@@ -120,7 +120,7 @@ class HeightModel(SensorModel):
 """
 DRIVER_EXAMPLE = """\
 from snakesim_drivers.kit.drive_settings import DriveSettings
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, group_by_port
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, make_bus_specs_by_port
 
 
 class MySettings(DriveSettings, frozen=True, kw_only=True):
@@ -149,7 +149,7 @@ class MyBackend(DriverTypeBackend):
         def open_drives(port, indices, readings):
             raise NotImplementedError("return your subclass of Drives")
 
-        return group_by_port(context.joints, context.settings, context.settings.ports, open_drives)
+        return make_bus_specs_by_port(context.joints, context.settings, context.settings.ports, open_drives)
 """
 
 PAGES = (
@@ -162,7 +162,7 @@ PAGES = (
         "print(f\"{result.metrics['advance_m']:.2f} m, digest {result.digest[:16]}\")\n"
         'print(result["angle_rad.joint_7"].max(), result.units["angle_rad"])\n',
         {
-            "snakesim": ("run", "load", "Result", "Robot", "find_nodes_w", "use_common_arithmetic"),
+            "snakesim": ("run", "load", "Result", "Robot", "compute_body_points_w", "use_common_arithmetic"),
             "snakesim.chart": ("Chart",),
             "snakesim_operator.robot_commands.parameters": ("Parameter",),
         },
@@ -206,7 +206,14 @@ PAGES = (
         "(../controllers.md) lists the shipped ones.",
         "",
         {
-            "snakesim": ("Controller", "Observation", "ControllerCommand", "Telemetry", "Parameters", "positions"),
+            "snakesim": (
+                "Controller",
+                "Observation",
+                "ControllerCommand",
+                "Telemetry",
+                "Parameters",
+                "make_position_setpoints",
+            ),
             "snakesim_hal.controller": ("SensorSamples", "Task"),
             "snakesim_hal.wire.setpoints": ("RequestedSetpoints",),
             "snakesim_hal.wire.messages": ("Mode", "JointState", "World", "WorldContact", "Trajectory"),
@@ -260,7 +267,7 @@ PAGES = (
         DRIVER_EXAMPLE,
         {
             "snakesim_drivers.kit.drives": ("Drives", "BusCommand"),
-            "snakesim_drivers.kit.drive_type": ("DriverTypeBackend", "DriverTypeContext", "group_by_port"),
+            "snakesim_drivers.kit.drive_type": ("DriverTypeBackend", "DriverTypeContext", "make_bus_specs_by_port"),
             "snakesim_drivers.kit.drive_settings": ("DriveSettings",),
             "snakesim_drivers.kit.start_up": ("StartUp", "StartUpStep", "StepFailedError"),
             "snakesim_drivers.kit.holding_brakes": ("HoldingBrakes", "BrakePlan"),

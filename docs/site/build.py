@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = ROOT / "build" / "site"
@@ -67,7 +67,9 @@ def shown_files() -> Iterator[Path]:
 
 def run(module: str, *arguments: str, **variables: str) -> None:
     """Run a module of this environment's Python, and end with it if it fails."""
-    ended = subprocess.run(python_command("-m", module, *arguments), cwd=ROOT, env=child_environment(variables))
+    ended = subprocess.run(
+        make_python_command("-m", module, *arguments), cwd=ROOT, env=make_child_environment(variables)
+    )
     if ended.returncode:
         sys.exit(f"docs: {module} {' '.join(arguments)} exited with {ended.returncode}")
 

@@ -26,9 +26,9 @@ The table lists the first word of each command. Follow its link for arguments an
 def make_page() -> str:
     """Return the page as it should be."""
     parser = make_parser()
-    about = {action.dest: action.help for action in parser.commands._choices_actions}
+    about = {action.dest: action.help for action in parser.subparsers._choices_actions}
     lines: list[str] = []
-    for heading, actions in parser.commands_by_heading():
+    for heading, actions in parser.list_commands_by_heading():
         for action in actions:
             lines.append(f"| [`snakesim {action.dest}`](#snakesim-{action.dest}) | {heading} | {about[action.dest]} |")
     for name in about:

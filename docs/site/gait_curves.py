@@ -5,10 +5,10 @@ import math
 import numpy as np
 
 from docs.site.drawing import Drawing
-from snakesim_gnc.control.gaits.backbones import BackboneSidewindingParameters, find_arc, find_helix
-from snakesim_gnc.control.gaits.concertina import ConcertinaParameters, find_fold_fractions
+from snakesim_gnc.control.gaits.backbones import BackboneSidewindingParameters, compute_arc, compute_helix
+from snakesim_gnc.control.gaits.concertina import ConcertinaParameters, compute_fold_fractions
 from snakesim_gnc.control.gaits.rectilinear import RectilinearParameters
-from snakesim_gnc.control.gaits.serpenoid import SerpenoidParameters, find_serpenoid_headings
+from snakesim_gnc.control.gaits.serpenoid import SerpenoidParameters, compute_serpenoid_headings
 from snakesim_gnc.control.gaits.sinus_lifting import SinusLiftingParameters
 
 LENGTH_PX = 250.0  # of a body that is straight
@@ -59,7 +59,7 @@ def _list_serpenoid():
     p = SerpenoidParameters()
     phases = (0.0, math.tau / 3, 2 * math.tau / 3)
     return [
-        _integrate(find_serpenoid_headings(MIDDLES_FROM_HEAD, phase, p.winding_angle_rad, p.wavelength))
+        _integrate(compute_serpenoid_headings(MIDDLES_FROM_HEAD, phase, p.winding_angle_rad, p.wavelength))
         for phase in phases
     ]
 
@@ -68,7 +68,7 @@ def _list_concertina():
     p = ConcertinaParameters()
     curves = []
     for phase in (math.tau / 6, math.tau / 2, 5 * math.tau / 6):
-        front, rear = find_fold_fractions(phase)
+        front, rear = compute_fold_fractions(phase)
         folded = np.sqrt(np.where(MIDDLES_FROM_HEAD < 0.5, front, rear))
         waves = np.sin(2 * math.tau * p.folds * MIDDLES_FROM_HEAD)
         curves.append(_integrate(p.winding_angle_rad * folded * waves))
@@ -93,8 +93,8 @@ def _list_lifts():
 
 def _list_helix():
     p = BackboneSidewindingParameters()
-    nodes = find_helix(PLACES, 1.0, p, 0.0).nodes
-    later = find_helix(PLACES, 1.0, p, math.tau / 3).nodes
+    nodes = compute_helix(PLACES, 1.0, p, 0.0).node_positions
+    later = compute_helix(PLACES, 1.0, p, math.tau / 3).node_positions
     left = nodes[0, 0]
     return [
         (nodes[:, 0] - left, nodes[:, 1]),
@@ -104,5 +104,5 @@ def _list_helix():
 
 
 def _list_arc():
-    nodes = find_arc(PLACES, 1.0, 2.2, 0.0).nodes
+    nodes = compute_arc(PLACES, 1.0, 2.2, 0.0).node_positions
     return [(nodes[:, 0] - nodes[0, 0], nodes[:, 1])]

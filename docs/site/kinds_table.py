@@ -7,8 +7,8 @@ from pathlib import Path
 
 from snakesim_drivers.emulation.emulated_body import FAULTS
 from snakesim_drivers.kit.drive_type import DriverTypeBackend
-from snakesim_hal.model.fault_kinds import DOERS, KINDS, Amount
-from snakesim_hal.programs.preflight import find_backend
+from snakesim_hal.model.fault_kinds import EXECUTOR_DESCRIPTIONS, FAULT_KINDS, FaultAmount
+from snakesim_hal.programs.preflight import load_backend_class
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "inject-faults.md"
 BEGIN, END = "<!-- from here: made by `make schemas` -->\n", "<!-- to here -->\n"
@@ -39,11 +39,11 @@ def _replace(page: str, begin: str, new_table: str) -> str:
 def table() -> str:
     """A row a kind."""
     rows = ["| target | kind | effect | amount | carried out by |", "|---|---|---|---|---|"]
-    for sort, kinds in KINDS.items():
+    for sort, kinds in FAULT_KINDS.items():
         target = f"{sort}: {TARGETS[sort]}" if sort in ("process", "key", "joint", "bus") else TARGETS[sort]
         for name, kind in kinds.items():
             amount = "" if kind.amount is None else _amount(kind.amount)
-            doers = ", else ".join(DOERS[doer] for doer in kind.by)
+            doers = ", else ".join(EXECUTOR_DESCRIPTIONS[doer] for doer in kind.executors)
             rows.append(f"| {target} | `{name}` | {kind.description} | {amount} | {doers} |")
             target = ""
     return "\n".join(rows) + "\n"
@@ -52,9 +52,11 @@ def table() -> str:
 def drive_table() -> str:
     """Return the table of faults that emulated drives and their buses have, with a row for each drive type."""
     rows = ["| `--backend` | in an emulated drive | on its bus | in samples |", "|---|---|---|---|"]
-    in_samples = [name for name, kind in KINDS["joint"].items() if "samples" in kind.by and name not in FAULTS]
+    in_samples = [
+        name for name, kind in FAULT_KINDS["joint"].items() if "samples" in kind.executors and name not in FAULTS
+    ]
     for name in DRIVE_TYPES:
-        backend = find_backend(name)
+        backend = load_backend_class(name)
         assert issubclass(backend, DriverTypeBackend)
         on_bus = {*backend.list_bus_faults(backend.Settings()), "slow"}
         cells = [" ".join(f"`{kind}`" for kind in kinds) for kinds in (FAULTS, sorted(on_bus), in_samples)]
@@ -62,9 +64,9 @@ def drive_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-def _amount(amount: Amount) -> str:
+def _amount(amount: FaultAmount) -> str:
     unit = "" if amount.unit == "1" else f" {amount.unit}"
-    return f"{amount.description}, {amount.default:g}{unit} ({amount.low:g} to {amount.high:g})"
+    return f"{amount.description}, {amount.default:g}{unit} ({amount.min_value:g} to {amount.max_value:g})"
 
 
 if __name__ == "__main__":

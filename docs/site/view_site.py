@@ -22,7 +22,7 @@ from urllib.parse import unquote, urlparse
 
 from PIL import Image, ImageDraw
 
-from snakesim_testing.operator.browser import Tab, chromium
+from snakesim_testing.operator.browser import Tab, open_chromium
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = ROOT / "build" / "docs"
@@ -110,7 +110,7 @@ def check(pages: list[Path], arguments: argparse.Namespace) -> Iterator[str]:
         yield from (f"{page}: {problem}" for problem in find_broken_links(page))
     views = EVERY_VIEW if arguments.every else USUAL_VIEWS
     sheets = {each: Sheets(*each) for each in views}
-    with chromium(with_webgl=False) as browser:
+    with open_chromium(with_webgl=False) as browser:
         tab = browser.open("about:blank")
         tab.send("Network.enable")
         tab.send("Network.setBlockedURLs", urls=["*search_index.js*"])  # large, and not needed here

@@ -19,7 +19,7 @@ Importing this package registers the names; it needs the extra `gym`. `docs/how-
 
 from snakesim_operator.base import extras
 
-extras.require("gym", "`snakesim.environments`")
+extras.require_extra("gym", "`snakesim.environments`")
 
 from gymnasium.envs.registration import register  # noqa: E402 - after the check
 

@@ -10,8 +10,12 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, suggest_word
 from snakesim_hal.wire.messages import Description, Mode
 
-RESIDUAL = "residual:"
-KINDS = {"position": (Mode.POSITION, "rad"), "velocity": (Mode.VELOCITY, "rad/s"), "torque": (Mode.TORQUE, "N·m")}
+RESIDUAL_PREFIX = "residual:"
+MODE_AND_UNIT_BY_KIND = {
+    "position": (Mode.POSITION, "rad"),
+    "velocity": (Mode.VELOCITY, "rad/s"),
+    "torque": (Mode.TORQUE, "N·m"),
+}
 
 
 @dataclass(frozen=True)
@@ -26,20 +30,20 @@ class Commands:
     high: Sequence[float]
 
     @staticmethod
-    def of(robot: Description, kind: str, residual_rad: float) -> "Commands":
-        """Return the actions of a robot.
+    def make_for_robot(robot: Description, kind: str, residual_rad: float) -> "Commands":
+        """Return what actions of a kind command on a robot, with the bounds of every joint.
 
         Args:
-            robot: Description with the joints and their limits.
-            kind: "position", "velocity", "torque", or "residual:CONTROLLER".
-            residual_rad: Largest correction of a joint, for "residual:CONTROLLER".
+            robot: Description of the robot, with the limits of the joints.
+            kind: Kind of action: "position", "velocity", "torque", or "residual:CONTROLLER".
+            residual_rad: Largest correction of a joint, for "residual:CONTROLLER". Ignored for other kinds.
         """
         joints = robot.joints
         names = [joint.name for joint in joints]
-        if kind.startswith(RESIDUAL):
+        if kind.startswith(RESIDUAL_PREFIX):
             high = [residual_rad] * len(joints)
             return Commands(kind, Mode.POSITION, "rad", names, [-value for value in high], high)
-        mode, unit = KINDS[kind]
+        mode, unit = MODE_AND_UNIT_BY_KIND[kind]
         match mode:
             case Mode.POSITION:
                 low = [joint.angle_min_rad for joint in joints]
@@ -52,87 +56,88 @@ class Commands:
                 low = [-value for value in high]
         return Commands(kind, mode, unit, names, low, high)
 
-    def target(self, action: Any) -> Floats:
-        """Return the targets of an action.
+    def convert_action(self, action: Any) -> Floats:
+        """Convert the action of one environment to targets.
 
         Args:
-            action: (joints,) numbers, tail to head; an array or a sequence.
+            action: A number for each joint, tail to head, as an array or a sequence.
 
         Returns:
-            A new array, (joints,).
+            The targets as a new array, (joints,), in the unit of the action.
 
         Raises:
             ValueError: The action has another shape, or holds a number that is not finite.
         """
-        values = _read_numbers("action", action, (len(self.names),), f"must be {self._describe_expected()}")
+        values = _convert_to_array("action", action, (len(self.names),), f"must be {self._describe_expected()}")
         self._check_finite(values, "action")
         return values
 
-    def targets(self, actions: Any, count: int) -> Floats:
-        """Return the targets of the actions of many environments.
+    def convert_actions(self, actions: Any, count: int) -> Floats:
+        """Convert the actions of many environments to targets.
 
         Args:
-            actions: (count, joints) numbers; an array or a sequence.
-            count: number of environments.
+            actions: An action for each environment, (count, joints), as an array or a sequence.
+            count: Number of environments.
 
         Returns:
-            A new array, (count, joints).
+            The targets as a new array, (count, joints), in the unit of the actions.
 
         Raises:
             ValueError: The actions have another shape, or hold a number that is not finite.
         """
         expected = f"must have {count} rows, and each row {self._describe_expected()}"
-        values = _read_numbers("actions", actions, (count, len(self.names)), expected)
+        values = _convert_to_array("actions", actions, (count, len(self.names)), expected)
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values).all(axis=1)))
             self._check_finite(values[row], f"actions[{row}]")
         return values
 
     def _check_finite(self, values: Floats, name: str) -> None:
-        """Raise ValueError for a number that is not finite. `name` is that of the array."""
+        """Raise ValueError for a number that is not finite. The error names the array, the joint and the value."""
         if not np.isfinite(values).all():
-            bad = int(np.argmin(np.isfinite(values)))
+            bad_index = int(np.argmin(np.isfinite(values)))
+            joint_name = self.names[bad_index]
             raise ValueError(
-                f"{name}[{bad}] ({self.names[bad]}) is {values[bad]}, must be a finite number of {self.unit}"
+                f"{name}[{bad_index}] ({joint_name}) is {values[bad_index]}, must be a finite number of {self.unit}"
             )
 
     def _describe_expected(self) -> str:
         count = len(self.names)
-        what = "a correction" if self.kind.startswith(RESIDUAL) else f"a {self.kind}"
+        what = "a correction" if self.kind.startswith(RESIDUAL_PREFIX) else f"a {self.kind}"
         return f"({count},): {what} in {self.unit} for each joint, {self.names[0]} to {self.names[-1]}"
 
 
-def _read_numbers(name: str, given: Any, shape: tuple[int, ...], expected: str) -> Floats:
-    """Return an argument as a new array.
+def _convert_to_array(name: str, argument: Any, shape: tuple[int, ...], expected: str) -> Floats:
+    """Convert an argument to a new array of a required shape.
 
     Args:
-        name: of the argument, for errors.
-        given: its value.
-        shape: that the array must have.
-        expected: what the argument must be, in words.
+        name: Name of the argument, for the error message.
+        argument: Array or sequence of numbers.
+        shape: Shape that the array must have.
+        expected: Description of a valid argument, for the error message.
 
     Raises:
-        ValueError: It is no array of numbers, or has another shape.
+        ValueError: The argument cannot be converted to numbers, or has another shape.
     """
     try:
-        values: Floats = np.array(given, dtype=np.float64)
+        values: Floats = np.array(argument, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} is {given!r:.60}, {expected}") from None
+        raise ValueError(f"{name} is {argument!r:.60}, {expected}") from None
     if values.shape != shape:
         raise ValueError(f"{name} has shape {values.shape}, {expected}")
     return values
 
 
-def corrected_controller(kind: str) -> str | None:
+def parse_corrected_controller(kind: str) -> str | None:
     """Return the controller whose targets an action corrects, or None if an action is itself a target.
 
     Raises:
         ConfigError: There is no such kind of action.
     """
-    if isinstance(kind, str) and kind.startswith(RESIDUAL) and kind != RESIDUAL:
-        return kind.removeprefix(RESIDUAL)
-    if kind not in KINDS:
-        hint = suggest_word(str(kind), KINDS)
+    if isinstance(kind, str) and kind.startswith(RESIDUAL_PREFIX) and kind != RESIDUAL_PREFIX:
+        return kind.removeprefix(RESIDUAL_PREFIX)
+    if kind not in MODE_AND_UNIT_BY_KIND:
+        hint = suggest_word(str(kind), MODE_AND_UNIT_BY_KIND)
         raise ConfigError(
             f"action={kind!r:.60}: {hint}give 'position', 'velocity', 'torque', or 'residual:' and a controller, such "
             "as 'residual:obstacle_aided'",

@@ -1,9 +1,9 @@
 """Many simulated robots behind limiters, stepped together: armed, until a fault stops one of them.
 
-Robots in the ordinary state are limited as arrays. A robot is ordinary while every joint state is plausible beyond
-doubt, no winding is too hot, and it obeys commands in one mode. A robot that is not ordinary, and each robot in the
-first ticks of its episode, has the limiter of the HAL to itself, in a `LimiterClient`. So no rule of the safety core is
-written twice, apart from the limits of targets.
+Robots in the ordinary state are limited together, by an array limiter. A robot is ordinary while every joint state is
+surely plausible, no winding is too hot, and all joints follow commands in one mode. A robot that is not ordinary, and
+each robot in the first ticks of its episode, has a limiter of the HAL of its own, in a `LimiterClient`. So no rule of
+the safety core is written twice, apart from the limits of targets.
 """
 
 from collections import deque
@@ -18,7 +18,7 @@ from snakesim.environments.array_limiter import (
     LimitArrays,
     Masks,
     MeasuredArrays,
-    find_active_limits,
+    find_active_limit_indices,
     limit_targets,
     limit_torque_limits,
 )
@@ -28,15 +28,15 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.safety.authority import MAX_REASON_LENGTH
-from snakesim_hal.safety.joint_limits import Applied
-from snakesim_hal.safety.plausibility import SLACK_RAD, SPEED_MARGIN
+from snakesim_hal.safety.joint_limits import AppliedSetpoints
+from snakesim_hal.safety.plausibility import ANGLE_NOISE_MARGIN_RAD, SPEED_MARGIN
 from snakesim_hal.wire.messages import Description, Fault, Mode
 from snakesim_sim_backend.batch.robots import SimulatedRobots
 
 Mask = NDArray[np.bool_]  # (robots,)
 ArrayT = TypeVar("ArrayT", bound=NDArray[Any])
-DOUBTLESS = 0.99  # fraction of the largest plausible jump of an angle
-MAX_CHANGE = 1e300  # of a finite velocity or torque from one tick to the next
+SURE_JUMP_FRACTION = 0.99  # of the largest plausible jump of an angle: a smaller jump is surely plausible
+MAX_FINITE_CHANGE = 1e300  # of a velocity or torque from one tick to the next; only NaN and infinity exceed it
 MIN_POWER_RATE_HZ = 0.5  # the limiter ignores temperatures that are older than 3 s
 
 
@@ -47,15 +47,15 @@ def can_arm(config: RunConfig) -> bool:
     return config.backend == "sim" and not config.faults and has_current_temperatures
 
 
-class _Decided(NamedTuple):
-    """The decisions of the array limiter in the last tick, and what they are based on."""
+class _LimiterDecision(NamedTuple):
+    """What the array limiter decided in the last tick, and what the decisions are based on."""
 
-    robots: Mask
+    robots: Mask  # which robots the array limiter has limited
     mode: Mode
-    requested: Floats
-    target: Floats
-    torque_limit_nm: Floats
-    torque_fraction: Floats
+    requested: Floats  # (robots, joints), targets of the commands
+    target: Floats  # (robots, joints), limited targets
+    torque_limit_nm: Floats  # (robots, joints)
+    torque_fraction: Floats  # (robots, joints), what derating leaves of each torque limit
     measured: MeasuredArrays
 
 
@@ -74,14 +74,14 @@ class ArmedRobots:
     """
 
     def __init__(self, robots: int, config: RunConfig, description: Description, *, safe: bool, threads: int) -> None:
-        """Make room for robots.
+        """Allocate the arrays for a number of robots. `start` adds each robot.
 
         Args:
-            robots: their number.
-            config: configuration of one of them; those of the others agree with it in joints, sensors and rates.
-            description: the robot of that configuration.
-            safe: whether targets pass the limiter.
-            threads: number of threads that step the physics.
+            robots: Number of robots.
+            config: Configuration of one robot. All other robots must have the same joints, sensors and rates.
+            description: Description of the robot of that configuration.
+            safe: If True, targets pass the limiter. If False, the motors get the targets unchanged.
+            threads: Number of threads that step the physics.
         """
         joints = config.robot.chain.modules
         self.simulated = SimulatedRobots(robots, config, threads=threads)
@@ -96,13 +96,15 @@ class ArmedRobots:
         self.reasons = [""] * robots
         self.is_limited: Masks = np.zeros((robots, joints), dtype=np.bool_)
         self._active_limits: NDArray[np.int64] = np.zeros((robots, joints), dtype=np.int64)
-        self._decided: _Decided | None = None
+        self._last_decision: _LimiterDecision | None = None
         self._digests = CommandDigests(robots, joints)
 
         # Limits.
         self._limits = LimitArrays.allocate(robots, joints, config.period_ns * 1e-9)
-        self._max_change = np.full((robots, 3 * joints), MAX_CHANGE)  # of angle, velocity and torque in a tick
-        self._heat_is_measured = np.ones((robots, joints), dtype=np.bool_)
+        self._max_plausible_change = np.full(
+            (robots, 3 * joints), MAX_FINITE_CHANGE
+        )  # of angle, velocity and torque in a tick
+        self._is_temperature_measured = np.ones((robots, joints), dtype=np.bool_)
         self._stop_at_c = np.ones((robots, joints))
         self._torque_fraction = np.ones((robots, joints))
         self._is_derated = False
@@ -112,29 +114,29 @@ class ArmedRobots:
         self._modes: NDArray[np.int8] = np.zeros((robots, joints), dtype=np.int8)
         self._target: Floats = np.zeros((robots, joints))
         self._torque_limit_nm: Floats = np.zeros((robots, joints))
-        self._setpoints_before = (self._modes, self._target, self._torque_limit_nm)
+        self._previous_setpoints = (self._modes, self._target, self._torque_limit_nm)
 
         # Commands, newest last. A limiter uses them some ticks later.
         schedule = config.services.get(CONTROL, ServiceSchedule())
         self._schedule = schedule
         self._commands: deque[Floats] = deque(maxlen=max(schedule.latency_ticks, 1) + schedule.decimation)
 
-        # Robots that have a limiter to themselves.
+        # Each robot is limited either as a row of arrays, or by a client with a limiter of its own.
         self._clients: dict[int, LimiterClient] = {}
-        self._is_ordinary: Mask = np.zeros(robots, dtype=np.bool_)  # limited as arrays
-        self._stays_alone: Mask = np.zeros(robots, dtype=np.bool_)  # until its next reset
+        self._is_array_limited: Mask = np.zeros(robots, dtype=np.bool_)
+        self._is_excluded: Mask = np.zeros(robots, dtype=np.bool_)  # from the array limiter, until the next `start`
         self._descriptions = [description] * robots
         self._all_robots = self.simulated.all_robots
 
-        # Robots that take part in the present ticks.
+        # Robots that take part in the current ticks. The masks are updated only when the arguments of `step` change.
         self._active: Mask = np.zeros(robots, dtype=np.bool_)
-        self._active_at_call = self._active
-        self._active_robots: list[int] = []
-        self._ordinary: Mask = np.zeros(robots, dtype=np.bool_)  # of the active ones
-        self._ordinary_at_call = self._is_ordinary
+        self._active_at_last_call = self._active
+        self._active_indices: list[int] = []
+        self._active_array_limited: Mask = np.zeros(robots, dtype=np.bool_)  # active ones
+        self._array_limited_at_last_call = self._is_array_limited
 
     def can_start(self, config: RunConfig) -> bool:
-        """Return whether a robot of this configuration can be a row."""
+        """Return whether a robot of this configuration can be stepped together with the other robots."""
         schedule = config.services.get(CONTROL, ServiceSchedule())
         has_equal_schedule = (schedule.latency_ticks, schedule.decimation) == (
             self._schedule.latency_ticks,
@@ -143,86 +145,90 @@ class ArmedRobots:
         return can_arm(config) and has_equal_schedule and self.simulated.can_simulate(config)
 
     def start(self, robot: int, config: RunConfig, description: Description) -> bool:
-        """Place a robot in its scene, and arm it.
+        """Start an episode of a robot: place it in its scene, and arm it.
 
         Args:
-            robot: its row.
-            config: configuration of its episode.
-            description: the robot of that configuration.
+            robot: Row of the robot in all arrays.
+            config: Configuration of the episode.
+            description: Description of the robot of that configuration.
 
         Returns:
-            False if its simulation does not fit to the others.
+            Whether the robot was started. False if its simulation cannot be stepped together with the other robots.
 
         Raises:
-            ConfigError: the settings do not match the robot or the scene.
-            RefusedError: the robot cannot be armed.
+            ConfigError: The settings do not match the robot or the scene.
+            RefusedError: The robot cannot be armed.
         """
         self.stop(robot)
-        if not self.simulated.place(robot, config):
+        if not self.simulated.load_robot(robot, config):
             return False
         self._descriptions[robot] = description
-        self._set_limits(robot)
-        self.ticks = _replace(self.ticks, robot, 0)
-        self.joints = _replace(self.joints, robot, self.simulated.sensors.joints[robot])
-        self._modes = _replace(self._modes, robot, int(Mode.PASSIVE))
-        self._target = _replace(self._target, robot, 0.0)
-        self._torque_limit_nm = _replace(self._torque_limit_nm, robot, self._limits.torque_nm[robot])
-        self._torque_fraction = _replace(self._torque_fraction, robot, 1.0)
-        self.is_limited = _replace(self.is_limited, robot, False)
+        self._load_limits(robot)
+        self.ticks = _copy_with_row(self.ticks, robot, 0)
+        self.joints = _copy_with_row(self.joints, robot, self.simulated.sensors.joints[robot])
+        self._modes = _copy_with_row(self._modes, robot, int(Mode.PASSIVE))
+        self._target = _copy_with_row(self._target, robot, 0.0)
+        self._torque_limit_nm = _copy_with_row(self._torque_limit_nm, robot, self._limits.torque_nm[robot])
+        self._torque_fraction = _copy_with_row(self._torque_fraction, robot, 1.0)
+        self.is_limited = _copy_with_row(self.is_limited, robot, False)
         self._active_limits[robot] = NO_LIMIT
         self._has_full_torque = False
 
+        # In the first ticks, a robot always has a limiter of its own. `_observe` moves it to the array limiter later.
         client = LimiterClient(description, safe=self._safe)
-        self._observe_alone(client, robot)
+        self._pass_samples_to_client(client, robot)
         client.arm(self.simulated.make_joint_state(robot, 0, self.joints[robot]))
         self._clients[robot] = client
-        self._stays_alone[robot] = False
-        self.is_armed = _replace(self.is_armed, robot, True)
+        self._is_excluded[robot] = False
+        self.is_armed = _copy_with_row(self.is_armed, robot, True)
         self.reasons[robot] = client.reason
         return True
 
     def stop(self, robot: int) -> None:
-        """End the episode of a robot. It takes part in no tick until the next `start`."""
+        """End the episode of a robot, which takes part in no tick until the next `start`."""
         self._update_active_limits()
         self._digests.restart(robot)
         self._clients.pop(robot, None)
-        self.is_armed = _replace(self.is_armed, robot, False)
-        self._is_ordinary = _replace(self._is_ordinary, robot, False)
+        self.is_armed = _copy_with_row(self.is_armed, robot, False)
+        self._is_array_limited = _copy_with_row(self._is_array_limited, robot, False)
 
     def step(self, mode: Mode, target: Floats, active: Mask) -> None:
-        """Run one tick. Commands for the present samples go to the limiters, as a host does it in lockstep.
+        """Run one tick: limit the commands, step the physics, and read the sensors.
+
+        The commands answer the current samples, as in a host in lockstep.
 
         Args:
-            mode: mode of all joints.
-            target: (robots, joints), in rad, rad/s or N·m. It must not change afterwards.
-            active: (robots,), which robots take part; they must be armed.
+            mode: Control mode of all joints.
+            target: Targets of all joints, (robots, joints), in rad, rad/s or N·m depending on the mode. The array must
+                not change afterwards.
+            active: Which robots take part, (robots,). They must be armed.
         """
-        if active is not self._active_at_call or self._is_ordinary is not self._ordinary_at_call:
-            self._choose_robots(active)
+        if active is not self._active_at_last_call or self._is_array_limited is not self._array_limited_at_last_call:
+            self._update_active_masks(active)
         active = self._active
-        ordinary = self._ordinary
+        array_limited = self._active_array_limited
         self._commands.append(target)
-        self._decide_together(mode, ordinary)
-        for robot in self._find_clients(active):
-            self._decide_alone(robot, mode, target[robot].tolist())
+        self._limit_with_arrays(mode, array_limited)
+        for robot in self._select_clients(active):
+            self._limit_with_client(robot, mode, target[robot].tolist())
         self._digests.add(active, self.ticks, self._modes, self._target, self._torque_limit_nm)
-        self.simulated.enact(mode, self._target, self._torque_limit_nm, ordinary)
+        self.simulated.enact(mode, self._target, self._torque_limit_nm, array_limited)
         moved = self._advance(active)
         self._observe(mode, moved)
 
-    def _choose_robots(self, active: Mask) -> None:
-        """Find the robots that take part in the next ticks."""
-        self._active_at_call = active
-        self._ordinary_at_call = self._is_ordinary
+    def _update_active_masks(self, active: Mask) -> None:
+        """Update the masks of the robots that are active, and of those among them that the array limiter limits."""
+        self._active_at_last_call = active
+        self._array_limited_at_last_call = self._is_array_limited
         self._active = self._all_robots if active.all() else active
-        self._active_robots = np.flatnonzero(active).tolist()
-        ordinary = active & self._is_ordinary
-        if not np.array_equal(ordinary, self._ordinary):
+        self._active_indices = np.flatnonzero(active).tolist()
+        array_limited = active & self._is_array_limited
+        if not np.array_equal(array_limited, self._active_array_limited):
             self._update_active_limits()
-        self._ordinary = self._all_robots if ordinary.all() else ordinary
+        self._active_array_limited = self._all_robots if array_limited.all() else array_limited
 
-    def _find_clients(self, robots: Mask) -> list[int]:
-        """Return those of these robots that have a limiter to themselves."""
+    def _select_clients(self, robots: Mask) -> list[int]:
+        """Return the indices of the robots of a mask that have a limiter of their own."""
         if not self._clients:
             return []
         return [robot for robot in self._clients if robots[robot]]
@@ -238,13 +244,20 @@ class ArmedRobots:
 
     # --- decisions ---------------------------------------------------------------------------------------------
 
-    def _decide_together(self, mode: Mode, robots: Mask) -> None:
-        """Limit the commands of these robots as arrays. The setpoints of the others stay."""
-        self._setpoints_before = (self._modes, self._target, self._torque_limit_nm)
+    def _limit_with_arrays(self, mode: Mode, robots: Mask) -> None:
+        """Limit the commands of some robots with the array limiter, and store their setpoints.
+
+        The setpoints of all other robots stay as they are.
+
+        Args:
+            mode: Control mode of all joints.
+            robots: Which robots to limit, (robots,).
+        """
+        self._previous_setpoints = (self._modes, self._target, self._torque_limit_nm)
         joints = self._joint_count
         measured = MeasuredArrays(self.joints[:, :joints], self.joints[:, joints : 2 * joints])
         if self._safe:
-            requested = self._find_commands()
+            requested = self._select_due_commands()
             torque_limit_nm = self._limit_torque_limits()
             target = limit_targets(mode, requested, self._target, torque_limit_nm, measured, self._limits)
             is_limited = target != requested
@@ -264,22 +277,25 @@ class ArmedRobots:
         self._target = target
         self._torque_limit_nm = torque_limit_nm
         self.is_limited = is_limited
-        self._decided = _Decided(robots, mode, requested, target, torque_limit_nm, self._torque_fraction, measured)
+        self._last_decision = _LimiterDecision(
+            robots, mode, requested, target, torque_limit_nm, self._torque_fraction, measured
+        )
 
-    def _find_commands(self) -> Floats:
-        """Return the commands that the limiters use in this tick, (robots, joints)."""
+    def _select_due_commands(self) -> Floats:
+        """Return the commands that take effect in this tick, after the latency of control, (robots, joints)."""
         schedule = self._schedule
         if schedule.decimation == 1:
-            back = max(schedule.latency_ticks, 1)
-            return self._commands[-min(back, len(self._commands))]
-        due = np.maximum(self.ticks + 1 - schedule.latency_ticks, 0)
-        ages = self.ticks - (due - due % schedule.decimation)
+            age_ticks = max(schedule.latency_ticks, 1)
+            return self._commands[-min(age_ticks, len(self._commands))]
+        # As `ServiceSchedule.used_output_tick` for the next tick, of every robot.
+        due_ticks = np.maximum(self.ticks + 1 - schedule.latency_ticks, 0)
+        ages = self.ticks - (due_ticks - due_ticks % schedule.decimation)
         newest_first = np.stack(list(self._commands)[::-1])
-        ages = np.clip(ages, 0, len(newest_first) - 1)  # of the robots that are not ordinary
+        ages = np.clip(ages, 0, len(newest_first) - 1)  # outside of the bounds only for robots with their own limiter
         return newest_first[ages, np.arange(len(ages))]
 
     def _limit_torque_limits(self) -> Floats:
-        """Return the torque limits of this tick."""
+        """Return the torque limits of this tick, (robots, joints)."""
         full_nm = self._limits.torque_nm
         if self._has_full_torque and not self._is_derated:
             return full_nm
@@ -287,203 +303,225 @@ class ArmedRobots:
         self._has_full_torque = np.array_equal(torque_limit_nm, full_nm)
         return torque_limit_nm
 
-    def _decide_alone(self, robot: int, mode: Mode, target: list[float]) -> None:
-        """Let the limiter of one robot decide on its command, and hand the setpoints to its motors."""
+    def _limit_with_client(self, robot: int, mode: Mode, target: list[float]) -> None:
+        """Limit the command of one robot with its own limiter, and pass the setpoints to its motors.
+
+        Args:
+            robot: Row of the robot.
+            mode: Control mode of all joints.
+            target: A target for each joint, tail to head.
+        """
         client = self._clients[robot]
         tick = int(self.ticks[robot])
         now_ns = tick * self._period_ns
         client.command(tick, now_ns, [mode] * len(target), target)
-        client.core.check_deadlines(now_ns, tick)
-        decision = client.core.decide(self._schedule.used_output_tick(tick + 1))
+        client.core.latch_faults_and_expire_lease(now_ns, tick)
+        decision = client.core.compute_setpoints(self._schedule.used_output_tick(tick + 1))
         setpoints = decision.setpoints
         self.simulated.enact_one(robot, setpoints)
         self._modes[robot] = [int(mode) for mode in setpoints.mode]
         self._target[robot] = setpoints.target
         self._torque_limit_nm[robot] = setpoints.torque_limit_nm
         self._active_limits[robot] = NO_LIMIT
-        for joint, name in decision.limited.items():
+        for joint, name in decision.limit_by_joint.items():
             self._active_limits[robot, joint] = LIMIT_NAMES.index(name)
         self.is_limited[robot] = self._active_limits[robot] != NO_LIMIT
         if client.state != "armed":
-            self.is_armed = _replace(self.is_armed, robot, False)
+            self.is_armed = _copy_with_row(self.is_armed, robot, False)
             self.reasons[robot] = client.reason
 
     # --- physics and samples -----------------------------------------------------------------------------------
 
     def _advance(self, active: Mask) -> Mask:
-        """Step the physics, and return the robots whose simulations go on."""
-        following = self.ticks + active
-        diverged = self.simulated.advance(self._active_robots, following.tolist())
+        """Step the physics, sample the sensors, and return the robots whose simulations have not diverged."""
+        next_ticks = self.ticks + active
+        diverged = self.simulated.advance(self._active_indices, next_ticks.tolist())
         if not diverged:
-            self.ticks = following
-            self.simulated.sample(following, active)
+            self.ticks = next_ticks
+            self.simulated.sample(next_ticks, active)
             return active
         moved = active
         for robot, cause in diverged.items():
-            moved = _replace(moved, robot, False)
+            moved = _copy_with_row(moved, robot, False)
             self._stop_diverged(robot, cause)
         self.ticks = self.ticks + moved
         self.simulated.sample(self.ticks, moved)
         return moved
 
     def _stop_diverged(self, robot: int, cause: str) -> None:
-        """React to a simulation that has failed, as a host reacts to a backend that has failed."""
+        """Disarm a robot whose simulation has diverged, as a host does when its backend has failed."""
         cause = cause[:MAX_REASON_LENGTH]
         client = self._clients.get(robot)
         if client is None:
             self.reasons[robot] = cause
         else:
             fault = Fault(tick=int(self.ticks[robot]), what="backend_failed", cause=cause, reach="robot")
-            client.core.fault(fault)
+            client.core.latch_fault(fault)
             self.reasons[robot] = client.reason
-        self.is_armed = _replace(self.is_armed, robot, False)
+        self.is_armed = _copy_with_row(self.is_armed, robot, False)
 
     def _observe(self, mode: Mode, moved: Mask) -> None:
-        """Let the limiters judge the newest samples of the robots that have moved."""
-        before = self.joints
+        """Check the newest samples of the robots that have moved, and choose a limiter for each robot.
+
+        A robot with an unusual sample gets a limiter of its own. A robot that is ordinary again moves back to the array
+        limiter.
+
+        Args:
+            mode: Control mode of all joints.
+            moved: Which robots have moved in this tick, (robots,).
+        """
+        joints_before = self.joints
         self.joints = self.simulated.sensors.joints
         if not self._safe:
-            for robot in self._find_clients(moved):
-                self._join_others(robot)
+            for robot in self._select_clients(moved):
+                self._move_to_array_limiter(robot)
             return
         self._update_torque_fractions()
-        is_near, is_ordinary = self._find_ordinary(before)
-        for robot in self._find_clients(moved):
-            self._observe_alone(self._clients[robot], robot)
-            self._stays_alone[robot] |= not is_near[robot] or self._clients[robot].has_isolated_joints
-            if is_ordinary[robot] and not self._stays_alone[robot] and self._obeys(robot, mode):
-                self._join_others(robot)
+        is_plausible, is_ordinary = self._find_ordinary_changes(joints_before)
+        for robot in self._select_clients(moved):
+            self._pass_samples_to_client(self._clients[robot], robot)
+            self._is_excluded[robot] |= not is_plausible[robot] or self._clients[robot].has_isolated_joints
+            if is_ordinary[robot] and not self._is_excluded[robot] and self._follows_mode(robot, mode):
+                self._move_to_array_limiter(robot)
         if is_ordinary is not self._all_robots:
-            unusual = self._ordinary & moved & ~is_ordinary
+            unusual = self._active_array_limited & moved & ~is_ordinary
             for robot in np.flatnonzero(unusual).tolist():
-                self._leave_others(robot, before[robot], mode)
+                self._move_to_own_client(robot, joints_before[robot], mode)
 
-    def _find_ordinary(self, before: Floats) -> tuple[Mask, Mask]:
-        """Compare the newest joint states with those before.
+    def _find_ordinary_changes(self, joints_before: Floats) -> tuple[Mask, Mask]:
+        """Find the robots whose newest joint states are surely plausible, and those that are ordinary in addition.
+
+        Args:
+            joints_before: Joint states of the tick before, (robots, 3 * joints): angles, velocities and torques.
 
         Returns:
-            The robots whose joint states are surely plausible changes; and those among them of which no joint has
-            repeated its state, and no winding is too hot.
+            Two masks, (robots,). The first one has the robots whose joint states have changed by surely plausible
+            amounts. The second one has those among them of which every joint has changed its state, and no winding is
+            too hot. If all robots are ordinary, both are the object `self._all_robots`.
         """
-        joints = self._joint_count
-        change = np.abs(self.joints - before)
-        is_near = change <= self._max_change
-        has_moved = change[:, joints : 2 * joints] != 0.0
+        joint_count = self._joint_count
+        change = np.abs(self.joints - joints_before)
+        is_joint_plausible = change <= self._max_plausible_change
+        has_velocity_changed = change[:, joint_count : 2 * joint_count] != 0.0
         windings = self.simulated.sensors.windings
-        is_heat_new = windings is not None and windings.is_new is not windings.no_robots
-        all_near = np.count_nonzero(is_near) == is_near.size
-        if all_near and np.count_nonzero(has_moved) == has_moved.size and not is_heat_new:
+        has_new_temperatures = windings is not None and windings.is_new is not windings.no_robots
+        # The usual case: all velocities have changed, so no joint has repeated its state. This saves the reductions.
+        are_all_plausible = np.count_nonzero(is_joint_plausible) == is_joint_plausible.size
+        have_all_changed = np.count_nonzero(has_velocity_changed) == has_velocity_changed.size
+        if are_all_plausible and have_all_changed and not has_new_temperatures:
             return self._all_robots, self._all_robots
-        near: Mask = np.all(is_near, axis=1)
-        has_changed: Mask = np.all(np.any(change.reshape(len(change), 3, joints) != 0.0, axis=1), axis=1)
-        ordinary: Mask = near & has_changed
-        if windings is not None and is_heat_new:
-            is_hot = (windings.values >= self._stop_at_c) & self._heat_is_measured
-            ordinary = ordinary & ~(np.any(is_hot, axis=1) & windings.is_new)
-        return near, ordinary
+        is_plausible: Mask = np.all(is_joint_plausible, axis=1)
+        has_joint_changed = np.any(change.reshape(len(change), 3, joint_count) != 0.0, axis=1)
+        is_ordinary: Mask = is_plausible & np.all(has_joint_changed, axis=1)
+        if windings is not None and has_new_temperatures:
+            is_hot = (windings.values >= self._stop_at_c) & self._is_temperature_measured
+            is_ordinary = is_ordinary & ~(np.any(is_hot, axis=1) & windings.is_new)
+        return is_plausible, is_ordinary
 
     def _update_torque_fractions(self) -> None:
         """Derate the torque limits of robots whose winding temperatures have just been measured."""
         windings = self.simulated.sensors.windings
         if windings is None or windings.is_new is windings.no_robots:
             return
-        fractions = np.where(self._heat_is_measured, self.simulated.remaining_fractions(), 1.0)
+        fractions = np.where(self._is_temperature_measured, self.simulated.remaining_fractions(), 1.0)
         self._torque_fraction = np.where(windings.is_new[:, None], fractions, self._torque_fraction)
         self._is_derated = bool((self._torque_fraction < 1.0).any())
 
-    # --- robots that have a limiter to themselves --------------------------------------------------------------
+    # --- robots that have a limiter of their own ----------------------------------------------------------------
 
-    def _observe_alone(self, client: LimiterClient, robot: int) -> None:
+    def _pass_samples_to_client(self, client: LimiterClient, robot: int) -> None:
         """Pass the newest samples of one robot to its limiter."""
         tick = int(self.ticks[robot])
         now_ns = tick * self._period_ns
-        client.core.observe(self.simulated.make_joint_state(robot, tick, self.joints[robot]), now_ns)
+        client.core.observe_joints(self.simulated.make_joint_state(robot, tick, self.joints[robot]), now_ns)
         windings = self.simulated.sensors.windings
         if windings is not None and windings.is_new[robot]:
             power = self.simulated.make_power(robot, tick)
             assert power is not None, "a sample has just been delivered"
             client.core.observe_power(power, now_ns)
 
-    def _obeys(self, robot: int, mode: Mode) -> bool:
-        """Return whether all joints of a robot follow commands of this mode, and will in the next tick."""
+    def _follows_mode(self, robot: int, mode: Mode) -> bool:
+        """Return whether all joints of a robot follow commands in this mode now, and will do so in the next tick."""
         has_commands = self.ticks[robot] + 1 >= self._schedule.latency_ticks
         return bool(self.is_armed[robot] and has_commands and (self._modes[robot] == int(mode)).all())
 
-    def _join_others(self, robot: int) -> None:
-        """Limit a robot together with the others from now on."""
+    def _move_to_array_limiter(self, robot: int) -> None:
+        """Move a robot from its own limiter to the array limiter, if it is armed."""
         if self.is_armed[robot]:
             del self._clients[robot]
-            self._is_ordinary = _replace(self._is_ordinary, robot, True)
+            self._is_array_limited = _copy_with_row(self._is_array_limited, robot, True)
 
-    def _leave_others(self, robot: int, before: Floats, mode: Mode) -> None:
-        """Give a robot a limiter to itself, and let that judge the newest samples.
+    def _move_to_own_client(self, robot: int, joints_before: Floats, mode: Mode) -> None:
+        """Move a robot from the array limiter to a limiter of its own, and pass the newest samples to that limiter.
+
+        The new limiter is put into the state that it would have if it had limited the robot before.
 
         Args:
-            robot: its row.
-            before: (3 * joints,), the joint states of the tick before.
-            mode: the mode of all joints.
+            robot: Row of the robot.
+            joints_before: Joint states of the tick before, (3 * joints,): angles, velocities and torques.
+            mode: Control mode of all joints.
         """
         tick = int(self.ticks[robot])
         client = LimiterClient(self._descriptions[robot], safe=True)
         self._clients[robot] = client
-        self._is_ordinary = _replace(self._is_ordinary, robot, False)
-        newest_first = list(self._commands)[::-1][:tick]
+        self._is_array_limited = _copy_with_row(self._is_array_limited, robot, False)
+        newest_first = list(self._commands)[::-1][:tick]  # only those of this episode
         commands = [(tick - 1 - age, target[robot].tolist()) for age, target in enumerate(newest_first)]
         windings = self.simulated.sensors.windings
         power = None
         if windings is not None and not windings.is_new[robot]:
             power = self.simulated.make_power(robot, tick - 1)
         client.resume(
-            self.simulated.make_joint_state(robot, tick - 1, before),
+            self.simulated.make_joint_state(robot, tick - 1, joints_before),
             power,
             applied=(
-                _read_setpoints(self._setpoints_before, robot),
+                _read_setpoints(self._previous_setpoints, robot),
                 _read_setpoints((self._modes, self._target, self._torque_limit_nm), robot),
             ),
             commands=commands[::-1],
             mode=mode,
         )
-        self._observe_alone(client, robot)
+        self._pass_samples_to_client(client, robot)
 
     # --- limits ------------------------------------------------------------------------------------------------
 
-    def _set_limits(self, robot: int) -> None:
-        """Use the limits of a robot's present description."""
+    def _load_limits(self, robot: int) -> None:
+        """Fill in the limits of a robot from its current description."""
         description = self._descriptions[robot]
         joints = self._joint_count
         self._limits.set_robot(robot, description)
         speed_rad_s = np.array([joint.speed_limit_rad_s for joint in description.joints])
         max_turn_rad = SPEED_MARGIN * speed_rad_s * description.period_ns * 1e-9
-        self._max_change[robot, :joints] = SLACK_RAD + DOUBTLESS * max_turn_rad
-        self._heat_is_measured[robot] = ["temperature" in joint.measures for joint in description.joints]
+        self._max_plausible_change[robot, :joints] = ANGLE_NOISE_MARGIN_RAD + SURE_JUMP_FRACTION * max_turn_rad
+        self._is_temperature_measured[robot] = ["temperature" in joint.measures for joint in description.joints]
         self._stop_at_c[robot] = [joint.stop_at_c for joint in description.joints]
 
     def _update_active_limits(self) -> None:
-        """Find the names of the limits of the last tick. That is done only when they are read, or would be lost."""
-        decided = self._decided
-        if decided is None:
+        """Compute the active limits of the last tick. This is done only when they are read, or would be lost."""
+        decision = self._last_decision
+        if decision is None:
             return
-        self._decided = None
-        names = find_active_limits(
-            decided.mode,
-            decided.requested,
-            decided.target,
-            decided.torque_limit_nm,
-            decided.torque_fraction,
-            decided.measured,
+        self._last_decision = None
+        limit_indices = find_active_limit_indices(
+            decision.mode,
+            decision.requested,
+            decision.target,
+            decision.torque_limit_nm,
+            decision.torque_fraction,
+            decision.measured,
             self._limits,
         )
-        np.copyto(self._active_limits, names, where=decided.robots[:, None])
+        np.copyto(self._active_limits, limit_indices, where=decision.robots[:, None])
 
 
-def _replace(array: ArrayT, robot: int, value: object) -> ArrayT:
-    """Return a copy of an array with another row."""
+def _copy_with_row(array: ArrayT, robot: int, value: object) -> ArrayT:
+    """Return a copy of an array in which the row of one robot is replaced."""
     copy = array.copy()
     copy[robot] = value
     return copy
 
 
-def _read_setpoints(setpoints: tuple[NDArray[np.int8], Floats, Floats], robot: int) -> Applied:
-    """Return the setpoints of one robot."""
+def _read_setpoints(setpoints: tuple[NDArray[np.int8], Floats, Floats], robot: int) -> AppliedSetpoints:
+    """Return the setpoints of one robot from the arrays of modes, targets and torque limits of all robots."""
     modes, target, torque_limit_nm = setpoints
-    return Applied(modes[robot].astype(np.int64), target[robot], torque_limit_nm[robot])
+    return AppliedSetpoints(modes[robot].astype(np.int64), target[robot], torque_limit_nm[robot])

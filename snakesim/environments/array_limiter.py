@@ -1,4 +1,4 @@
-"""The limiter for many simulated robots at once: `snakesim_hal.safety.limiter.limit_command` on arrays.
+"""Limits the commands of many simulated robots at once: `snakesim_hal.safety.limiter.limit_command` on arrays.
 
 Real robots use the limiter of the HAL. This one gives the same bits for commands in which all joints of all robots have
 one mode, and had it in the period before; a test compares the two over random commands. Every array has the shape
@@ -16,7 +16,7 @@ from snakesim_hal.safety.limiter import MIN_SPEED_LIMIT_RAD_S, REACTION_PERIODS
 from snakesim_hal.wire.messages import Description, Mode
 
 Masks = NDArray[np.bool_]  # (robots, joints)
-# Names of limits, as `name_active_limits` gives them. An array of limits holds indices of this list.
+# Names of limits, as `limit_names.find_active_limits` gives them. An array of limits holds indices of this list.
 LIMIT_NAMES = ("", "angle", "angle_rate", "speed", "acceleration", "torque", "torque_rate", "thermal", "isolated")
 NO_LIMIT, ANGLE, ANGLE_RATE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, THERMAL, _ = range(len(LIMIT_NAMES))
 
@@ -38,7 +38,7 @@ class LimitArrays:
 
     @staticmethod
     def allocate(robots: int, joints: int, period_s: float) -> "LimitArrays":
-        """Return limits that `set_robot` fills in."""
+        """Return arrays of placeholder limits, which `set_robot` fills in."""
         return LimitArrays(period_s, *(np.ones((robots, joints)) for _ in range(9)))
 
     def set_robot(self, robot: int, description: Description) -> None:
@@ -64,17 +64,19 @@ class MeasuredArrays(NamedTuple):
 
 
 def limit_torque_limits(last_limit_nm: Floats, torque_fraction: Floats, limits: LimitArrays) -> Floats:
-    """Return the torque limits of commands that request full torque.
+    """Return the torque limits that apply in this period, for commands that request full torque.
+
+    A torque limit rises by no more than the torque rate allows, and never exceeds the derated torque.
 
     Args:
-        last_limit_nm: the torque limits of the period before.
-        torque_fraction: from 0 to 1; what derating leaves of each torque limit.
-        limits: the limits of the robots.
+        last_limit_nm: Torque limits of the last period, (robots, joints).
+        torque_fraction: Fraction from 0 to 1 that derating leaves of each torque limit, (robots, joints).
+        limits: Limits of the robots.
     """
     derated_nm = limits.torque_nm * torque_fraction
-    risen_nm = last_limit_nm + limits.torque_rate_nm_s * limits.period_s
-    highest_nm = np.where(risen_nm < derated_nm, risen_nm, derated_nm)
-    return _clamp(limits.torque_nm, np.zeros_like(derated_nm), highest_nm)
+    rate_limited_nm = last_limit_nm + limits.torque_rate_nm_s * limits.period_s
+    max_limit_nm = np.where(rate_limited_nm < derated_nm, rate_limited_nm, derated_nm)
+    return _clamp(limits.torque_nm, np.zeros_like(derated_nm), max_limit_nm)
 
 
 def limit_targets(
@@ -85,37 +87,40 @@ def limit_targets(
     measured: MeasuredArrays,
     limits: LimitArrays,
 ) -> Floats:
-    """Return the targets that are nearest to the requested ones within all limits.
+    """Return the targets within all limits that are nearest to the requested targets, (robots, joints).
 
     Args:
-        mode: the mode of all joints; not PASSIVE.
-        requested: the targets of the commands.
-        last_target: the limited targets of the period before, in the same mode.
-        torque_limit_nm: the torque limits of this period.
-        measured: the last plausible states of the joints.
-        limits: the limits of the robots.
+        mode: Control mode of all joints. PASSIVE is not allowed.
+        requested: Targets of the commands, in rad, rad/s or N·m depending on the mode.
+        last_target: Limited targets of the last period, in the same mode.
+        torque_limit_nm: Torque limits of this period.
+        measured: Last plausible states of the joints.
+        limits: Limits of the robots.
+
+    Raises:
+        ValueError: The mode is PASSIVE.
     """
     match mode:
         case Mode.POSITION:
             low = _clamp(measured.angle_rad - limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
             high = _clamp(measured.angle_rad + limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
-            step = limits.angle_rate_rad
+            max_change = limits.angle_rate_rad
         case Mode.VELOCITY:
-            low, high = _velocity_bounds(measured, limits)
+            low, high = _compute_velocity_bounds(measured, limits)
             low = _clamp(low, -limits.speed_rad_s, limits.speed_rad_s)
             high = _clamp(high, -limits.speed_rad_s, limits.speed_rad_s)
-            step = limits.acceleration_rad_s2 * limits.period_s
+            max_change = limits.acceleration_rad_s2 * limits.period_s
         case Mode.TORQUE:
-            low, high = _torque_bounds(measured, limits)
+            low, high = _compute_torque_bounds(measured, limits)
             low = _clamp(low, -torque_limit_nm, torque_limit_nm)
             high = _clamp(high, -torque_limit_nm, torque_limit_nm)
-            step = limits.torque_rate_nm_s * limits.period_s
+            max_change = limits.torque_rate_nm_s * limits.period_s
         case Mode.PASSIVE:
             raise ValueError("passive joints have no targets")
-    return _clamp(_clamp(requested, last_target - step, last_target + step), low, high)
+    return _clamp(_clamp(requested, last_target - max_change, last_target + max_change), low, high)
 
 
-def find_active_limits(
+def find_active_limit_indices(
     mode: Mode,
     requested: Floats,
     target: Floats,
@@ -127,42 +132,47 @@ def find_active_limits(
     """Return the index in LIMIT_NAMES of the tightest limit that each requested target exceeds.
 
     Args:
-        mode: the mode of all joints.
-        requested: the targets before the limiter.
-        target: the targets after it.
-        torque_limit_nm: the torque limits of this period.
-        torque_fraction: what derating leaves of each torque limit.
-        measured: the states that the limiter used.
-        limits: the limits of the robots.
+        mode: Control mode of all joints.
+        requested: Targets before the limiter.
+        target: Targets after the limiter.
+        torque_limit_nm: Torque limits of this period.
+        torque_fraction: Fraction that derating leaves of each torque limit.
+        measured: Joint states that the limiter used.
+        limits: Limits of the robots.
     """
     if mode is Mode.POSITION:
-        within_ends = (limits.angle_min_rad <= requested) & (requested <= limits.angle_max_rad)
-        names = np.where(within_ends, ANGLE_RATE, ANGLE)
+        is_within_ends = (limits.angle_min_rad <= requested) & (requested <= limits.angle_max_rad)
+        limit_indices = np.where(is_within_ends, ANGLE_RATE, ANGLE)
     else:
         if mode is Mode.VELOCITY:
-            low, high = _velocity_bounds(measured, limits)
-            magnitude_limit, magnitude, rate = limits.speed_rad_s, SPEED, ACCELERATION
+            low, high = _compute_velocity_bounds(measured, limits)
+            max_magnitude = limits.speed_rad_s
+            magnitude_index = SPEED
+            rate_index = ACCELERATION
         else:
-            low, high = _torque_bounds(measured, limits)
-            magnitude_limit, magnitude, rate = torque_limit_nm, TORQUE, TORQUE_RATE
-        above_end_bound = (requested > high) & (high < magnitude_limit)
-        below_end_bound = (requested < low) & (low > -magnitude_limit)
-        names = np.where(np.abs(requested) > magnitude_limit, magnitude, rate)
-        names = np.where(above_end_bound | below_end_bound, ANGLE, names)
-    names = np.where(target != requested, names, NO_LIMIT)
-    derated = limits.torque_nm > limits.torque_nm * torque_fraction
-    return np.where(derated & ((names == NO_LIMIT) | (names == TORQUE)), THERMAL, names)
+            low, high = _compute_torque_bounds(measured, limits)
+            max_magnitude = torque_limit_nm
+            magnitude_index = TORQUE
+            rate_index = TORQUE_RATE
+        # The bounds near the ends of a joint are the tighter ones where they are within the maximum magnitude.
+        is_above_end_bound = (requested > high) & (high < max_magnitude)
+        is_below_end_bound = (requested < low) & (low > -max_magnitude)
+        limit_indices = np.where(np.abs(requested) > max_magnitude, magnitude_index, rate_index)
+        limit_indices = np.where(is_above_end_bound | is_below_end_bound, ANGLE, limit_indices)
+    limit_indices = np.where(target != requested, limit_indices, NO_LIMIT)
+    is_derated = limits.torque_nm > limits.torque_nm * torque_fraction
+    return np.where(is_derated & ((limit_indices == NO_LIMIT) | (limit_indices == TORQUE)), THERMAL, limit_indices)
 
 
-def _velocity_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+def _compute_velocity_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
     """Return the minimum and maximum velocities from which joints can stop before their ends."""
-    to_lower_end, to_upper_end = _stoppable_speeds(measured, limits)
+    to_lower_end, to_upper_end = _compute_stoppable_speeds(measured, limits)
     return -to_lower_end, to_upper_end
 
 
-def _torque_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+def _compute_torque_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
     """Return the minimum and maximum torques that keep joints between their ends."""
-    to_lower_end, to_upper_end = _stoppable_speeds(measured, limits)
+    to_lower_end, to_upper_end = _compute_stoppable_speeds(measured, limits)
     gain = limits.velocity_gain
     low = -gain * (to_lower_end + measured.velocity_rad_s)
     high = gain * (to_upper_end - measured.velocity_rad_s)
@@ -175,14 +185,14 @@ def _torque_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Float
     )
 
 
-def _stoppable_speeds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+def _compute_stoppable_speeds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
     """Return the maximum speeds from which joints can stop before their lower and upper ends."""
-    to_lower_end = _stoppable_speed(measured.angle_rad - limits.angle_min_rad, limits)
-    to_upper_end = _stoppable_speed(limits.angle_max_rad - measured.angle_rad, limits)
+    to_lower_end = _compute_stoppable_speed(measured.angle_rad - limits.angle_min_rad, limits)
+    to_upper_end = _compute_stoppable_speed(limits.angle_max_rad - measured.angle_rad, limits)
     return to_lower_end, to_upper_end
 
 
-def _stoppable_speed(distance_rad: Floats, limits: LimitArrays) -> Floats:
+def _compute_stoppable_speed(distance_rad: Floats, limits: LimitArrays) -> Floats:
     """Return the maximum speeds from which joints can stop within distances, as `limiter.stoppable_speed` does."""
     reaction_s = REACTION_PERIODS * limits.period_s
     acceleration = limits.acceleration_rad_s2

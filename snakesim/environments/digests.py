@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 
-TICKS_AT_ONCE = 64  # hashing many ticks together costs little more than hashing one
+MAX_PENDING_TICKS = 64  # hashing many ticks together costs little more than hashing one
 Mask = NDArray[np.bool_]  # (robots,)
 
 
-class _Tick(NamedTuple):
-    """The setpoints of one tick, (robots, joints)."""
+class _TickSetpoints(NamedTuple):
+    """The setpoints of one tick. Arrays without another shape are (robots, joints)."""
 
     robots: Mask  # which robots got setpoints
     ticks: NDArray[np.int64]  # (robots,), number of the control cycle
@@ -23,13 +23,13 @@ class _Tick(NamedTuple):
 
 
 class CommandDigests:
-    """A hash for each robot. Ticks are collected, and hashed together."""
+    """Computes a digest of all setpoints for each robot. Ticks are collected, and hashed together."""
 
     def __init__(self, robots: int, joints: int) -> None:
         self._hashes = [hashlib.sha256() for _ in range(robots)]
-        self._ticks: list[_Tick] = []
+        self._pending_ticks: list[_TickSetpoints] = []
         # One tick in the layout of `BlackBox`, little-endian and without gaps.
-        self._layout = np.dtype(
+        self._tick_dtype = np.dtype(
             [
                 ("tick", "<i8"),
                 ("mode", "i1", (joints,)),
@@ -40,7 +40,7 @@ class CommandDigests:
 
     def restart(self, robot: int) -> None:
         """Start the digest of a new episode."""
-        self._hash_ticks()
+        self._hash_pending_ticks()
         self._hashes[robot] = hashlib.sha256()
 
     def add(
@@ -51,35 +51,35 @@ class CommandDigests:
         target: Floats,
         torque_limit_nm: Floats,
     ) -> None:
-        """Add the setpoints of a tick. The arrays must not change afterwards.
+        """Add the setpoints of one tick to the digests. The arrays must not change afterwards.
 
         Args:
-            robots: (robots,), which robots got setpoints.
-            ticks: (robots,), numbers of the control cycle.
-            modes: (robots, joints).
-            target: (robots, joints).
-            torque_limit_nm: (robots, joints).
+            robots: Which robots got setpoints in this tick, (robots,). The rows of all other robots are ignored.
+            ticks: Number of the control cycle of each robot, (robots,).
+            modes: Control mode of every joint, (robots, joints).
+            target: Target of every joint, (robots, joints), in rad, rad/s or N·m depending on the mode.
+            torque_limit_nm: Torque limit of every joint, (robots, joints).
         """
-        self._ticks.append(_Tick(robots, ticks, modes, target, torque_limit_nm))
-        if len(self._ticks) == TICKS_AT_ONCE:
-            self._hash_ticks()
+        self._pending_ticks.append(_TickSetpoints(robots, ticks, modes, target, torque_limit_nm))
+        if len(self._pending_ticks) == MAX_PENDING_TICKS:
+            self._hash_pending_ticks()
 
     def read(self, robot: int) -> str:
-        """Return the digest of all setpoints of the present episode of a robot."""
-        self._hash_ticks()
+        """Return the digest of all setpoints of the current episode of a robot."""
+        self._hash_pending_ticks()
         return self._hashes[robot].hexdigest()
 
-    def _hash_ticks(self) -> None:
-        """Hash the collected ticks."""
-        if not self._ticks:
+    def _hash_pending_ticks(self) -> None:
+        """Add the collected ticks to the digests, and drop the ticks."""
+        if not self._pending_ticks:
             return
-        packed = np.empty((len(self._hashes), len(self._ticks)), dtype=self._layout)
-        for i, tick in enumerate(self._ticks):
-            packed["tick"][:, i] = tick.ticks
-            packed["mode"][:, i] = tick.modes
-            packed["target"][:, i] = tick.target
-            packed["torque_limit_nm"][:, i] = tick.torque_limit_nm
-        got_setpoints = np.stack([tick.robots for tick in self._ticks], axis=1)  # (robots, ticks)
-        self._ticks = []
-        for robot_hash, rows, mask in zip(self._hashes, packed, got_setpoints, strict=True):
+        packed_ticks = np.empty((len(self._hashes), len(self._pending_ticks)), dtype=self._tick_dtype)
+        for i, tick in enumerate(self._pending_ticks):
+            packed_ticks["tick"][:, i] = tick.ticks
+            packed_ticks["mode"][:, i] = tick.modes
+            packed_ticks["target"][:, i] = tick.target
+            packed_ticks["torque_limit_nm"][:, i] = tick.torque_limit_nm
+        got_setpoints = np.stack([tick.robots for tick in self._pending_ticks], axis=1)  # (robots, ticks)
+        self._pending_ticks = []
+        for robot_hash, rows, mask in zip(self._hashes, packed_ticks, got_setpoints, strict=True):
             robot_hash.update(rows[mask].tobytes())

@@ -13,8 +13,8 @@ from snakesim.environments.setup import RENDER_MODES, EnvironmentSetup
 from snakesim_hal.model.scenario import RunConfig
 
 ObservationValues = NDArray[np.float32] | dict[str, NDArray[np.float32]]
-ONLY = 0  # row of the only environment
-STEPPED = np.ones(1, dtype=np.bool_)
+ONLY_ROW = 0  # of the arrays, which have one row for each environment
+ONLY_ENVIRONMENT_MASK = np.ones(1, dtype=np.bool_)
 
 
 class SnakeEnv(gymnasium.Env[Any, Any]):
@@ -55,7 +55,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
                 "residual:CONTROLLER" for corrections in rad to the position targets of that controller.
             observe: Parts of the observation by name. None takes the default parts.
             flat: Whether an observation is one vector of all parts, rather than a dict of vectors.
-            reward: Weights of reward terms that differ from the defaults in `rewards.TERMS`.
+            reward: Weights of reward terms that differ from the defaults in `rewards.REWARD_TERMS`.
             frame_skip: Ticks of the robot in one step.
             duration: Robot time in s until an episode is truncated. None takes the scenario's duration.
             set: Values by their dotted keys, as in `snakesim.run`.
@@ -88,18 +88,18 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         self.observation_units = setup.observation_units
 
     def __reduce__(self) -> Any:
-        return _rebuild, (type(self), self._arguments, self.spec)
+        return _rebuild_environment, (type(self), self._arguments, self.spec)
 
     @property
     def config(self) -> RunConfig:
         """The configuration of this episode. `snakesim run` takes it, written to a file."""
-        return self._episodes.configs[ONLY]
+        return self._episodes.configs[ONLY_ROW]
 
     @property
     def digest(self) -> str:
         """Hash of every setpoint as applied in this episode: the same for the same seed and actions, to the bit."""
         self._require_robot()
-        return self._episodes.robots.read_digest(ONLY)
+        return self._episodes.robots.read_digest(ONLY_ROW)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -118,15 +118,15 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
                 MAX_FIELD_ATTEMPTS fields.
         """
         super().reset(seed=seed)
-        self._episodes.reset(ONLY, seed, self.np_random)
-        observation = self.setup.split(self._episodes.observe(STEPPED)[ONLY])
-        return observation, {"seed": self.config.seed, **self._robot_info()}
+        self._episodes.reset(ONLY_ROW, seed, self.np_random)
+        observation = self.setup.split(self._episodes.observe(ONLY_ENVIRONMENT_MASK)[ONLY_ROW])
+        return observation, {"seed": self.config.seed, **self._make_robot_info()}
 
     def step(self, action: Any) -> tuple[ObservationValues, float, bool, bool, dict[str, Any]]:
         """Command targets for `frame_skip` ticks, or until the robot is stopped or the time is over.
 
         Args:
-            action: (joints,) targets, tail to head, in the unit of `action_units`.
+            action: A target for each joint, tail to head, (joints,), in the unit of `action_units`.
 
         Returns:
             Observation, reward, terminated (goal reached, or stopped by a fault), truncated (time over), and an info
@@ -138,16 +138,16 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             ValueError: The action has another shape, or holds a number that is not finite.
         """
         self._require_robot()
-        target = self.setup.commands.target(action)
-        if self._episodes.is_over[ONLY]:
+        target = self.setup.commands.convert_action(action)
+        if self._episodes.is_over[ONLY_ROW]:
             raise gymnasium.error.ResetNeeded("the episode is over, or its last step did not finish; call reset()")
-        result = self._episodes.step(target[None], STEPPED)
+        result = self._episodes.step(target[None], ONLY_ENVIRONMENT_MASK)
         return (
-            self.setup.split(result.observations[ONLY]),
-            float(result.rewards[ONLY]),
-            bool(result.terminated[ONLY]),
-            bool(result.truncated[ONLY]),
-            self._step_info(result),
+            self.setup.split(result.observations[ONLY_ROW]),
+            float(result.rewards[ONLY_ROW]),
+            bool(result.terminated[ONLY_ROW]),
+            bool(result.truncated[ONLY_ROW]),
+            self._make_step_info(result),
         )
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -159,45 +159,45 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         if self.render_mode is None:
             return None
         self._require_robot()
-        return self._episodes.render(ONLY)
+        return self._episodes.render(ONLY_ROW)
 
     def close(self) -> None:
         """Release the robot and the renderer."""
-        self._episodes.close(ONLY)
+        self._episodes.close(ONLY_ROW)
 
     def _require_robot(self) -> None:
         """Raise ResetNeeded if there is no robot."""
-        if not self._episodes.has_robot[ONLY]:
+        if not self._episodes.has_robot[ONLY_ROW]:
             raise gymnasium.error.ResetNeeded("there is no robot yet; call reset()")
 
-    def _robot_info(self) -> dict[str, Any]:
-        """Return the values of an info dict that describe the robot at this tick."""
+    def _make_robot_info(self) -> dict[str, Any]:
+        """Return the part of an info dict that describes the robot at this tick."""
         robots = self._episodes.robots
-        lifecycle = robots.read_lifecycle(ONLY)
+        lifecycle = robots.read_lifecycle(ONLY_ROW)
         info: dict[str, Any] = {
-            "time_s": float(self._episodes.time_s[ONLY]),
-            "advance_m": float(self._episodes.advance_m[ONLY]),
+            "time_s": float(self._episodes.time_s[ONLY_ROW]),
+            "advance_m": float(self._episodes.advance_m[ONLY_ROW]),
             "lifecycle": lifecycle,
         }
-        limits = zip(self.action_names, robots.read_limit_names()[ONLY].tolist(), strict=True)
-        limited = {joint: name for joint, name in limits if name is not None}
+        joints_with_limits = zip(self.action_names, robots.read_limit_names()[ONLY_ROW].tolist(), strict=True)
+        limited = {joint: name for joint, name in joints_with_limits if name is not None}
         if limited:
             info["limited"] = limited
         if lifecycle != "armed":
-            info["reason"] = robots.read_reason(ONLY)
+            info["reason"] = robots.read_reason(ONLY_ROW)
         return info
 
-    def _step_info(self, result: StepResult) -> dict[str, Any]:
+    def _make_step_info(self, result: StepResult) -> dict[str, Any]:
         """Return the info dict of a step."""
-        terms = {name: float(term[ONLY]) for name, term in result.terms.items()}
-        info = {**self._robot_info(), "energy_j": float(result.energy_j[ONLY]), "reward_terms": terms}
-        if ONLY in result.endings:
-            info["ended"] = result.endings[ONLY]
-            info["digest"] = self._episodes.robots.read_digest(ONLY)
+        terms = {name: float(term[ONLY_ROW]) for name, term in result.terms.items()}
+        info = {**self._make_robot_info(), "energy_j": float(result.energy_j[ONLY_ROW]), "reward_terms": terms}
+        if ONLY_ROW in result.endings:
+            info["ended"] = result.endings[ONLY_ROW]
+            info["digest"] = self._episodes.robots.read_digest(ONLY_ROW)
         return info
 
 
-def _rebuild(env_class: type[SnakeEnv], arguments: dict[str, Any], spec: Any) -> SnakeEnv:
+def _rebuild_environment(env_class: type[SnakeEnv], arguments: dict[str, Any], spec: Any) -> SnakeEnv:
     """Return a new environment like the one that was pickled."""
     env = env_class(**arguments)
     env.spec = spec

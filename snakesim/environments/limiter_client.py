@@ -6,7 +6,7 @@ from snakesim.environments.no_limiter import NoLimiter
 from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.safety.authority import Authority
-from snakesim_hal.safety.joint_limits import Applied
+from snakesim_hal.safety.joint_limits import AppliedSetpoints
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.messages import (
     Description,
@@ -27,18 +27,20 @@ class LimiterClient:
     """Sends commands to the safety core of one robot.
 
     Attributes:
-        core: decides on the setpoints.
+        core: Safety core of the robot: the authority of the HAL, or a stand-in without limits. It turns commands into
+            setpoints.
     """
 
     def __init__(self, description: Description, *, safe: bool) -> None:
-        """Make a robot that is not armed.
+        """Create the safety core of a robot, which is not armed yet.
 
         Args:
-            description: the robot.
-            safe: whether commands pass the limiter. Otherwise motors get them unchanged, and nothing stops the robot.
+            description: Description of the robot.
+            safe: If True, commands pass the limiter of the HAL. If False, motors get the commands unchanged, and no
+                fault stops the robot.
         """
         self._description = description
-        self._full_torque_nm = [joint.torque_limit_nm for joint in description.joints]
+        self._max_torque_nm = [joint.torque_limit_nm for joint in description.joints]
         self._sequence = 0
         self._authority: Authority | None = None
         self._no_limiter: NoLimiter | None = None
@@ -70,16 +72,19 @@ class LimiterClient:
         return self._authority is not None and bool(self._authority.isolated_joints)
 
     def arm(self, joints: JointState) -> None:
-        """Arm the robot at the present pose.
+        """Acquire the lease, command the measured angles, and arm the robot. Without a limiter, do nothing.
+
+        Args:
+            joints: Joint states of tick 0.
 
         Raises:
-            RefusedError: the robot cannot be armed.
+            RefusedError: The robot cannot be armed.
         """
         if self._authority is None:
             return
-        self._authority.on_lease(LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0)
-        self._offer(self._authority, 0, 0, [Mode.POSITION] * len(self._full_torque_nm), list(joints.angle_rad))
-        answer = self._authority.on_lifecycle(make_arm_request(self._description, REQUESTER), 0)
+        self._authority.handle_lease_request(LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0)
+        self._send_command(self._authority, 0, 0, [Mode.POSITION] * len(self._max_torque_nm), list(joints.angle_rad))
+        answer = self._authority.handle_lifecycle_request(make_arm_request(self._description, REQUESTER), 0)
         if not answer.ok:
             raise RefusedError(f"not ready to arm: {answer.reason}", code="robot/not-ready")
 
@@ -87,33 +92,36 @@ class LimiterClient:
         """Send a command that answers the samples of a tick. A robot that is not armed gets none.
 
         Args:
-            tick: number of the control cycle.
-            now_ns: safety time.
-            modes: mode of each joint.
-            target: a target for each joint, tail to head; in rad, rad/s or N·m, depending on the mode.
+            tick: Number of the control cycle.
+            now_ns: Current robot time, which is the time base of the safety core.
+            modes: Control mode of each joint, tail to head.
+            target: A target for each joint, tail to head, in rad, rad/s or N·m depending on the mode.
         """
         if self._no_limiter is not None:
             self._no_limiter.command(modes, target)
         elif self._authority is not None and self._authority.state == "armed":
-            self._offer(self._authority, tick, now_ns, modes, target)
+            self._send_command(self._authority, tick, now_ns, modes, target)
 
     def resume(
         self,
         joints: JointState,
         power: Power | None,
         *,
-        applied: tuple[Applied, Applied],
+        applied: tuple[AppliedSetpoints, AppliedSetpoints],
         commands: Iterable[tuple[int, list[float]]],
         mode: Mode,
     ) -> None:
-        """Take over a robot that has been armed, and has been commanded without this object until now.
+        """Take over a robot that has been armed and limited by the array limiter until now.
+
+        The safety core is replaced by one in the state that it would have if it had limited the robot before. Without a
+        limiter, this does nothing.
 
         Args:
-            joints: the newest joint state, which was ordinary.
-            power: the newest power sample, if there is one.
-            applied: the last setpoints but one, and the last ones.
-            commands: ticks and targets of the commands that may still be used, oldest first.
-            mode: the mode of these commands.
+            joints: Newest joint state that the array limiter has accepted.
+            power: Newest power sample. None if there was none.
+            applied: Setpoints of the last tick but one, and of the last tick.
+            commands: Tick and targets of each command that may still take effect, oldest first.
+            mode: Control mode of these commands.
         """
         if self._authority is None:
             return
@@ -121,9 +129,11 @@ class LimiterClient:
         self._authority = authority
         self.core = authority
         for tick, target in commands:
-            self._offer(authority, tick, joints.timestamp_ns, [mode] * len(target), target)
+            self._send_command(authority, tick, joints.timestamp_ns, [mode] * len(target), target)
 
-    def _offer(self, authority: Authority, tick: int, now_ns: int, modes: list[Mode], target: list[float]) -> None:
+    def _send_command(
+        self, authority: Authority, tick: int, now_ns: int, modes: list[Mode], target: list[float]
+    ) -> None:
         """Send a command that answers the samples of a tick."""
         self._sequence += 1
         command = JointCommand(
@@ -137,15 +147,16 @@ class LimiterClient:
             # The setpoints.
             mode=modes,
             target=target,
-            torque_limit_nm=self._full_torque_nm,
+            torque_limit_nm=self._max_torque_nm,
         )
-        authority.offer_command(command, now_ns=now_ns, tick=tick, age_ns=0)
+        authority.process_command(command, now_ns=now_ns, tick=tick, age_ns=0)
 
 
 class _ResumedAuthority(Authority):
-    """The authority of a robot that arrays have limited until now, in the state that it would have had.
+    """The authority of a robot that the array limiter has limited until now, in the state that it would be in.
 
-    After an ordinary joint state, the plausibility check depends on that state alone, see `plausibility`.
+    After an ordinary joint state, the plausibility check depends on that state alone, see
+    `snakesim_hal.safety.plausibility`.
     """
 
     def __init__(
@@ -153,21 +164,28 @@ class _ResumedAuthority(Authority):
         description: Description,
         joints: JointState,
         power: Power | None,
-        applied: tuple[Applied, Applied],
+        applied: tuple[AppliedSetpoints, AppliedSetpoints],
     ) -> None:
-        """Continue an arm session. The arguments are those of `LimiterClient.resume`."""
+        """Create an authority that is armed, holds a lease, and has seen the given samples.
+
+        Args:
+            description: Description of the robot.
+            joints: Newest joint state that the array limiter has accepted.
+            power: Newest power sample. None if there was none.
+            applied: Setpoints of the last tick but one, and of the last tick.
+        """
         super().__init__(description)
         # An armed robot with a lease, and without a stop that its motors have not received yet.
         self.state = "armed"
         self.reason = f"armed by {REQUESTER}"
         self.arm_session = 1
-        self._stop_sent = True
+        self._is_stop_sent = True
         expires_ns = joints.timestamp_ns + description.lease_ns
         self.lease = Lease(holder=CONTROL, epoch=1, priority=LEASE_PRIORITY, expires_ns=expires_ns)
         # `joints` were measured under the last setpoints but one, and the state that follows under the last ones.
-        applied_before, last_applied = applied
-        self._applied = applied_before
-        self.observe(joints)
-        self._applied = last_applied
+        previous_setpoints, last_setpoints = applied
+        self._last_setpoints = previous_setpoints
+        self.observe_joints(joints)
+        self._last_setpoints = last_setpoints
         if power is not None:
             self.observe_power(power, joints.timestamp_ns)

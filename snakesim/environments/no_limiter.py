@@ -1,7 +1,7 @@
-"""What decides on the setpoints of an environment that has no limits."""
+"""A safety core without limits, for environments that command the motors directly."""
 
 from snakesim_hal.backend import SafeSetpoints
-from snakesim_hal.safety.authority import TickDecision
+from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Mode, Power
 
 
@@ -32,23 +32,23 @@ class NoLimiter:
         self._modes = modes
         self._target = target
 
-    def observe(self, joints: JointState, now_ns: int) -> None:
+    def observe_joints(self, joints: JointState, now_ns: int) -> None:
         """Ignore the joint states."""
 
-    def observe_obstacles(self, obstacles: list[str]) -> None:
+    def set_backend_obstacles(self, obstacles: list[str]) -> None:
         """Ignore them: simulated robots are always ready."""
 
     def observe_power(self, power: Power, now_ns: int) -> None:
         """Ignore the power samples."""
 
-    def check_deadlines(self, now_ns: int, tick: int) -> None:
+    def latch_faults_and_expire_lease(self, now_ns: int, tick: int) -> None:
         """Do nothing: there is no lease that could expire."""
 
-    def decide(self, up_to: int | None = None) -> TickDecision:
+    def compute_setpoints(self, max_tick: int | None = None) -> TickOutput:
         """Return the targets unchanged."""
-        return TickDecision(SafeSetpoints(self._modes, self._target, self._full_torque_nm), None, {})
+        return TickOutput(SafeSetpoints(self._modes, self._target, self._full_torque_nm), None, {})
 
-    def fault(self, fault: Fault) -> None:
+    def latch_fault(self, fault: Fault) -> None:
         """Remember a fault of the whole robot; a fault of a joint changes nothing."""
         if fault.reach == "robot":
             self._failure = fault.cause

@@ -1,6 +1,6 @@
 """What the agents of many environments observe, and how far their robots have advanced, as rows of arrays.
 
-The parts of an observation are those of `snakesim_gnc.control.observations`, which policies read on a robot.
+The parts of an observation are those of `snakesim_gnc.control.observations`, quantity_index policies read on a robot.
 """
 
 import math
@@ -20,32 +20,32 @@ from snakesim_hal.wire.messages import Description
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What there is to observe of all robots at one tick."""
+class BatchState:
+    """The state of all robots at one tick, from which the parts of observations are read."""
 
     time_s: Floats  # (robots,), since arming
-    joints: Floats  # (robots, 3 * joints)
-    poses: Floats  # (robots, 7)
+    joints: Floats  # (robots, 3 * joints): angles, velocities, torques
+    poses: Floats  # (robots, 7): positions, quaternions wxyz
     progress: Sequence[GoalProgress]
-    robots: Robots  # measures what few environments observe
+    robots: Robots  # read only by the parts that few environments observe
 
 
-class Observers:
-    """The observers of all environments.
+class BatchObserver:
+    """Computes the observations of all environments, and how far their robots have advanced.
 
     Attributes:
-        progress: the advance of each robot towards its goal.
+        progress: Advance of each robot towards its goal.
     """
 
     def __init__(self, robots: int, description: Description, parts: Mapping[str, ObservationPart]) -> None:
-        """Make room for robots.
+        """Allocate the arrays for a number of robots, without tasks. `restart` sets the task of each robot.
 
         Args:
-            robots: their number.
-            description: a robot like them.
-            parts: the parts of an observation, in their order.
+            robots: Number of robots.
+            description: Description of a robot with the same joints, which stands for each robot until its `restart`.
+            parts: Parts of an observation by name, in their order in the observation.
         """
-        self._readers = [READERS[name] for name in parts]
+        self._part_readers = [PART_READERS[name] for name in parts]
         self._low = np.array([value for part in parts.values() for value in part.low], np.float32)
         self._high = np.array([value for part in parts.values() for value in part.high], np.float32)
         self._descriptions = [description] * robots
@@ -57,45 +57,46 @@ class Observers:
         self.progress = [GoalProgress(description, no_task) for _ in range(robots)]
 
     def restart(self, robot: int, description: Description, task: Task) -> None:
-        """Start an episode. The advance counts from the first observation on."""
+        """Start an episode of a robot with a new task. The advance counts from the first observation on."""
         self._descriptions[robot] = description
-        first = self._descriptions[0]
-        self._has_equal_links = all(_has_equal_links(first, other) for other in self._descriptions)
-        self._locator = BodyLocator(first)
+        first_description = self._descriptions[0]
+        self._has_equal_links = all(_has_equal_links(first_description, other) for other in self._descriptions)
+        self._locator = BodyLocator(first_description)
         self._start_poses[robot] = [*task.start_position_w, *task.start_wxyz]
         self.progress[robot] = GoalProgress(description, task)
 
     def observe(self, robots: Robots, time_s: Floats, rows: Mask) -> NDArray[np.float32]:
-        """Measure the advance of some robots, and return the observations of all, (robots, n).
+        """Measure the advance of some robots, and return the observations of all robots, (robots, n).
 
         Args:
-            robots: the robots.
-            time_s: (robots,), time since arming.
-            rows: (robots,), the robots whose advance is measured; the observations of the others mean nothing.
+            robots: Robots of all environments.
+            time_s: Time since arming, (robots,).
+            rows: Which robots' advance is measured, (robots,). The observations of other robots are not valid.
         """
         has_pose, poses = robots.read_poses()
         if not has_pose.all():
             poses = np.where(has_pose[:, None], poses, self._start_poses)
         self._measure_advance(robots.joints, poses, rows)
-        seen = Seen(time_s, robots.joints, poses, self.progress, robots)
-        columns = [read(seen) for read in self._readers]
-        numbers = np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
-        return np.minimum(np.maximum(numbers, self._low), self._high)
+        state = BatchState(time_s, robots.joints, poses, self.progress, robots)
+        columns = [read(state) for read in self._part_readers]
+        values = np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
+        return np.minimum(np.maximum(values, self._low), self._high)
 
     def _measure_advance(self, joints: Floats, poses: Floats, rows: Mask) -> None:
+        """Update the progress of some robots. Robots with equal links are located together, which is faster."""
         angles_rad = joints[:, : joints.shape[1] // 3]
-        pose_numbers = poses.tolist()
+        pose_lists = poses.tolist()
         indices = np.flatnonzero(rows).tolist()
         groups = [[robot] for robot in indices]
         if self._has_equal_links and indices:
-            groups = [indices]  # faster
+            groups = [indices]
         for group in groups:
             locator = self._locator if self._has_equal_links else BodyLocator(self._descriptions[group[0]])
-            nodes_w, centers_w = locator.locate(poses[group], angles_rad[group])
+            nodes_w, centers_w = locator.compute_body_positions(poses[group], angles_rad[group])
             for i, robot in enumerate(group):
                 progress = self.progress[robot]
-                progress.pose = pose_numbers[robot][:3], pose_numbers[robot][3:]
-                progress.follow(nodes_w[i], centers_w[i])
+                progress.pose = pose_lists[robot][:3], pose_lists[robot][3:]
+                progress.update_from_body(nodes_w[i], centers_w[i])
 
 
 def _has_equal_links(first: Description, second: Description) -> bool:
@@ -105,34 +106,34 @@ def _has_equal_links(first: Description, second: Description) -> bool:
     return first.links == second.links and [j.axis for j in first.joints] == [j.axis for j in second.joints]
 
 
-def _read_joints(which: int) -> Callable[[Seen], Floats]:
-    """Return a function that reads angles (0), velocities (1) or torques (2)."""
+def _make_joint_reader(quantity_index: int) -> Callable[[BatchState], Floats]:
+    """Return a function that reads the angles (index 0), velocities (1) or torques (2) of all joints."""
 
-    def read(seen: Seen) -> Floats:
-        count = seen.joints.shape[1] // 3
-        return seen.joints[:, which * count : (which + 1) * count]
+    def read(state: BatchState) -> Floats:
+        count = state.joints.shape[1] // 3
+        return state.joints[:, quantity_index * count : (quantity_index + 1) * count]
 
     return read
 
 
-def _read_bearings(seen: Seen) -> Floats:
-    return np.array([(math.cos(p.bearing_rad), math.sin(p.bearing_rad)) for p in seen.progress])
+def _read_bearings(state: BatchState) -> Floats:
+    return np.array([(math.cos(p.goal_bearing_rad), math.sin(p.goal_bearing_rad)) for p in state.progress])
 
 
-def _read_distances_left(seen: Seen) -> Floats:
-    return np.array([[progress.left_m] for progress in seen.progress])
+def _read_distances_left(state: BatchState) -> Floats:
+    return np.array([[progress.remaining_distance_m] for progress in state.progress])
 
 
-READERS: Mapping[str, Callable[[Seen], Floats]] = {
-    "time_s": lambda seen: seen.time_s[:, None],
-    "angle_rad": _read_joints(0),
-    "velocity_rad_s": _read_joints(1),
-    "torque_nm": _read_joints(2),
+PART_READERS: Mapping[str, Callable[[BatchState], Floats]] = {
+    "time_s": lambda state: state.time_s[:, None],
+    "angle_rad": _make_joint_reader(0),
+    "velocity_rad_s": _make_joint_reader(1),
+    "torque_nm": _make_joint_reader(2),
     "goal_bearing": _read_bearings,
     "goal_m": _read_distances_left,
-    "contact_n": lambda seen: seen.robots.read_contact_forces(),
-    "position_w_m": lambda seen: seen.poses[:, :3],
-    "orientation_wxyz": lambda seen: seen.poses[:, 3:],
-    "velocity_w_m_s": lambda seen: seen.robots.read_velocities()[:, :3],
-    "angular_velocity_w_rad_s": lambda seen: seen.robots.read_velocities()[:, 3:],
+    "contact_n": lambda state: state.robots.read_contact_forces(),
+    "position_w_m": lambda state: state.poses[:, :3],
+    "orientation_wxyz": lambda state: state.poses[:, 3:],
+    "velocity_w_m_s": lambda state: state.robots.read_velocities()[:, :3],
+    "angular_velocity_w_rad_s": lambda state: state.robots.read_velocities()[:, 3:],
 }

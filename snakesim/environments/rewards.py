@@ -7,52 +7,52 @@ from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 
 
 @dataclass(frozen=True)
-class Term:
+class RewardTerm:
     """One term of the reward: its default weight, and the quantity that it weighs, with unit and meaning."""
 
     weight: float
     unit: str
-    about: str
+    description: str
 
 
-TERMS = {
-    "advance": Term(1.0, "m", "of the center of mass towards the goal; without a goal along the first heading"),
-    "energy": Term(-0.005, "J", "sum over joints of |torque x velocity| over time"),
-    "limited": Term(
+REWARD_TERMS = {
+    "advance": RewardTerm(1.0, "m", "of the center of mass towards the goal; without a goal along the first heading"),
+    "energy": RewardTerm(-0.005, "J", "sum over joints of |torque x velocity| over time"),
+    "limited": RewardTerm(
         -0.001, "1", "fraction of joints whose targets the limiter changed, mean over the ticks of the step"
     ),
-    "goal": Term(1.0, "1", "1 in the step that reaches the goal"),
-    "stopped": Term(-1.0, "1", "1 in the step in which the robot is stopped by a fault"),
+    "goal": RewardTerm(1.0, "1", "1 in the step that reaches the goal"),
+    "stopped": RewardTerm(-1.0, "1", "1 in the step in which the robot is stopped by a fault"),
 }
 
 
-def complete_weights(given: Mapping[str, float] | None) -> dict[str, float]:
-    """Return the weight of every term.
+def fill_reward_weights(overrides: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the weight of every reward term: the defaults, replaced by the caller's weights.
 
     Args:
-        given: Weights that differ from the defaults, by the name of their term.
+        overrides: Weights that differ from the defaults, by the name of their term. None if there are none.
 
     Raises:
-        ConfigError: There is no such term, or its weight is no number.
+        ConfigError: `overrides` is not a mapping, has an unknown term, or has a weight that is not a number.
     """
-    if given is not None and not isinstance(given, Mapping):
+    if overrides is not None and not isinstance(overrides, Mapping):
         raise ConfigError(
-            f"reward={shorten(repr(given))}: give a dict of weights, such as {{'energy': 0}}, of {', '.join(TERMS)}; "
-            "for a reward that you compute yourself, wrap the environment in a gymnasium.Wrapper, see "
-            "docs/how-to/environments.md",
+            f"reward={shorten(repr(overrides))}: give a dict of weights, such as {{'energy': 0}}, of "
+            f"{', '.join(REWARD_TERMS)}; for a reward that you compute yourself, wrap the environment in a "
+            "gymnasium.Wrapper, see docs/how-to/environments.md",
             code="python/invalid-argument",
         )
-    weights = {name: float(term.weight) for name, term in TERMS.items()}
-    for name, weight in (given or {}).items():
-        if name not in TERMS:
-            hint = suggest_word(str(name), TERMS)
+    weights = {name: float(term.weight) for name, term in REWARD_TERMS.items()}
+    for name, weight in (overrides or {}).items():
+        if name not in REWARD_TERMS:
+            hint = suggest_word(str(name), REWARD_TERMS)
             raise ConfigError(
-                f"reward={shorten(str(given))}: no term {name!r}; {hint}there are {', '.join(TERMS)}",
+                f"reward={shorten(str(overrides))}: no term {name!r}; {hint}there are {', '.join(REWARD_TERMS)}",
                 code="python/invalid-argument",
             )
         if not isinstance(weight, int | float):
             raise ConfigError(
-                f"reward[{name!r}]={weight!r:.60}: give a number, the reward per {TERMS[name].unit}",
+                f"reward[{name!r}]={weight!r:.60}: give a number, the reward per {REWARD_TERMS[name].unit}",
                 code="python/invalid-argument",
             )
         weights[name] = float(weight)

@@ -8,12 +8,12 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
-from snakesim.configuration import list_overrides, load_checked
-from snakesim.environments.actions import Commands, corrected_controller
-from snakesim.environments.rewards import complete_weights
-from snakesim_gnc.control.observations import Observer, select_parts
+from snakesim.configuration import load_and_validate_config, make_overrides
+from snakesim.environments.actions import Commands, parse_corrected_controller
+from snakesim.environments.rewards import fill_reward_weights
+from snakesim_gnc.control.observations import ObservationBuilder, select_observation_parts
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.randomization import make_randomizations
+from snakesim_hal.model.randomization import parse_randomizations
 from snakesim_hal.model.scenario import Override, RunConfig, describe_run_robot
 from snakesim_hal.wire.messages import Description
 
@@ -25,8 +25,8 @@ class EnvironmentSetup:
     """The checked arguments of environments, and what all environments with the same arguments share.
 
     Attributes:
-        config: the configuration of the scenario, without what a seed changes.
-        new_fields: number of random fields that each reset draws again.
+        config: Configuration of the scenario, without what a seed changes.
+        new_fields: Number of random fields that each reset draws again.
     """
 
     def __init__(
@@ -58,9 +58,9 @@ class EnvironmentSetup:
                 "SnakeSIM/Scenario-v0 needs scenario=..., a shipped name or the path of a file",
                 code="python/invalid-argument",
             )
-        _check_step_arguments(frame_skip, render_mode, residual_rad)
-        controller = corrected_controller(action)  # whose targets the actions correct; None: actions are targets
-        overrides = list_overrides(set, duration_s=duration)
+        _validate_step_arguments(frame_skip, render_mode, residual_rad)
+        controller = parse_corrected_controller(action)  # whose targets the actions correct; None: actions are targets
+        overrides = make_overrides(set, duration_s=duration)
         if controller is not None:
             if not safe:
                 raise ConfigError(
@@ -72,7 +72,7 @@ class EnvironmentSetup:
         # The scenario, and what each seed changes in it.
         self._scenario = os.fspath(scenario)
         self._overrides = overrides
-        self._randomizations = make_randomizations(randomize)
+        self._randomizations = parse_randomizations(randomize)
         self.config: RunConfig = self._load_config(0)
         self.new_fields = len(self.config.scene.random_field) if new_field else 0
 
@@ -80,54 +80,54 @@ class EnvironmentSetup:
         self.is_assisted = controller is not None
         self.is_safe = safe
         self.frame_skip = frame_skip
-        self.weights = complete_weights(reward)
+        self.weights = fill_reward_weights(reward)
         self.render_mode = render_mode
         self.render_fps = self.config.rate_hz / frame_skip
         self.picture_size = (width, height)
 
         self.description = describe_run_robot(self.config)
-        self.commands = Commands.of(self.description, action, residual_rad)
+        self.commands = Commands.make_for_robot(self.description, action, residual_rad)
         self._declare_spaces(observe, flat)
 
     def _declare_spaces(self, observe: Sequence[str] | None, flat: bool) -> None:
-        """Set the action space and the observation space, and a name and a unit for every number in them.
+        """Set the action space and the observation space, and a name and a unit for every value in them.
 
-        An observation consists of parts, such as the joint angles. In a flat space the numbers of all parts are one
-        vector, otherwise the space is a dict of the parts.
+        An observation consists of parts, such as the joint angles. In a flat space the values of all parts are one
+        vector. Otherwise the space is a dict of the parts.
 
         Args:
-            observe: names of the parts; None: those of `select_parts`.
-            flat: whether an observation is one vector.
+            observe: Names of the parts of an observation. None takes the default parts of `select_parts`.
+            flat: Whether an observation is one vector instead of a dict.
         """
         self.action_space = _make_box(self.commands.low, self.commands.high)
         self.action_names = list(self.commands.names)
         self.action_units = [self.commands.unit] * len(self.action_names)
 
-        self.parts = select_parts(self.description, observe)
+        self.parts = select_observation_parts(self.description, observe)
         self.observation_names: list[str] = []
         self.observation_units: list[str] = []
-        slices: dict[str, slice] = {}
-        boxes: dict[str, spaces.Space[Any]] = {}
+        slice_by_part: dict[str, slice] = {}
+        space_by_part: dict[str, spaces.Space[Any]] = {}
         for part_name, part in self.parts.items():
             start = len(self.observation_names)
             self.observation_names += [f"{part_name}.{name}" for name in part.names]
             self.observation_units += [part.unit] * len(part.names)
-            slices[part_name] = slice(start, len(self.observation_names))
-            boxes[part_name] = _make_box(part.low, part.high)
+            slice_by_part[part_name] = slice(start, len(self.observation_names))
+            space_by_part[part_name] = _make_box(part.low, part.high)
         self.observation_space: spaces.Space[Any]
-        self.slices: dict[str, slice] | None = None  # of each part in an observation; None: it is one vector
+        self.slices: dict[str, slice] | None = None  # of each part in an observation; None for a flat space
         if flat:
-            observer = Observer(self.description, self.parts)
+            observer = ObservationBuilder(self.description, self.parts)
             self.observation_space = spaces.Box(observer.low, observer.high)
         else:
-            self.observation_space = spaces.Dict(boxes)
-            self.slices = slices
+            self.observation_space = spaces.Dict(space_by_part)
+            self.slices = slice_by_part
 
     def make_config(self, seed: int) -> RunConfig:
         """Return the configuration of an episode.
 
         Args:
-            seed: replaces the seed of the run and that of the random obstacle fields, and randomizes parameters.
+            seed: Seed of the run and of the random obstacle fields. It also decides the randomized parameters.
 
         Raises:
             ConfigError: A randomized value is not allowed.
@@ -138,7 +138,10 @@ class EnvironmentSetup:
         return self._load_config(seed, ["seed", *field_keys])
 
     def describe(self, config: RunConfig) -> Description:
-        """Return the robot of an episode. Nothing reads the hash of its configuration, which may be of another seed."""
+        """Return the description of the robot of an episode.
+
+        The hash of the configuration in it may be that of another seed. Nothing reads this hash here.
+        """
         has_equal_times = (config.period_ns, config.lease_ns) == (self.config.period_ns, self.config.lease_ns)
         if config.robot is self.config.robot and has_equal_times:
             return self.description
@@ -162,8 +165,8 @@ class EnvironmentSetup:
         """Load the scenario with the parameters that a seed randomizes.
 
         Args:
-            seed: of the random numbers.
-            seed_keys: keys of the configuration that get the seed itself as their value.
+            seed: Seed that decides the randomized parameters.
+            seed_keys: Dotted keys of the configuration that get the seed itself as their value.
 
         Raises:
             ConfigError: The scenario or a randomized value is wrong.
@@ -171,16 +174,16 @@ class EnvironmentSetup:
         overrides = [*self._overrides]
         overrides += [Override(key, seed, "seed") for key in seed_keys]
         for randomization in self._randomizations:
-            overrides += randomization.overrides_for_scene(seed, "randomize")
-        return load_checked(self._scenario, overrides, processes=False)
+            overrides += randomization.sample_overrides(seed, "randomize")
+        return load_and_validate_config(self._scenario, overrides, processes=False)
 
 
-def _check_step_arguments(frame_skip: int, render_mode: str | None, residual_rad: float) -> None:
-    """Check the arguments that decide what a step does.
+def _validate_step_arguments(frame_skip: int, render_mode: str | None, residual_rad: float) -> None:
+    """Raise ConfigError unless the arguments that decide what a step does are valid.
 
     Args:
-        frame_skip: Ticks of each step.
-        render_mode: How pictures are made; None: no pictures.
+        frame_skip: Number of ticks in each step.
+        render_mode: Kind of pictures that `render` returns. None if there are none.
         residual_rad: Largest correction of a controller's target, in rad.
 
     Raises:

@@ -74,7 +74,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         self._episodes = Episodes(setup, num_envs, threads or len(os.sched_getaffinity(0)))
         if setup.config.backend == "sim" and num_envs > 1 and (cost := describe_loop_cost()):
             logger.warn(cost)
-        self._random: list[Generator] = [np_random(None)[0] for _ in range(num_envs)]
+        self._rngs: list[Generator] = [np_random(None)[0] for _ in range(num_envs)]
         self._has_unfinished_step = False
 
         self.num_envs = num_envs
@@ -98,9 +98,10 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         """Reset all environments, or some of them.
 
         Args:
-            seed: Seed of the first environment, from which the next ones count up, or one for each.
-            options: `reset_mask`: (num_envs,), the environments that are reset. Without it all are. Nothing else is
-                read.
+            seed: Seed of the first environment, from which the seeds of the next ones count up, or a seed for each
+                environment. None keeps the random generators.
+            options: Options with the key `reset_mask`, whose value selects the environments to reset, (num_envs,).
+                Without this key, all are reset. Other keys are ignored.
 
         Returns:
             Observations of all environments, stacked, and the merged info dicts of those that were reset.
@@ -110,11 +111,11 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             ValueError: The number of seeds or the mask is wrong.
             ConfigError: The obstacles of a random field find no place.
         """
-        seeds = _spread_seeds(seed, self.num_envs)
+        seeds = _expand_seeds(seed, self.num_envs)
         mask = _read_mask(options, self.num_envs)
         self._has_unfinished_step = True
         for environment in np.flatnonzero(mask).tolist():
-            self._reset_one(environment, seeds[environment])
+            self._reset_environment(environment, seeds[environment])
         observations = self._episodes.observe(self._episodes.has_robot)
         self._has_unfinished_step = not self._episodes.has_robot.all()
         return self._setup.split(observations), self._make_reset_infos(mask).read()
@@ -123,7 +124,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         """Step every environment.
 
         Args:
-            actions: (num_envs, joints) actions, a row for each environment.
+            actions: An action for each environment, (num_envs, joints).
 
         Returns:
             Stacked observations, then rewards, terminated and truncated, each (num_envs,), and merged info dicts.
@@ -133,31 +134,31 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
                 an episode is over, and the autoreset mode is "Disabled".
             ValueError: The number of rows is wrong, or a row is no action. No environment has taken a step then.
         """
-        targets = self._setup.commands.targets(actions, self.num_envs)
+        targets = self._setup.commands.convert_actions(actions, self.num_envs)
         if self._has_unfinished_step:
             raise error.ResetNeeded(
                 "the last step or reset did not finish, so some environments may be a step ahead of the others; "
                 "call reset()"
             )
-        was_over = self._episodes.is_over.copy()
-        if self._autoreset_mode is AutoresetMode.DISABLED and was_over.any():
-            over = np.flatnonzero(was_over).tolist()
+        was_episode_over = self._episodes.is_over.copy()
+        if self._autoreset_mode is AutoresetMode.DISABLED and was_episode_over.any():
+            over = np.flatnonzero(was_episode_over).tolist()
             raise error.ResetNeeded(f"the episodes of environments {over} are over; reset them with `reset_mask`")
         self._has_unfinished_step = True
-        for environment in np.flatnonzero(was_over).tolist():
-            self._reset_one(environment, None)
-        result = self._episodes.step(targets, ~was_over)
-        infos = self._make_step_infos(result, ~was_over)
+        for environment in np.flatnonzero(was_episode_over).tolist():
+            self._reset_environment(environment, None)
+        result = self._episodes.step(targets, ~was_episode_over)
+        infos = self._make_step_infos(result, ~was_episode_over)
         observations = result.observations
-        if was_over.any():
-            infos.update(self._make_reset_infos(was_over), was_over)
-            observations = self._observe_also(was_over, observations)
+        if was_episode_over.any():
+            infos.update(self._make_reset_infos(was_episode_over), was_episode_over)
+            observations = self._update_observations(was_episode_over, observations)
         if self._autoreset_mode is AutoresetMode.SAME_STEP and self._episodes.is_over.any():
             observations, infos = self._reset_in_same_step(observations, infos)
         self._has_unfinished_step = False
         return (
             self._setup.split(observations),
-            np.where(was_over, 0.0, result.rewards),
+            np.where(was_episode_over, 0.0, result.rewards),
             result.terminated,
             result.truncated,
             infos.read(),
@@ -181,13 +182,13 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             self._episodes.close(environment)
         self._has_unfinished_step = True
 
-    def _reset_one(self, environment: int, seed: int | None) -> None:
+    def _reset_environment(self, environment: int, seed: int | None) -> None:
         """Start an episode of one environment."""
         if seed is not None:
-            self._random[environment] = np_random(seed)[0]
-        self._episodes.reset(environment, seed, self._random[environment])
+            self._rngs[environment] = np_random(seed)[0]
+        self._episodes.reset(environment, seed, self._rngs[environment])
 
-    def _observe_also(self, environments: Mask, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _update_observations(self, environments: Mask, observations: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return observations in which those of some environments are new."""
         return np.where(environments[:, None], self._episodes.observe(environments), observations)
 
@@ -199,12 +200,12 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         final_observations = np.full(self.num_envs, None, dtype=object)
         for environment in np.flatnonzero(over).tolist():
             final_observations[environment] = self._setup.split(observations[environment])
-            self._reset_one(environment, None)
-        following = infos.select(~over)
-        following.add("final_obs", final_observations, over)
-        following.add_group("final_info", infos.select(over), over)
-        following.update(self._make_reset_infos(over), over)
-        return self._observe_also(over, observations), following
+            self._reset_environment(environment, None)
+        merged_infos = infos.select(~over)
+        merged_infos.add("final_obs", final_observations, over)
+        merged_infos.add_group("final_info", infos.select(over), over)
+        merged_infos.update(self._make_reset_infos(over), over)
+        return self._update_observations(over, observations), merged_infos
 
     # --- infos -----------------------------------------------------------------------------------------------
 
@@ -233,29 +234,35 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         return infos
 
     def _add_robot_infos(self, infos: InfoArrays, environments: Mask) -> None:
-        """Add the values that describe the robots at this tick."""
+        """Add the values that describe the robots at this tick to the infos of some environments.
+
+        Every environment gets `time_s`, `advance_m` and `lifecycle`. Those with limited joints also get `limited`, and
+        those that are not armed get `reason`.
+
+        Args:
+            infos: Infos to add the values to.
+            environments: Which environments get values, (num_envs,).
+        """
         robots = self._episodes.robots
         rows = np.flatnonzero(environments).tolist()
-        lifecycles = {environment: robots.read_lifecycle(environment) for environment in rows}
+        lifecycle_by_row = {row: robots.read_lifecycle(row) for row in rows}
         infos.add("time_s", self._episodes.time_s, environments)
         infos.add("advance_m", self._episodes.advance_m, environments)
-        infos.add_objects("lifecycle", lifecycles)
-        limits = robots.read_limit_names()
-        is_limited = (limits != None).any(axis=1) & environments  # noqa: E711 - element by element
-        if is_limited.any():
-            group = InfoArrays(self.num_envs)
-            for joint, name in enumerate(self._setup.action_names):
-                of_joint = (limits[:, joint] != None) & environments  # noqa: E711
-                if of_joint.any():
-                    group.add(name, limits[:, joint], of_joint)
-            infos.add_group("limited", group, is_limited)
-        reasons = {
-            environment: robots.read_reason(environment)
-            for environment, lifecycle in lifecycles.items()
-            if lifecycle != "armed"
+        infos.add_objects("lifecycle", lifecycle_by_row)
+        limit_names = robots.read_limit_names()  # (num_envs, joints), None where no limit changed the target
+        has_limited_joint = (limit_names != None).any(axis=1) & environments  # noqa: E711 - element by element
+        if has_limited_joint.any():
+            limit_infos = InfoArrays(self.num_envs)
+            for joint_index, joint_name in enumerate(self._setup.action_names):
+                is_limited = (limit_names[:, joint_index] != None) & environments  # noqa: E711
+                if is_limited.any():
+                    limit_infos.add(joint_name, limit_names[:, joint_index], is_limited)
+            infos.add_group("limited", limit_infos, has_limited_joint)
+        reason_by_row = {
+            row: robots.read_reason(row) for row, lifecycle in lifecycle_by_row.items() if lifecycle != "armed"
         }
-        if reasons:
-            infos.add_objects("reason", reasons)
+        if reason_by_row:
+            infos.add_objects("reason", reason_by_row)
 
 
 def _rebuild_vector(env_class: type[SnakeVectorEnv], arguments: dict[str, Any], spec: Any) -> SnakeVectorEnv:
@@ -277,8 +284,15 @@ def _read_mask(options: dict[str, Any] | None, count: int) -> Mask:
     return mask
 
 
-def _spread_seeds(seed: Any, count: int) -> list[int | None]:
-    """Return a seed for each environment, by the rules of Gymnasium.
+def _expand_seeds(seed: Any, count: int) -> list[int | None]:
+    """Expand the argument `seed` of `reset` to a seed for each environment, by the rules of Gymnasium.
+
+    Args:
+        seed: None, the seed of the first environment (the merged_infos ones count up), or a sequence of seeds.
+        count: Number of environments.
+
+    Returns:
+        A seed for each environment. None keeps the random generator of the environment.
 
     Raises:
         gymnasium.error.Error: A seed is not a Python integer of 0 or more.
@@ -287,22 +301,22 @@ def _spread_seeds(seed: Any, count: int) -> list[int | None]:
     if seed is None:
         return [None] * count
     if isinstance(seed, int):
-        _check_seed("seed", seed)
-        return [seed + number for number in range(count)]
+        _validate_seed("seed", seed)
+        return [seed + environment for environment in range(count)]
     try:
         seeds = list(seed)
     except TypeError:
-        _check_seed("seed", seed)
+        _validate_seed("seed", seed)
         raise
     if len(seeds) != count:
         raise ValueError(f"seed has {len(seeds)} entries, must be one number, or {count}")
-    for number, seed_of_env in enumerate(seeds):
-        _check_seed(f"seed[{number}]", seed_of_env)
+    for environment, environment_seed in enumerate(seeds):
+        _validate_seed(f"seed[{environment}]", environment_seed)
     return seeds
 
 
-def _check_seed(name: str, seed: Any) -> None:
-    """Raise gymnasium.error.Error, with the name of the argument, for what is no seed."""
+def _validate_seed(name: str, seed: Any) -> None:
+    """Raise gymnasium.error.Error, with the name of the argument, for a value that is not a valid seed."""
     try:
         np_random(seed)
     except error.Error as refusal:

@@ -13,32 +13,33 @@ from snakesim_hal.programs.arguments import (
     add_seed,
     add_set,
     add_workers,
-    number_type,
+    make_number_parser,
 )
 from snakesim_hal.programs.commands import Command, Commands, Noun
 
 
-def _add_train(parser: argparse.ArgumentParser) -> None:
+def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `snakesim policy train`."""
     add_scenario_name(parser)
     parser.add_argument(
         "--form", choices=("feeling", "wave"), default="feeling", help="what is learned (default: feeling)"
     )
-    _add_number(parser, "--generations", 1, 20, "generations of the search")
-    _add_number(parser, "--population", 4, 12, "policies in a generation")
+    _add_count_option(parser, "--generations", 1, 20, "generations of the search")
+    _add_count_option(parser, "--population", 4, 12, "policies in a generation")
     add_fields(parser, "for each policy, anew in each generation (default: 4)", 4)
-    _add_number(parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked")
+    _add_count_option(parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked")
     add_seed(parser, "of the search (default: 1)", 1)
     parser.add_argument(
         "--init", dest="begin", metavar="POLICY", help="begin at its numbers: a shipped policy, or policy.onnx"
     )
     parser.add_argument(
         "--spread",
-        type=number_type(0.01, 10.0),
+        type=make_number_parser(0.01, 10.0),
         default=1.0,
         metavar="X",
         help="times how far the first generation looks (default: 1)",
     )
-    add_duration(parser, "seconds of an episode (default: the scenario's)", number_type(0.1, 3600.0, "s"))
+    add_duration(parser, "seconds of an episode (default: the scenario's)", make_number_parser(0.1, 3600.0, "s"))
     parser.add_argument(
         "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002 (may be repeated)"
     )
@@ -55,46 +56,52 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     add_resume(parser)
 
 
-def _add_number(parser: argparse.ArgumentParser, option: str, minimum: int, default: int, about: str) -> None:
+def _add_count_option(parser: argparse.ArgumentParser, option: str, minimum: int, default: int, about: str) -> None:
     parser.add_argument(
-        option, type=number_type(minimum, 100_000), default=default, metavar="N", help=f"{about} (default: {default})"
+        option,
+        type=make_number_parser(minimum, 100_000),
+        default=default,
+        metavar="N",
+        help=f"{about} (default: {default})",
     )
 
 
-def _add_info(parser: argparse.ArgumentParser) -> None:
+def _add_info_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `snakesim policy info`."""
     parser.add_argument("policy", metavar="POLICY", help="path of an ONNX file, or name of a shipped policy")
     add_json(parser)
 
 
-def _info(arguments: argparse.Namespace) -> int:
+def _run_info(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
-    extras.require("policy", "`snakesim policy info`")
+    extras.require_extra("policy", "`snakesim policy info`")
     from snakesim.training.policy_info import show_policy
 
     return show_policy(arguments.policy, as_json=arguments.json)
 
 
-def _train(arguments: argparse.Namespace) -> int:
-    """Run the command; return its exit code."""
+def _run_train(arguments: argparse.Namespace) -> int:
+    """Run `snakesim policy train` with the parsed arguments, and return the exit code."""
     from snakesim_operator.base import extras
 
     for extra in ("train", "gym", "report", "policy"):
-        extras.require(extra, "`snakesim policy train`")
+        extras.require_extra(extra, "`snakesim policy train`")
     from snakesim.training.search import Effort
-    from snakesim.training.trained import train
-    from snakesim_hal.model.randomization import parse_randomization
-    from snakesim_hal.model.scenario import parse_set
+    from snakesim.training.trained import train_policy
+    from snakesim_hal.model.randomization import parse_randomize_option
+    from snakesim_hal.model.scenario import parse_set_option
 
     environment = {
         "scenario": arguments.scenario,
         "duration": arguments.duration,
-        "reward": {override.key: override.value for override in map(parse_set, arguments.reward)},
-        "set": {override.key: override.value for override in map(parse_set, arguments.set)},
-        "randomize": dict(map(parse_randomization, arguments.randomize)),
+        "reward": {override.key: override.value for override in map(parse_set_option, arguments.reward)},
+        "set": {override.key: override.value for override in map(parse_set_option, arguments.set)},
+        "randomize": dict(map(parse_randomize_option, arguments.randomize)),
     }
+    # Every field of Effort is the `dest` of an option.
     effort = Effort(**{field.name: getattr(arguments, field.name) for field in dataclasses.fields(Effort)})
-    return train(
+    return train_policy(
         environment,
         arguments.form,
         arguments.begin,
@@ -102,13 +109,13 @@ def _train(arguments: argparse.Namespace) -> int:
         arguments.out,
         workers=arguments.workers,
         cluster=arguments.cluster,
-        again=["snakesim", "policy", "train", arguments.scenario, *_repeat_options(arguments)],
+        again=["snakesim", "policy", "train", arguments.scenario, *_list_search_options(arguments)],
         resume=arguments.resume,
     )
 
 
-def _repeat_options(arguments: argparse.Namespace) -> list[str]:
-    """Return the options that give the same search again; --out, --workers and --cluster change no number."""
+def _list_search_options(arguments: argparse.Namespace) -> list[str]:
+    """Return the options that decide the result of the search. --out, --workers and --cluster do not."""
     options = ["--form", arguments.form]
     if arguments.duration:
         options += ["--duration", f"{arguments.duration:g}"]
@@ -130,8 +137,8 @@ COMMANDS: Commands = (
     Command(
         name="policy train",
         help="Search a policy for a scenario on random fields. An ONNX file for --controller policy:FILE.",
-        add=_add_train,
-        run=_train,
+        add=_add_train_arguments,
+        run=_run_train,
         details="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers "
         "give the same policy for any --workers. Exit code 0: done. 2: wrong input. 130: stopped by Ctrl-C, continue "
         "with --resume.",
@@ -143,8 +150,8 @@ COMMANDS: Commands = (
     Command(
         name="policy info",
         help="Print the description in a policy file: robot, observations, actions and source.",
-        add=_add_info,
-        run=_info,
+        add=_add_info_arguments,
+        run=_run_info,
         examples=("policy info clutter", "policy info runs/policy/policy.onnx --json"),
     ),
 )

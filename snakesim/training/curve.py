@@ -6,30 +6,38 @@ from dataclasses import asdict
 from pathlib import Path
 
 from snakesim.training.search import Generation
-from snakesim_hal.model.textfiles import exported
-from snakesim_operator.features.figures.inherited import PLAIN_TEXT, import_matplotlib
+from snakesim_hal.model.textfiles import export_atomically
+from snakesim_operator.features.figures.inherited import PLAIN_TEXT_STYLE, import_matplotlib
 
 
 def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
     """Write `curve.csv` and `curve.png` into a folder."""
-    with exported(folder / "curve.csv") as partial, partial.open("x", newline="") as file:
+    with export_atomically(folder / "curve.csv") as partial, partial.open("x", newline="") as file:
         table = csv.DictWriter(file, list(asdict(generations[0])))
         table.writeheader()
         table.writerows(asdict(generation) for generation in generations)
     _write_figure(folder / "curve.png", generations)
 
 
-def _write_figure(file: Path, generations: Sequence[Generation]) -> None:
+def _write_figure(path: Path, generations: Sequence[Generation]) -> None:
+    """Draw the learning curve into a file, with the text style of all figures."""
     import_matplotlib()
     from matplotlib import rc_context
 
-    with rc_context(PLAIN_TEXT):
-        _draw_curve(file, generations)
+    with rc_context(PLAIN_TEXT_STYLE):
+        _draw_curve(path, generations)
 
 
-def _draw_curve(file: Path, generations: Sequence[Generation]) -> None:
-    """Draw rewards over episodes: of each population, and of the mean policy where it was checked."""
-    from matplotlib.figure import Figure  # needs no window, whatever the display
+def _draw_curve(path: Path, generations: Sequence[Generation]) -> None:
+    """Draw the learning curve into a file: rewards over the number of episodes.
+
+    The curves are the mean and the best reward of each generation, and the rewards of the mean policy on check fields.
+
+    Args:
+        path: Path of the picture to write.
+        generations: Rows of the learning curve.
+    """
+    from matplotlib.figure import Figure  # unlike pyplot, this works without a display
 
     episodes = [generation.episodes for generation in generations]
     best_rewards = [generation.best_reward for generation in generations]
@@ -49,5 +57,5 @@ def _draw_curve(file: Path, generations: Sequence[Generation]) -> None:
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=8)
-    with exported(file) as partial:
+    with export_atomically(path) as partial:
         figure.savefig(partial, dpi=120)

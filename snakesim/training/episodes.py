@@ -18,17 +18,17 @@ from snakesim.training.form import OBSERVE, Policy
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.base.worker_pool import WorkerPool
 
-RETRIES = 2  # of an episode whose worker died
+WORKER_RETRIES = 2  # of an episode whose worker died
 Values = Mapping[str, float]  # parameters of a policy, by name
 Arguments = Mapping[str, Any]  # of `SnakeEnv`
-Map = Callable[[Callable[..., Any], Sequence[Sequence[Any]]], list[Any]]
+MapFunction = Callable[[Callable[..., Any], Sequence[Sequence[Any]]], list[Any]]
 """Calls a function with each of several argument lists, and returns the results in their order."""
 Job = tuple[Policy, int]  # an episode: what acts, and the seed of its field
-MAX_TOGETHER = 32  # episodes that a process steps together; a worker that dies loses no more
+MAX_BATCH_SIZE = 32  # episodes that a process steps together; a worker that dies loses no more
 
 
 @dataclass(frozen=True)
-class _Cached:
+class _CachedEnvironments:
     """The environments of this process."""
 
     arguments: Arguments
@@ -36,7 +36,7 @@ class _Cached:
     environments: Environments
 
 
-_CACHED: list[_Cached] = []  # at most one
+_ENVIRONMENT_CACHE: list[_CachedEnvironments] = []  # at most one
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class Episodes:
     """
 
     def __init__(self, arguments: Arguments, workers: int | None = None, cluster: str | None = None) -> None:
-        """Load the scenario in this process; `with` starts the workers.
+        """Load the scenario in this process. The `with` block starts the workers.
 
         Args:
-            arguments: Arguments of `SnakeEnv`.
-            workers: Number of processes on this computer; None starts one for each processor.
-            cluster: Address of a Dask scheduler, whose workers are used instead.
+            arguments: Arguments of `SnakeEnv`, by name.
+            workers: Number of processes on this computer. None starts one for each processor.
+            cluster: Address of a Dask scheduler, whose workers run the episodes instead. None uses this computer.
 
         Raises:
             ConfigError: An argument of `SnakeEnv` is wrong.
@@ -70,59 +70,60 @@ class Episodes:
         self._arguments = dict(arguments)
         self._workers = workers
         self._cluster = cluster
-        self._opened = ExitStack()
-        self._shares = 1  # into which the episodes are divided: one for each worker
+        self._exit_stack = ExitStack()
+        self._batch_count = 1  # into how many batches the episodes are divided: one for each worker
         setup = _make_setup(self._arguments)
         self.axes = [joint.axis for joint in setup.description.joints]
         self.sizes = {name: len(part.names) for name, part in setup.parts.items()}
 
     def __enter__(self) -> Self:
         if self._cluster is None:
-            self._map = self._start_workers()
+            self._map_jobs = self._start_workers()
         else:
-            self._map = self._connect_to_cluster(self._cluster)
+            self._map_jobs = self._connect_to_cluster(self._cluster)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._opened.close()
+        self._exit_stack.close()
 
     def run(self, policies: Sequence[Values], fields: Sequence[int]) -> list[list[Episode]]:
         """Run every policy on every field.
 
         Args:
-            policies: Parameters of each policy.
+            policies: Parameters of each policy, by name.
             fields: Seeds of the random fields.
 
         Returns:
-            The episodes of each policy. Fields without room for their obstacles are left out.
+            A list of episodes for each policy. Fields without room for their obstacles are left out.
         """
         jobs: list[Job] = []
         for values in policies:
-            policy = Policy.of(values, self.axes, self.sizes)
+            policy = Policy.make_from_parameters(values, self.axes, self.sizes)
             jobs += [(policy, field) for field in fields]
-        size = min(max(math.ceil(len(jobs) / self._shares), 1), MAX_TOGETHER)
-        groups = [jobs[start : start + size] for start in range(0, len(jobs), size)]
-        results = self._map(_run_together, [(self._arguments, group) for group in groups])
-        ran = [episode for of_group in results for episode in of_group]
-        episodes: list[list[Episode]] = []
-        for start in range(0, len(ran), len(fields)):
-            of_policy = ran[start : start + len(fields)]
-            episodes.append([episode for episode in of_policy if episode is not None])
-        return episodes
+        batch_size = min(max(math.ceil(len(jobs) / self._batch_count), 1), MAX_BATCH_SIZE)
+        batches = [jobs[start : start + batch_size] for start in range(0, len(jobs), batch_size)]
+        results = self._map_jobs(_run_batch, [(self._arguments, batch) for batch in batches])
+        all_episodes = [episode for batch_episodes in results for episode in batch_episodes]
+        episodes_by_policy: list[list[Episode]] = []
+        for start in range(0, len(all_episodes), len(fields)):
+            policy_episodes = all_episodes[start : start + len(fields)]
+            episodes_by_policy.append([episode for episode in policy_episodes if episode is not None])
+        return episodes_by_policy
 
-    def _start_workers(self) -> Map:
-        pool = self._opened.enter_context(WorkerPool(self._workers))
-        self._shares = pool.size
-        return pool.map
+    def _start_workers(self) -> MapFunction:
+        """Start the worker processes on this computer."""
+        pool = self._exit_stack.enter_context(WorkerPool(self._workers))
+        self._batch_count = pool.size
+        return pool.run_and_collect
 
-    def _connect_to_cluster(self, address: str) -> Map:
+    def _connect_to_cluster(self, address: str) -> MapFunction:
         """Connect to a Dask scheduler. Raises ConfigError, NotConnectedError."""
-        from snakesim_operator.base.dask_cluster import connected  # Dask is of another extra
+        from snakesim_operator.base.dask_cluster import connect_to_cluster  # Dask is of another extra
 
-        client = self._opened.enter_context(connected(address))
+        client = self._exit_stack.enter_context(connect_to_cluster(address))
         threads: Any = client.nthreads()  # of each worker
-        self._shares = max(sum(threads.values()), 1)
-        executor = client.get_executor(pure=False, retries=RETRIES)
+        self._batch_count = max(sum(threads.values()), 1)
+        executor = client.get_executor(pure=False, retries=WORKER_RETRIES)
         return lambda function, calls: list(executor.map(function, *zip(*calls, strict=True)))
 
 
@@ -131,34 +132,34 @@ def _make_setup(arguments: Arguments) -> EnvironmentSetup:
     return SnakeEnv(**{**arguments, "observe": OBSERVE, "action": "position"}).setup
 
 
-def _find_environments(arguments: Arguments) -> tuple[EnvironmentSetup, Environments]:
-    """Return the environments of this process, MAX_TOGETHER. They are made anew when the arguments change."""
-    if not _CACHED or _CACHED[-1].arguments != arguments:
+def _get_cached_environments(arguments: Arguments) -> tuple[EnvironmentSetup, Environments]:
+    """Return the environments of this process, MAX_BATCH_SIZE. They are made anew when the arguments change."""
+    if not _ENVIRONMENT_CACHE or _ENVIRONMENT_CACHE[-1].arguments != arguments:
         setup = _make_setup(arguments)
-        _CACHED[:] = [_Cached(arguments, setup, Environments(setup, MAX_TOGETHER, threads=1))]
-    return _CACHED[-1].setup, _CACHED[-1].environments
+        _ENVIRONMENT_CACHE[:] = [_CachedEnvironments(arguments, setup, Environments(setup, MAX_BATCH_SIZE, threads=1))]
+    return _ENVIRONMENT_CACHE[-1].setup, _ENVIRONMENT_CACHE[-1].environments
 
 
-def _run_together(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | None]:
-    """Run episodes in a worker, all at once.
+def _run_batch(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | None]:
+    """Run a batch of episodes in this process, stepped together.
 
     Args:
-        arguments: Arguments of `SnakeEnv`.
-        jobs: Policy and seed of the field of each episode, at most MAX_TOGETHER.
+        arguments: Arguments of `SnakeEnv`, by name.
+        jobs: Policy and seed of the field of each episode. At most MAX_BATCH_SIZE.
 
     Returns:
-        An episode for each job; None if the obstacles of its field find no place.
+        An episode for each job, in order. It is None if the obstacles of the field find no place.
     """
-    setup, environments = _find_environments(arguments)
-    count = MAX_TOGETHER
-    can_run = np.zeros(count, dtype=np.bool_)
+    setup, environments = _get_cached_environments(arguments)
+    row_count = MAX_BATCH_SIZE  # rows behind those of the jobs stay empty
+    can_run = np.zeros(row_count, dtype=np.bool_)
     for row, (_, field) in enumerate(jobs):
-        can_run[row] = _reset(environments, row, field)
+        can_run[row] = _start_episode(environments, row, field)
     observations = environments.observe(can_run)
-    targets_rad = np.zeros((count, len(setup.action_names)))
-    total_reward = np.zeros(count)
-    energy_j = np.zeros(count)
-    endings: dict[int, str] = {}
+    targets_rad = np.zeros((row_count, len(setup.action_names)))
+    total_reward = np.zeros(row_count)
+    energy_j = np.zeros(row_count)
+    ending_by_row: dict[int, str] = {}
     while True:
         is_active = can_run & ~environments.is_over
         rows = np.flatnonzero(is_active).tolist()
@@ -166,12 +167,12 @@ def _run_together(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | N
             break
         targets_rad = targets_rad.copy()
         for row in rows:
-            targets_rad[row] = jobs[row][0].targets(observations[row])
+            targets_rad[row] = jobs[row][0].compute_targets(observations[row])
         result = environments.step(targets_rad, is_active)
         observations = result.observations
         total_reward = total_reward + np.where(is_active, result.rewards, 0.0)
         energy_j = energy_j + np.where(is_active, result.energy_j, 0.0)
-        endings |= result.endings
+        ending_by_row |= result.endings
     advance_m = environments.advance_m.tolist()
     time_s = environments.time_s.tolist()
     episodes: list[Episode | None] = []
@@ -179,14 +180,16 @@ def _run_together(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | N
         if not can_run[row]:
             episodes.append(None)
             continue
-        goal = endings[row] == "goal"
-        episodes.append(Episode(float(total_reward[row]), advance_m[row], float(energy_j[row]), time_s[row], goal))
-    for row in range(count):
+        is_goal_reached = ending_by_row[row] == "goal"
+        episodes.append(
+            Episode(float(total_reward[row]), advance_m[row], float(energy_j[row]), time_s[row], is_goal_reached)
+        )
+    for row in range(row_count):
         environments.close(row)
     return episodes
 
 
-def _reset(environments: Environments, row: int, field: int) -> bool:
+def _start_episode(environments: Environments, row: int, field: int) -> bool:
     """Start an episode on a field. Returns False if its obstacles find no place."""
     try:
         environments.reset(row, field, np.random.default_rng(field))

@@ -9,15 +9,15 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from snakesim.training.form import FELT_RAD, OBSERVE, RAMP_PER_S, Policy
-from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS, load_model
+from snakesim.training.form import MAX_REACTION_RAD, OBSERVE, RAMP_PER_S, Policy
+from snakesim_gnc.control.policy import ACTION_KEY, FRAME_SKIP_KEY, JOINTS_KEY, OBSERVATIONS_KEY, load_model
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.textfiles import exported
+from snakesim_hal.model.textfiles import export_atomically
 
-LEARNED = "snakesim.learned"
-OPSET = 17  # the newest ones that onnxruntime 1.20 reads
+LEARNED_PARAMETERS_KEY = "snakesim.learned"
+OPSET_VERSION = 17  # the newest ones that onnxruntime 1.20 reads
 IR_VERSION = 10
-NODES = (  # operator, inputs, output; together they compute `Policy.targets`
+GRAPH_NODES = (  # operator, inputs, output; together they compute `Policy.compute_targets`
     ("MatMul", ("seen", "time"), "time_s"),
     ("Mul", ("time_s", "omega"), "turned"),
     ("Sub", ("turned", "lag"), "phase"),
@@ -37,7 +37,7 @@ NODES = (  # operator, inputs, output; together they compute `Policy.targets`
 )
 
 
-def learned_by(policy: str) -> dict[str, float]:
+def read_learned_parameters(policy: str) -> dict[str, float]:
     """Return the parameters of a policy that `snakesim policy train` has written.
 
     Args:
@@ -48,7 +48,7 @@ def learned_by(policy: str) -> dict[str, float]:
     """
     _, metadata = load_model(policy)
     try:
-        return msgspec.json.decode(metadata.get(LEARNED, ""), type=dict[str, float])
+        return msgspec.json.decode(metadata.get(LEARNED_PARAMETERS_KEY, ""), type=dict[str, float])
     except msgspec.MsgspecError:
         raise ConfigError(
             f"--init {policy}: holds no numbers of `snakesim policy train`; give a policy.onnx that it has written",
@@ -56,38 +56,40 @@ def learned_by(policy: str) -> dict[str, float]:
         ) from None
 
 
-def export(file: Path, policy: Policy, values: Mapping[str, float], frame_skip: int, again: Sequence[str]) -> None:
+def write_onnx_file(
+    path: Path, policy: Policy, values: Mapping[str, float], frame_skip: int, again: Sequence[str]
+) -> None:
     """Write a policy into an ONNX file.
 
     Args:
-        file: The file to write; an existing one is replaced.
-        policy: The arrays of the policy.
-        values: Its parameters, which are kept in the metadata.
-        frame_skip: Ticks of the robot for each action.
-        again: The command that finds the same policy, which is kept in the metadata.
+        path: Path of the file to write. An existing file is replaced.
+        policy: Arrays of the policy, which become constants of the graph.
+        values: Parameters of the policy. They are stored in the metadata, to continue the search from them.
+        frame_skip: Number of ticks of the robot for each action.
+        again: Command line that finds the same policy. It is stored in the metadata.
     """
-    width, joints = policy.time.shape
-    constants = {"ramp_per_s": RAMP_PER_S, "one": 1.0, "felt_rad": FELT_RAD}
+    observation_size, joint_count = policy.time.shape
+    constants = {"ramp_per_s": RAMP_PER_S, "one": 1.0, "felt_rad": MAX_REACTION_RAD}
     arrays = dict(vars(policy))
     for name, value in constants.items():
         arrays[name] = np.array(value, np.float32)
     graph = helper.make_graph(
-        [helper.make_node(kind, list(inputs), [output]) for kind, inputs, output in NODES],
+        [helper.make_node(kind, list(inputs), [output]) for kind, inputs, output in GRAPH_NODES],
         "policy",
-        [helper.make_tensor_value_info("seen", TensorProto.FLOAT, [1, width])],
-        [helper.make_tensor_value_info("target_rad", TensorProto.FLOAT, [1, joints])],
+        [helper.make_tensor_value_info("seen", TensorProto.FLOAT, [1, observation_size])],
+        [helper.make_tensor_value_info("target_rad", TensorProto.FLOAT, [1, joint_count])],
         [numpy_helper.from_array(array, name) for name, array in arrays.items()],
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    properties = {
-        OBSERVATIONS: ",".join(OBSERVE),
-        ACTION: "position",
-        JOINTS: str(joints),
-        FRAME_SKIP: str(frame_skip),
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET_VERSION)], ir_version=IR_VERSION)
+    metadata = {
+        OBSERVATIONS_KEY: ",".join(OBSERVE),
+        ACTION_KEY: "position",
+        JOINTS_KEY: str(joint_count),
+        FRAME_SKIP_KEY: str(frame_skip),
         "snakesim.trained_by": " ".join(again),
-        LEARNED: json.dumps({name: round(value, 6) for name, value in values.items()}),
+        LEARNED_PARAMETERS_KEY: json.dumps({name: round(value, 6) for name, value in values.items()}),
     }
-    helper.set_model_props(model, properties)
+    helper.set_model_props(model, metadata)
     onnx.checker.check_model(model)
-    with exported(file) as partial:
+    with export_atomically(path) as partial:
         onnx.save(model, partial)

@@ -1,6 +1,6 @@
 """The form of a trained policy: a wave from head to tail, bent towards the goal, that yields to what the joints feel.
 
-    target = ramp (amplitude + x @ yielding) sin(omega t - lag) + x @ steering + tanh(x @ feeling) FELT_RAD
+    target = ramp (amplitude + x @ yielding) sin(omega t - lag) + x @ steering + tanh(x @ feeling) MAX_REACTION_RAD
 
 x is the observation. Every joint has the same gains on its own and its neighbors' numbers, so that a policy has few
 parameters whatever the length of the robot. The same arrays compute it in NumPy and as ONNX.
@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 OBSERVE = ("time_s", "goal_bearing", "angle_rad", "velocity_rad_s", "torque_nm", "contact_n")
-FELT_RAD = 0.4  # largest reaction of a joint to what the joints measure
+MAX_REACTION_RAD = 0.4  # largest reaction of a joint to what the joints measure
 RAMP_PER_S = 1.0  # the wave grows to its full amplitude in 1 s
-UNITS = {"angle_rad": 0.5, "velocity_rad_s": 2.0, "torque_nm": 5.0, "contact_n": 50.0}
+INPUT_SCALES = {"angle_rad": 0.5, "velocity_rad_s": 2.0, "torque_nm": 5.0, "contact_n": 50.0}
 """Values of an observation that count as 1 for a gain."""
-FELT_PARTS = ("angle_rad", "velocity_rad_s", "torque_nm")
-NEIGHBORS = {"behind": -1, "itself": 0, "ahead": 1}  # steps along the joints that bend sideways
+REACTION_PARTS = ("angle_rad", "velocity_rad_s", "torque_nm")
+NEIGHBOR_STEPS = {"behind": -1, "itself": 0, "ahead": 1}  # steps along the joints that bend sideways
 Array = NDArray[np.float32]
 
 
@@ -41,8 +41,8 @@ WAVE = {
 }
 FEELING = {
     f"{part}_{where}": Parameter(0.0, 0.15, f"gain of {part} of the joint {where}")
-    for part in FELT_PARTS
-    for where in NEIGHBORS
+    for part in REACTION_PARTS
+    for where in NEIGHBOR_STEPS
 } | {
     "contact_behind": Parameter(0.0, 0.05, "rad of amplitude for each 50 N on the link behind"),
     "contact_ahead": Parameter(0.0, 0.05, "rad of amplitude for each 50 N on the link ahead"),
@@ -63,62 +63,67 @@ class Policy:
     feeling: Array
 
     @staticmethod
-    def of(values: Mapping[str, float], axes: Sequence[str], sizes: Mapping[str, int]) -> "Policy":
-        """Return the policy of given parameters.
+    def make_from_parameters(values: Mapping[str, float], axes: Sequence[str], sizes: Mapping[str, int]) -> "Policy":
+        """Return the policy for a set of parameters and a robot.
 
         Args:
-            values: Parameters by the names of a form; those of FEELING that are missing are 0.
-            axes: "yaw" or "pitch" of every joint, tail to head. Only yaw joints move.
-            sizes: Width of each part of the observation in OBSERVE.
+            values: Parameters by their names in a form of FORMS. Missing parameters of FEELING are 0.
+            axes: Axis of every joint, "yaw" or "pitch", tail to head. Only yaw joints move.
+            sizes: Number of values in each part of the observation, by the part's name in OBSERVE.
         """
-        count = len(axes)
+        joint_count = len(axes)
         parameters = {**dict.fromkeys(FEELING, 0.0), **values}
-        bends = np.array([axis == "yaw" for axis in axes], dtype=np.float64)
-        bends_ahead = np.cumsum(bends[::-1])[::-1] - 1  # between a joint and the head
-        fraction = np.clip(bends_ahead / max(bends.sum() - 1, 1), 0, 1)  # 0 at the head, 1 at the tail
+        is_yaw = np.array([axis == "yaw" for axis in axes], dtype=np.float64)  # 1.0 or 0.0
+        yaw_joints_ahead = np.cumsum(is_yaw[::-1])[::-1] - 1  # number of yaw joints between a joint and the head
+        tail_fraction = np.clip(yaw_joints_ahead / max(is_yaw.sum() - 1, 1), 0, 1)  # 0 at the head, 1 at the tail
 
-        width = 0
-        first_row: dict[str, int] = {}  # of each part of the observation
+        observation_size = 0
+        first_row_by_part: dict[str, int] = {}  # of each part of the observation
         for part in OBSERVE:
-            first_row[part] = width
-            width += sizes[part]
-        time = np.zeros((width, count))
-        yielding = np.zeros((width, count))
-        steering = np.zeros((width, count))
-        feeling = np.zeros((width, count))
+            first_row_by_part[part] = observation_size
+            observation_size += sizes[part]
+        time = np.zeros((observation_size, joint_count))
+        yielding = np.zeros((observation_size, joint_count))
+        steering = np.zeros((observation_size, joint_count))
+        feeling = np.zeros((observation_size, joint_count))
 
-        time[first_row["time_s"]] = 1.0
-        sine_of_bearing = first_row["goal_bearing"] + 1
-        steering[sine_of_bearing] = parameters["steering"] + parameters["head_steering"] * (1 - fraction)
-        bending_joints = np.flatnonzero(bends)
-        for place, joint in enumerate(bending_joints):
-            for where, step in NEIGHBORS.items():
-                if not 0 <= place + step < len(bending_joints):
+        time[first_row_by_part["time_s"]] = 1.0
+        # The part has the cosine and the sine of the bearing.
+        bearing_sine_row = first_row_by_part["goal_bearing"] + 1
+        steering[bearing_sine_row] = parameters["steering"] + parameters["head_steering"] * (1 - tail_fraction)
+        yaw_joints = np.flatnonzero(is_yaw)
+        for position, joint in enumerate(yaw_joints):
+            for neighbor_name, step in NEIGHBOR_STEPS.items():
+                if not 0 <= position + step < len(yaw_joints):
                     continue
-                neighbor = bending_joints[place + step]
-                for part in FELT_PARTS:
-                    feeling[first_row[part] + neighbor, joint] = parameters[f"{part}_{where}"] / UNITS[part]
-            link_behind = first_row["contact_n"] + joint
-            yielding[link_behind, joint] = parameters["contact_behind"] / UNITS["contact_n"]
-            yielding[link_behind + 1, joint] = parameters["contact_ahead"] / UNITS["contact_n"]
+                neighbor = yaw_joints[position + step]
+                for part in REACTION_PARTS:
+                    gain = parameters[f"{part}_{neighbor_name}"]
+                    feeling[first_row_by_part[part] + neighbor, joint] = gain / INPUT_SCALES[part]
+            # Joint i is between link i behind it and link i + 1 ahead of it.
+            contact_row_behind = first_row_by_part["contact_n"] + joint
+            yielding[contact_row_behind, joint] = parameters["contact_behind"] / INPUT_SCALES["contact_n"]
+            yielding[contact_row_behind + 1, joint] = parameters["contact_ahead"] / INPUT_SCALES["contact_n"]
 
-        omega = np.full(count, parameters["omega"])
-        lag = parameters["lag"] * bends_ahead
-        amplitude = bends * (parameters["amplitude"] + parameters["growth"] * fraction)
+        omega = np.full(joint_count, parameters["omega"])
+        lag = parameters["lag"] * yaw_joints_ahead
+        amplitude = is_yaw * (parameters["amplitude"] + parameters["growth"] * tail_fraction)
         return Policy(
             time=time.astype(np.float32),
             omega=omega.astype(np.float32),
             lag=lag.astype(np.float32),
             amplitude=amplitude.astype(np.float32),
             yielding=yielding.astype(np.float32),
-            steering=(steering * bends).astype(np.float32),
+            steering=(steering * is_yaw).astype(np.float32),
             feeling=feeling.astype(np.float32),
         )
 
-    def targets(self, seen: Array) -> Array:
-        """Return the target angle of every joint in rad, (joints,), for an observation, (observation,)."""
-        time = seen @ self.time
+    def compute_targets(self, observation: Array) -> Array:
+        """Return the target angle of every joint in rad, (joints,), for one observation vector."""
+        time = observation @ self.time
         wave = np.sin(time * self.omega - self.lag)
-        swing = np.minimum(time * np.float32(RAMP_PER_S), np.float32(1)) * (self.amplitude + seen @ self.yielding)
-        targets = swing * wave + seen @ self.steering + np.tanh(seen @ self.feeling) * np.float32(FELT_RAD)
+        ramp = np.minimum(time * np.float32(RAMP_PER_S), np.float32(1))
+        swing = ramp * (self.amplitude + observation @ self.yielding)
+        reaction = np.tanh(observation @ self.feeling) * np.float32(MAX_REACTION_RAD)
+        targets = swing * wave + observation @ self.steering + reaction
         return targets.astype(np.float32)

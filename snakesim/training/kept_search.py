@@ -15,7 +15,7 @@ import msgspec
 from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.errors import ConfigError
 
-FILE = "search.jsonl"
+SEARCH_FILENAME = "search.jsonl"
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -33,7 +33,7 @@ class KeptGeneration(msgspec.Struct, frozen=True):
     check: Check | None  # None: not checked in this generation
 
 
-class _Header(msgspec.Struct, frozen=True):
+class _SearchHeader(msgspec.Struct, frozen=True):
     command: list[str]  # without --out, --workers and --cluster, which change no number
     version: str  # of SnakeSIM
 
@@ -42,31 +42,34 @@ class KeptSearch:
     """The file of one search, open for more generations."""
 
     def __init__(self, handle: int, generations: list[KeptGeneration]) -> None:
-        self._handle = handle
+        self._file_descriptor = handle
         self.generations = generations
 
     def add(self, generation: KeptGeneration) -> None:
-        """Keep a generation; it is on the disk when this returns."""
-        os.write(self._handle, msgspec.json.encode(generation) + b"\n")
-        os.fsync(self._handle)
+        """Append a generation to the file. It is on the disk when this returns."""
+        os.write(self._file_descriptor, msgspec.json.encode(generation) + b"\n")
+        os.fsync(self._file_descriptor)
 
 
 @contextmanager
-def opened(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[KeptSearch]:
+def open_search_file(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[KeptSearch]:
     """Open the file of a search in a folder.
 
     Args:
-        folder: where the search writes.
-        command: what was typed, without what changes no number.
-        resume: go on with the search that is there, instead of beginning one.
+        folder: Folder that the search writes to. It is created if it does not exist.
+        command: Command line of the search, without the options that do not change its results.
+        resume: If True, continue the search in the folder. If False, start a new search.
+
+    Yields:
+        The file with the generations so far, to which new generations can be added.
 
     Raises:
-        ConfigError: there is none to go on with, or another one.
+        ConfigError: The folder holds no search to resume, another search, or, without `resume`, any search.
     """
-    path = folder / FILE
-    header = _Header(list(command), version("snakesim"))
+    path = folder / SEARCH_FILENAME
+    header = _SearchHeader(list(command), version("snakesim"))
     if resume:
-        generations = _read(path, header)
+        generations = _read_generations(path, header)
     elif path.exists():
         raise ConfigError(
             f"--out {folder} holds a search; go on with it by --resume, or choose another folder",
@@ -88,8 +91,16 @@ def opened(folder: Path, command: Sequence[str], *, resume: bool) -> Iterator[Ke
         os.close(handle)
 
 
-def _read(path: Path, expected: _Header) -> list[KeptGeneration]:
-    """Return the generations of the same search. A last line that was cut by a kill or a full disk is left out."""
+def _read_generations(path: Path, expected: _SearchHeader) -> list[KeptGeneration]:
+    """Read the generations of an earlier search. A last line that is incomplete is left out.
+
+    Args:
+        path: Path of the file.
+        expected: Header that the file must have, so that it is of the same search.
+
+    Raises:
+        ConfigError: The file cannot be read, or is of another search.
+    """
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -97,8 +108,8 @@ def _read(path: Path, expected: _Header) -> list[KeptGeneration]:
             f"--resume: {path}: {error.strerror}; leave --resume out to begin a search there", code="file/not-writable"
         ) from None
     try:
-        first, *lines = content.split(b"\n")[:-1]
-        header = msgspec.json.decode(first, type=_Header)
+        header_line, *lines = content.split(b"\n")[:-1]
+        header = msgspec.json.decode(header_line, type=_SearchHeader)
         generations = [msgspec.json.decode(line, type=KeptGeneration) for line in lines]
     except (ValueError, msgspec.MsgspecError) as error:
         raise ConfigError(

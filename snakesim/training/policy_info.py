@@ -1,15 +1,15 @@
 """What `snakesim policy info` prints: the metadata of an ONNX file."""
 
-from snakesim.training.exported import LEARNED
-from snakesim_gnc.control.policy import ACTION, FRAME_SKIP, JOINTS, OBSERVATIONS, load_model
+from snakesim.training.exported import LEARNED_PARAMETERS_KEY
+from snakesim_gnc.control.policy import ACTION_KEY, FRAME_SKIP_KEY, JOINTS_KEY, OBSERVATIONS_KEY, load_model
 from snakesim_hal.base.terminal import print_json, print_line
 
-PREFIX = "snakesim."
-LABELS = {
-    JOINTS: "joints of the robot",
-    OBSERVATIONS: "observations",
-    ACTION: "action of each joint",
-    FRAME_SKIP: "ticks of an action",
+METADATA_PREFIX = "snakesim."
+LABEL_BY_KEY = {
+    JOINTS_KEY: "joints of the robot",
+    OBSERVATIONS_KEY: "observations",
+    ACTION_KEY: "action of each joint",
+    FRAME_SKIP_KEY: "ticks of an action",
 }
 
 
@@ -32,11 +32,11 @@ def show_policy(policy: str, *, as_json: bool) -> int:
         print_json({"policy": policy, "controller": "policy", "metadata": dict(metadata), "tensors": shapes})
         return 0
     print_line(f"{policy}: run it with --controller policy:{policy}")
-    width = max(len(label) for label in LABELS.values())
-    for key, label in LABELS.items():
-        print_line(f"  {label:<{width}}  {metadata.get(key, 'unknown')}")
-    for key in sorted(metadata.keys() - LABELS.keys() - {LEARNED}):
-        print_line(f"  {key.removeprefix(PREFIX).replace('_', ' '):<{width}}  {metadata[key]}")
+    label_width = max(len(label) for label in LABEL_BY_KEY.values())
+    for key, label in LABEL_BY_KEY.items():
+        print_line(f"  {label:<{label_width}}  {metadata.get(key, 'unknown')}")
+    for key in sorted(metadata.keys() - LABEL_BY_KEY.keys() - {LEARNED_PARAMETERS_KEY}):
+        print_line(f"  {key.removeprefix(METADATA_PREFIX).replace('_', ' '):<{label_width}}  {metadata[key]}")
     for name, shape in shapes.items():
-        print_line(f"  {'tensor ' + name:<{width}}  {tuple(shape)}")
+        print_line(f"  {'tensor ' + name:<{label_width}}  {tuple(shape)}")
     return 0

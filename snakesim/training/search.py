@@ -10,10 +10,10 @@ from snakesim.training.episodes import Episode, Episodes
 from snakesim.training.form import FORMS
 from snakesim.training.kept_search import Check, KeptGeneration
 
-CHECK_EVERY = 5  # generations
-FIRST_FIELD = 1_000_001  # seed of the first field that is searched on; evaluations use fields from 1 on
-CHECK_FIELD = 2_000_001  # seed of the first field that policies are checked on
-OTHER_FIELDS = 10_000_000  # step to other seeds when no field of a generation has room for its obstacles
+CHECK_INTERVAL = 5  # generations
+FIRST_TRAINING_SEED = 1_000_001  # seed of the first field that is searched on; evaluations use fields from 1 on
+FIRST_CHECK_SEED = 2_000_001  # seed of the first field that policies are checked on
+RETRY_SEED_STEP = 10_000_000  # step to other seeds when no field of a generation has room for its obstacles
 
 
 @dataclass(frozen=True)
@@ -51,81 +51,85 @@ class Step:
     best_reward: float  # of that policy, on the fields that it was checked on
 
 
-def search(
+def run_search(
     episodes: Episodes,
     form: str,
     effort: Effort,
-    begin: Mapping[str, float],
-    kept: Sequence[KeptGeneration] = (),
+    start_values: Mapping[str, float],
+    known_generations: Sequence[KeptGeneration] = (),
 ) -> Iterator[Step]:
-    """Search, and yield each generation as it is done.
+    """Search for a policy by CMA-ES, and yield the state of the search after each generation.
 
     Args:
-        episodes: runs policies.
-        form: name of the form whose parameters are searched.
-        effort: how long to search.
-        begin: parameters where the search begins, if not where the form does.
-        kept: the first generations, as an earlier search with the same arguments has run them. Their policies are
-            asked for again, but not run.
+        episodes: Runs the episodes of policies.
+        form: Name of the form in FORMS whose parameters are searched.
+        effort: Number of generations, policies and fields, and the seed of the search.
+        start_values: Start values of parameters, by name. Missing parameters start at the values of the form.
+        known_generations: Results of the first generations, from an earlier search with the same arguments. Their
+            policies are proposed again by the optimizer, but not run.
     """
     parameters = FORMS[form]
-    starts = np.array([begin.get(name, parameter.start) for name, parameter in parameters.items()])
+    start = np.array([start_values.get(name, parameter.start) for name, parameter in parameters.items()])
     sigmas = effort.spread * np.array([parameter.sigma for parameter in parameters.values()])
-    optimizer = cmaes.CMA(np.zeros(len(starts)), 1.0, seed=effort.seed, population_size=effort.population)
-    best: dict[str, float] = {}
+    optimizer = cmaes.CMA(np.zeros(len(start)), 1.0, seed=effort.seed, population_size=effort.population)
+    best_policy: dict[str, float] = {}
     best_reward = -np.inf
 
-    def name_values(point: np.ndarray) -> dict[str, float]:
-        """Return the parameters for a point of the search, which has one sigma as its unit."""
-        return dict(zip(parameters, (starts + sigmas * point).tolist(), strict=True))
+    def make_parameters(point: np.ndarray) -> dict[str, float]:
+        """Return the parameters, by name, for a point of the search space, whose unit is one sigma."""
+        return dict(zip(parameters, (start + sigmas * point).tolist(), strict=True))
 
-    for number in range(effort.generations + 1):
+    for number in range(effort.generations + 1):  # in the last round, the mean policy is only checked
         is_last = number == effort.generations
-        mean = name_values(optimizer.mean)
+        mean_policy = make_parameters(optimizer.mean)
         points = [] if is_last else [optimizer.ask() for _ in range(effort.population)]
-        if number < len(kept):
-            done = kept[number]
+        if number < len(known_generations):
+            result = known_generations[number]
         else:
-            is_checked = is_last or number % CHECK_EVERY == 0
-            policies = [name_values(point) for point in points]
-            done = KeptGeneration(
-                check=_check(episodes, mean, effort) if is_checked else None,
+            is_checked = is_last or number % CHECK_INTERVAL == 0
+            policies = [make_parameters(point) for point in points]
+            result = KeptGeneration(
+                check=_run_check(episodes, mean_policy, effort) if is_checked else None,
                 rewards=_run_generation(episodes, policies, number, effort),
             )
-        if done.check is not None and done.check.reward > best_reward:
-            best = mean
-            best_reward = done.check.reward
+        if result.check is not None and result.check.reward > best_reward:
+            best_policy = mean_policy
+            best_reward = result.check.reward
         if not is_last:
-            losses = [-reward for reward in done.rewards]
+            losses = [-reward for reward in result.rewards]
             optimizer.tell(list(zip(points, losses, strict=True)))
-        yield Step(_row(number, done, effort), done, best, best_reward)
+        yield Step(_make_curve_row(number, result, effort), result, best_policy, best_reward)
 
 
-def _check(episodes: Episodes, policy: Mapping[str, float], effort: Effort) -> Check:
-    """Run a policy on the fields that nothing is searched on."""
-    fields = range(CHECK_FIELD, CHECK_FIELD + effort.check_fields)
-    ran = episodes.run([policy], fields)[0]
-    return Check(mean_of(ran, "total_reward"), mean_of(ran, "advance_m"), mean_of(ran, "goal"))
+def _run_check(episodes: Episodes, policy: Mapping[str, float], effort: Effort) -> Check:
+    """Run a policy on the check fields, which the search does not use, and return the means over these episodes."""
+    fields = range(FIRST_CHECK_SEED, FIRST_CHECK_SEED + effort.check_fields)
+    check_episodes = episodes.run([policy], fields)[0]
+    return Check(
+        reward=compute_mean(check_episodes, "total_reward"),
+        advance_m=compute_mean(check_episodes, "advance_m"),
+        goals=compute_mean(check_episodes, "goal"),
+    )
 
 
 def _run_generation(
     episodes: Episodes, policies: Sequence[Mapping[str, float]], number: int, effort: Effort
 ) -> list[float]:
-    """Run the policies of a generation on its fields; return the mean reward of each."""
+    """Run the policies of a generation on the fields of the generation, and return the mean reward of each policy."""
     if not policies:
         return []
-    first = FIRST_FIELD + number * effort.fields
-    ran = episodes.run(policies, range(first, first + effort.fields))
-    while not all(ran):  # no field of these has room for its obstacles
-        first += OTHER_FIELDS
-        ran = episodes.run(policies, range(first, first + effort.fields))
-    return [mean_of(of_policy, "total_reward") for of_policy in ran]
+    first_seed = FIRST_TRAINING_SEED + number * effort.fields
+    episodes_by_policy = episodes.run(policies, range(first_seed, first_seed + effort.fields))
+    while not all(episodes_by_policy):  # no field of these has room for its obstacles
+        first_seed += RETRY_SEED_STEP
+        episodes_by_policy = episodes.run(policies, range(first_seed, first_seed + effort.fields))
+    return [compute_mean(policy_episodes, "total_reward") for policy_episodes in episodes_by_policy]
 
 
-def _row(number: int, done: KeptGeneration, effort: Effort) -> Generation:
-    """Return the row of the learning curve for a generation."""
-    rewards = done.rewards or [np.nan]
-    check = done.check
+def _make_curve_row(number: int, result: KeptGeneration, effort: Effort) -> Generation:
+    """Return the row of the learning curve for a generation. Its rewards are NaN if no policies were run."""
+    rewards = result.rewards or [np.nan]
+    check = result.check
     return Generation(
         generation=number,
         episodes=min(number + 1, effort.generations) * effort.population * effort.fields,
@@ -137,6 +141,6 @@ def _row(number: int, done: KeptGeneration, effort: Effort) -> Generation:
     )
 
 
-def mean_of(ran: Sequence[Episode], name: str) -> float:
+def compute_mean(episodes: Sequence[Episode], name: str) -> float:
     """Return the mean of an attribute over episodes."""
-    return float(np.mean([getattr(episode, name) for episode in ran]))
+    return float(np.mean([getattr(episode, name) for episode in episodes]))

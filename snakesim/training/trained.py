@@ -10,92 +10,96 @@ from typing import Any
 from snakesim.training import kept_search
 from snakesim.training.curve import write_curve
 from snakesim.training.episodes import Episodes
-from snakesim.training.exported import export, learned_by
+from snakesim.training.exported import read_learned_parameters, write_onnx_file
 from snakesim.training.form import Policy
-from snakesim.training.search import Effort, Generation, Step, search
-from snakesim_hal.base.process import stop_signals_raise
+from snakesim.training.search import Effort, Generation, Step, run_search
+from snakesim_hal.base.process import raise_on_stop_signals
 from snakesim_hal.base.terminal import print_line
-from snakesim_operator.run.conclusion import INTERRUPTED
+from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
 
 FRAME_SKIP = 5  # ticks: at 100 Hz, 20 decisions a second
-POLICY = "policy.onnx"
+POLICY_FILE = "policy.onnx"
 
 
-def train(
+def train_policy(
     arguments: Mapping[str, Any],
     form: str,
     begin: str | None,
     effort: Effort,
-    out: Path,
+    folder: Path,
     *,
     workers: int | None,
     cluster: str | None,
     again: Sequence[str],
     resume: bool = False,
 ) -> int:
-    """Search, and write the best policy and the learning curve after each generation.
+    """Run the search for a policy, and write the best policy and the learning curve after each generation.
 
     Args:
-        arguments: of `SnakeEnv`.
-        form: what is learned.
-        begin: a policy, shipped or a file, with whose numbers the search begins.
-        effort: how long to search.
-        out: the folder to write to.
-        workers: how many processes on this computer; None: one a core.
-        cluster: address of a Dask scheduler, instead.
-        again: the command that does the same.
-        resume: go on with the search that was stopped in `out`.
+        arguments: Arguments of `SnakeEnv`, by name.
+        form: Name of the form in FORMS whose parameters are learned.
+        begin: Shipped policy, or path of a policy file, with whose parameters the search starts. None starts with those
+            of the form.
+        effort: Number of generations, policies and fields, and the seed of the search.
+        folder: Folder to write to.
+        workers: Number of processes on this computer. None starts one for each processor.
+        cluster: Address of a Dask scheduler, whose workers are used instead. None uses this computer.
+        again: Command line of the same search.
+        resume: If True, continue the search that was stopped in `folder`.
 
-    Returns: 0; 130 when it was stopped.
+    Returns:
+        The exit code: 0, or 130 if the search was stopped by a signal.
 
     Raises:
-        ConfigError: wrong input; nothing was run.
+        ConfigError: An argument is wrong. Nothing was run.
     """
-    began_s = time.monotonic()
-    start = {} if begin is None else learned_by(begin)
+    start_time_s = time.monotonic()
+    start_values = {} if begin is None else read_learned_parameters(begin)
     curve: list[Generation] = []
     newest: Step | None = None  # of those that are kept
-    with stop_signals_raise():
+    with raise_on_stop_signals():
         try:
             with (
                 Episodes({**arguments, "frame_skip": FRAME_SKIP}, workers, cluster) as episodes,
-                kept_search.opened(out, again, resume=resume) as kept,
+                kept_search.open_search_file(folder, again, resume=resume) as kept,
             ):
-                known = len(kept.generations)
+                known_count = len(kept.generations)
                 if resume:
-                    print_line(f"{known} of {effort.generations + 1} generations are done already")
-                for step in search(episodes, form, effort, start, kept.generations):
+                    print_line(f"{known_count} of {effort.generations + 1} generations are done already")
+                for step in run_search(episodes, form, effort, start_values, kept.generations):
                     curve.append(step.row)
-                    if len(curve) > known:
-                        print_line(_describe(step.row))
-                        policy = Policy.of(step.best, episodes.axes, episodes.sizes)
-                        export(out / POLICY, policy, step.best, FRAME_SKIP, again)
-                        write_curve(out, curve)
+                    if len(curve) > known_count:
+                        print_line(_format_generation(step.row))
+                        policy = Policy.make_from_parameters(step.best, episodes.axes, episodes.sizes)
+                        write_onnx_file(folder / POLICY_FILE, policy, step.best, FRAME_SKIP, again)
+                        write_curve(folder, curve)
                         kept.add(step.kept)
                     newest = step
         except KeyboardInterrupt:
-            _say_stopped(newest, out)
-            return INTERRUPTED
+            _print_stopped(newest, folder)
+            return EXIT_INTERRUPTED
     assert newest is not None, "a search has at least its last check"
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     print_line(
-        f"{out / POLICY}: reward {newest.best_reward:.2f} on fields that it was checked on; {newest.row.episodes} "
-        f"episodes in {time.monotonic() - began_s:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of processor time"
+        f"{folder / POLICY_FILE}: reward {newest.best_reward:.2f} on fields that it was checked on; "
+        f"{newest.row.episodes} episodes in {time.monotonic() - start_time_s:.0f} s, "
+        f"{usage.ru_utime + usage.ru_stime:.0f} s of processor time"
     )
     return 0
 
 
-def _say_stopped(newest: Step | None, out: Path) -> None:
+def _print_stopped(newest: Step | None, folder: Path) -> None:
+    """Print what is kept of a search that was stopped, and how to continue it."""
     if newest is None:
         print_line("stopped before the first generation was done; nothing is kept")
         return
     print_line(
-        f"stopped after generation {newest.row.generation}: {out / POLICY} is the best policy until then, reward "
-        f"{newest.best_reward:.2f} on fields that it was checked on; the same command goes on with --resume"
+        f"stopped after generation {newest.row.generation}: {folder / POLICY_FILE} is the best policy until then, "
+        f"reward {newest.best_reward:.2f} on fields that it was checked on; the same command goes on with --resume"
     )
 
 
-def _describe(row: Generation) -> str:
+def _format_generation(row: Generation) -> str:
     """Return a line about a generation for the terminal."""
     line = f"generation {row.generation}: {row.episodes} episodes"
     if not math.isnan(row.mean_reward):  # the last generation is only checked

@@ -17,15 +17,19 @@ from typing import Any
 
 import can
 
-from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface, to_python_can
+from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, to_python_can, validate_interface
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError, suggest_word
 
-LOCAL = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
-FD = ("socketcan", "kvaser", *LOCAL)  # interfaces through which this driver supports CAN FD
-GROUPS_ARE_SEPARATE = sys.platform == "linux"  # only Linux keeps multicast groups on one UDP port apart
+INTERFACES_WITHOUT_ADAPTER = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
+FD_INTERFACES = (
+    "socketcan",
+    "kvaser",
+    *INTERFACES_WITHOUT_ADAPTER,
+)  # interfaces through which this driver supports CAN FD
+ARE_MULTICAST_GROUPS_SEPARATE = sys.platform == "linux"  # only Linux keeps multicast groups on one UDP port apart
 IP_MULTICAST_ALL = 49  # linux/in.h
 IPV6_MULTICAST_ALL = 29  # linux/in6.h
 ERROR_FRAME_BYTES = 8  # of a whole error frame of the kernel
@@ -35,7 +39,7 @@ SERIAL_PORT = "a serial port, such as /dev/ttyACM0: see `snakesim doctor`"
 KERNEL_DRIVER = "with the kernel's own driver the adapter is an interface such as can0"
 WINDOWS = "Windows, and its vendor's driver"
 # What a person must install or name to use an interface of python-can; shown when it cannot be opened.
-NEEDS = {
+REQUIREMENT_BY_INTERFACE = {
     "canalystii": "the Python package canalystii",
     "cantact": "the Python package cantact",
     "etas": WINDOWS,
@@ -58,7 +62,7 @@ NEEDS = {
     "usb2can": WINDOWS,
     "vector": WINDOWS,
 }
-POLL_S = 0.0005  # pause between two looks at an adapter that has no file descriptor
+POLL_PERIOD_S = 0.0005  # pause between two looks at an adapter that has no file descriptor
 
 
 def open_wire(
@@ -67,14 +71,14 @@ def open_wire(
     """Open one end of a bus: a SocketCAN interface of the kernel, or an adapter of python-can.
 
     Args:
-        channel: a SocketCAN interface, or INTERFACE:CHANNEL of python-can.
-        only: messages to receive; None: all.
-        bit_rate: in bit/s; not used by an interface of the kernel.
-        data_bit_rate: second bit rate, for the data of CAN FD; None: classic CAN.
+        channel: SocketCAN interface such as can0, or INTERFACE:CHANNEL of python-can.
+        only: Opcodes of the messages to receive; None for all messages.
+        bit_rate: Bit rate in bit/s; not used by an interface of the kernel.
+        data_bit_rate: Second bit rate in bit/s, for the data of CAN FD; None for classic CAN.
 
     Raises:
-        ConfigError: there is no such channel.
-        BackendError: the channel cannot be opened.
+        ConfigError: There is no such channel.
+        BackendError: The channel cannot be opened.
     """
     interface, name = split_channel(channel)
     if interface == "socketcan" and data_bit_rate is None:
@@ -101,52 +105,52 @@ def split_channel(channel: str) -> tuple[str, str]:
     return interface, name
 
 
-def check_channel(channel: str, *, fd: bool = False) -> None:
+def validate_channel(channel: str, *, fd: bool = False) -> None:
     """Check that python-can has the interface of a channel, and that an interface of the kernel is up.
 
     Args:
-        channel: a SocketCAN interface, or INTERFACE:CHANNEL of python-can.
-        fd: whether it must support CAN FD.
+        channel: SocketCAN interface such as can0, or INTERFACE:CHANNEL of python-can.
+        fd: Whether the channel must support CAN FD.
 
     Raises:
-        ConfigError: it does not exist, is down, or does not support CAN FD.
+        ConfigError: The channel does not exist, is down, or does not support CAN FD.
     """
     interface, name = split_channel(channel)
-    if fd and interface not in FD:
+    if fd and interface not in FD_INTERFACES:
         raise ConfigError(
-            f"channel {channel!r}: CAN FD is driven through {', '.join(FD)}; on Linux most adapters are interfaces of "
-            f"the kernel, such as can0",
+            f"channel {channel!r}: CAN FD is driven through {', '.join(FD_INTERFACES)}; on Linux most adapters are "
+            f"interfaces of the kernel, such as can0",
             code="bus/invalid-channel",
         )
     if interface == "socketcan":
-        check_interface(name)
+        validate_interface(name)
 
 
-def check_channels(channels: Sequence[str], *, fd: bool = False) -> None:
+def validate_channels(channels: Sequence[str], *, fd: bool = False) -> None:
     """Check every channel of a robot, and that no two of them are the same bus.
 
     Args:
         channels: SocketCAN interfaces, or INTERFACE:CHANNEL of python-can.
-        fd: whether they must support CAN FD.
+        fd: Whether the channels must support CAN FD.
 
     Raises:
-        ConfigError: a channel does not exist, is down, or is named twice.
+        ConfigError: A channel does not exist, is down, does not support CAN FD, or is named twice.
     """
-    channel_of_bus: dict[tuple[str, str], str] = {}
+    channel_by_bus: dict[tuple[str, str], str] = {}
     for channel in channels:
-        check_channel(channel, fd=fd)
+        validate_channel(channel, fd=fd)
         bus = split_channel(channel)
-        if bus in channel_of_bus:
+        if bus in channel_by_bus:
             raise ConfigError(
-                f"channels: {channel_of_bus[bus]!r} and {channel!r} are the same bus; name each bus once",
+                f"channels: {channel_by_bus[bus]!r} and {channel!r} are the same bus; name each bus once",
                 code="bus/invalid-channel",
             )
-        channel_of_bus[bus] = channel
-    groups = [channel for channel in channels if _is_multicast(channel)]
-    if len(groups) > 1 and not GROUPS_ARE_SEPARATE:
+        channel_by_bus[bus] = channel
+    multicast_channels = [channel for channel in channels if _is_multicast(channel)]
+    if len(multicast_channels) > 1 and not ARE_MULTICAST_GROUPS_SEPARATE:
         raise ConfigError(
-            f"channels: {', '.join(groups)} share one UDP port, and only Linux keeps their groups apart: name one of "
-            f"them",
+            f"channels: {', '.join(multicast_channels)} share one UDP port, and only Linux keeps their groups apart: "
+            f"name one of them",
             code="bus/invalid-channel",
         )
 
@@ -155,7 +159,7 @@ def is_emulated(channel: str) -> bool:
     """Return whether no real module can be on a bus of this name."""
     interface, name = split_channel(channel)
     is_virtual_interface = interface == "socketcan" and name.startswith("vcan")
-    return interface in LOCAL or is_virtual_interface
+    return interface in INTERFACES_WITHOUT_ADAPTER or is_virtual_interface
 
 
 def _is_multicast(channel: str) -> bool:
@@ -166,20 +170,24 @@ def _is_multicast(channel: str) -> bool:
 def open_bus(channel: str, bit_rate: int, data_bit_rate: int | None = None) -> can.BusABC:
     """Open a channel as a bus of python-can. Raises ConfigError and BackendError."""
     interface, name = split_channel(channel)
-    settings = _bus_settings(interface, bit_rate, data_bit_rate)
+    settings = _make_bus_arguments(interface, bit_rate, data_bit_rate)
     try:
         bus = can.Bus(interface=interface, channel=name, **settings)
     except (*IO_ERRORS, *LIBRARY_ERRORS) as error:
-        needs = f"; {interface} needs {NEEDS[interface]}" if interface in NEEDS else ""
-        library_is_missing = isinstance(error, NameError | AttributeError)
-        reason = "its library is missing" if library_is_missing else str(error)
+        needs = (
+            f"; {interface} needs {REQUIREMENT_BY_INTERFACE[interface]}"
+            if interface in REQUIREMENT_BY_INTERFACE
+            else ""
+        )
+        is_library_missing = isinstance(error, NameError | AttributeError)
+        reason = "its library is missing" if is_library_missing else str(error)
         raise BackendError(f"{channel}: cannot be opened: {reason}{needs}", code="bus/cannot-open") from error
     if interface == "udp_multicast":
-        receive_own_group_only(bus)
+        restrict_to_own_multicast_group(bus)
     return bus
 
 
-def _bus_settings(interface: str, bit_rate: int, data_bit_rate: int | None) -> dict[str, Any]:
+def _make_bus_arguments(interface: str, bit_rate: int, data_bit_rate: int | None) -> dict[str, Any]:
     """Return the arguments with which python-can opens an interface; they differ between interfaces."""
     fd = data_bit_rate is not None
     if interface == "virtual":
@@ -195,8 +203,8 @@ def _bus_settings(interface: str, bit_rate: int, data_bit_rate: int | None) -> d
     return settings
 
 
-def receive_own_group_only(bus: can.BusABC) -> None:
-    """Receive the datagrams of this bus's multicast group only.
+def restrict_to_own_multicast_group(bus: can.BusABC) -> None:
+    """Configure the socket of a bus so that it receives the datagrams of its own multicast group only.
 
     All such buses share one port. By default the kernel gives a socket the datagrams of every group that any socket of
     the computer has joined.
@@ -208,7 +216,7 @@ def receive_own_group_only(bus: can.BusABC) -> None:
         else:
             level = socket.IPPROTO_IPV6
             option = IPV6_MULTICAST_ALL
-        with contextlib.suppress(OSError):  # not on Linux: `check_channels` refuses a second bus
+        with contextlib.suppress(OSError):  # not on Linux: `validate_channels` rejects a second bus
             own_socket.setsockopt(level, option, 0)
 
 
@@ -220,25 +228,25 @@ class AdapterWire:
     ) -> None:
         """Open the adapter. `open_wire` explains the arguments. Raises ConfigError and BackendError."""
         self.channel = channel
-        self._fd = data_bit_rate is not None
-        self._only = None if only is None else frozenset(int(opcode) for opcode in only)
+        self._uses_fd = data_bit_rate is not None
+        self._received_opcodes = None if only is None else frozenset(int(opcode) for opcode in only)
         self._bus = open_bus(channel, bit_rate, data_bit_rate)
-        self._file = self._file_descriptor()
+        self._descriptor = self._find_file_descriptor()
         # UDP multicast returns the frames that this end sends: how many of each are still to come back.
-        self._echoes: Counter[Frame] | None = Counter() if _is_multicast(channel) else None
+        self._pending_echo_counts: Counter[Frame] | None = Counter() if _is_multicast(channel) else None
         self._errors: list[BusError] = []
 
     def send(self, frame: Frame) -> bool:
         """Send a frame; return False if the adapter did not accept it."""
         try:
-            self._bus.send(to_python_can(frame, fd=self._fd), timeout=0)
+            self._bus.send(to_python_can(frame, fd=self._uses_fd), timeout=0)
         except can.CanError as error:
             self._errors.append(BusError("not_sent", self.channel, str(error)))
             return False
         except (OSError, ValueError) as error:
             raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
-        if self._echoes is not None:
-            self._echoes[frame] += 1
+        if self._pending_echo_counts is not None:
+            self._pending_echo_counts[frame] += 1
         return True
 
     def receive(self) -> list[Frame]:
@@ -253,7 +261,7 @@ class AdapterWire:
                     self._errors += self._decode_errors(message)
                     continue
                 frame = Frame(message.arbitration_id, bytes(message.data))
-                if self._is_wanted(message, frame):
+                if self._should_receive(message, frame):
                     frames.append(frame)
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot receive: {error}", code="bus/io-failed") from error
@@ -267,11 +275,11 @@ class AdapterWire:
 
     def fileno(self) -> int | None:
         """Return the adapter's file descriptor, or None if it has none."""
-        return self._file
+        return self._descriptor
 
     def idle(self) -> float | None:
         """Return how long to wait for the file descriptor, or until the next look at an adapter without one."""
-        return math.inf if self._file is not None else POLL_S
+        return math.inf if self._descriptor is not None else POLL_PERIOD_S
 
     def inject(self, kind: str, *, begins: bool) -> None:
         """Raise ConfigError, because no fault can be injected from this end."""
@@ -294,18 +302,20 @@ class AdapterWire:
             return decode_error_frame(message.arbitration_id, data, self.channel)
         return [BusError("error_frames", self.channel, "an error frame")]
 
-    def _is_wanted(self, message: can.Message, frame: Frame) -> bool:
+    def _should_receive(self, message: can.Message, frame: Frame) -> bool:
         """Return whether to receive a frame; an echo of a frame that this end sent is removed once."""
         if message.is_remote_frame:
             return False
-        if not self._fd and (message.is_extended_id or message.is_fd):
+        if not self._uses_fd and (message.is_extended_id or message.is_fd):
             return False
-        if self._echoes and self._echoes[frame] > 0:  # UDP does not report which end sent a datagram
-            self._echoes[frame] -= 1
+        if (
+            self._pending_echo_counts and self._pending_echo_counts[frame] > 0
+        ):  # UDP does not report which end sent a datagram
+            self._pending_echo_counts[frame] -= 1
             return False
-        return self._only is None or message.arbitration_id >> NODE_BITS in self._only
+        return self._received_opcodes is None or message.arbitration_id >> NODE_BITS in self._received_opcodes
 
-    def _file_descriptor(self) -> int | None:
+    def _find_file_descriptor(self) -> int | None:
         try:
             number = self._bus.fileno()
         except NotImplementedError:

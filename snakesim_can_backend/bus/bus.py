@@ -44,7 +44,7 @@ MAX_AT_ONCE = 4096  # frames; a babbling bus must not block its reader for ever
 MAX_WAIT_S = 0.01  # for frames, before control cycles begin
 PAUSE_S = 0.001  # while nothing can arrive
 IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
-_wire_format = struct.Struct("<IB3x8s")  # id, length, data
+_RAW_FRAME_FORMAT = struct.Struct("<IB3x8s")  # id, length, data
 
 
 class Wire(Protocol):
@@ -79,12 +79,13 @@ class Wire(Protocol):
         """Let the other end run, if it is in this process.
 
         Returns:
-            Seconds until a frame may arrive, and 0 if there is one. None: no frame before this end sends something.
+            Seconds until a frame may arrive, and 0 if there is one. None if no frame can arrive before this end sends
+            something.
         """
         ...
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end an injected bus fault: see `snakesim_hal.model.fault_kinds`. Raises ConfigError."""
+        """Start or end an injected bus fault: see `snakesim_hal.model.fault_kinds`. Raises ConfigError."""
         ...
 
     def close(self) -> None:
@@ -99,16 +100,16 @@ class SocketCanWire:
         """Open a SocketCAN interface of the kernel for sending and receiving without blocking.
 
         Args:
-            channel: name of the interface.
-            only: messages to receive, filtered in the kernel; None: all with 11-bit ids.
+            channel: Name of the interface.
+            only: Opcodes of the messages to receive, filtered in the kernel; None for all frames with 11-bit ids.
 
         Raises:
-            ConfigError: there is no such interface, or it is down.
-            BackendError: it cannot be opened.
+            ConfigError: There is no such interface, or it is down.
+            BackendError: The interface cannot be opened.
         """
-        check_interface(channel)
+        validate_interface(channel)
         self.channel = channel
-        self._only = None if only is None else list(only)
+        self._received_opcodes = None if only is None else list(only)
         try:
             self._bus = SocketcanBus(channel=channel, ignore_rx_error_frames=False)
             self._socket = self._bus.socket
@@ -118,41 +119,41 @@ class SocketCanWire:
             raise BackendError(f"{channel}: cannot be opened: {error}", code="bus/cannot-open") from error
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        self._buffer = bytearray(_wire_format.size)
+        self._buffer = bytearray(_RAW_FRAME_FORMAT.size)
         self._errors: list[BusError] = []
-        self._down = False  # the interface
-        self._gone = False  # the adapter was unplugged
-        self._dropped = 0  # received frames that the kernel has dropped so far
+        self._is_down = False  # whether the interface is down
+        self._is_unplugged = False  # whether the adapter of the interface was unplugged
+        self._reported_drop_count = 0  # received frames that the kernel had dropped at the last call of `errors`
 
     def send(self, frame: Frame) -> bool:
         """Send a frame; return False if the queue is full or the interface is down."""
         try:
-            self._socket.send(_wire_format.pack(frame.id, len(frame.data), frame.data))
+            self._socket.send(_RAW_FRAME_FORMAT.pack(frame.id, len(frame.data), frame.data))
         except OSError as error:
-            self._note_failure(error)
+            self._record_os_error(error)
             return False
-        if self._down:
-            self._note_up()
+        if self._is_down:
+            self._record_interface_up()
         return True
 
     def receive(self) -> list[Frame]:
         """Return all received frames, in order."""
         frames: list[Frame] = []
         try:
-            drain_socket(self._socket, self._buffer, frames, self._note_error_frame)
+            drain_socket(self._socket, self._buffer, frames, self._record_error_frame)
         except OSError as error:
-            self._note_failure(error)
+            self._record_os_error(error)
         return frames
 
     def errors(self) -> list[BusError]:
         """Return the bus errors since the last call, with frames that the kernel dropped."""
-        dropped = self._count_drops()
-        if dropped > self._dropped:
-            detail = f"the kernel dropped {dropped - self._dropped} frames: this process reads too slowly"
+        dropped = self._read_drop_count()
+        if dropped > self._reported_drop_count:
+            detail = f"the kernel dropped {dropped - self._reported_drop_count} frames: this process reads too slowly"
             self._errors.append(BusError("receive_overflow", self.channel, detail))
-            self._dropped = dropped
-        if self._down and is_up(self.channel):
-            self._note_up()
+            self._reported_drop_count = dropped
+        if self._is_down and is_up(self.channel):
+            self._record_interface_up()
         errors = self._errors
         self._errors = []
         return errors
@@ -166,7 +167,7 @@ class SocketCanWire:
         return math.inf
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end a fault: the interface goes down, or an error frame reports an error."""
+        """Start or end a fault: the interface goes down, or an error frame reports an error."""
         inject_into_interface(self.channel, kind, begins=begins)
 
     def close(self) -> None:
@@ -179,46 +180,46 @@ class SocketCanWire:
     def _set_filters(self) -> None:
         """Let the kernel drop all messages that this end does not need."""
         filters = [(0, 0)]  # (id, mask): every frame with an 11-bit id
-        if self._only is not None:
+        if self._received_opcodes is not None:
             opcode_mask = LAST_STANDARD_ID & ~NODE_MASK
-            filters = [(opcode << NODE_BITS, opcode_mask) for opcode in self._only]
+            filters = [(opcode << NODE_BITS, opcode_mask) for opcode in self._received_opcodes]
         data = b"".join(struct.pack("=II", identifier, mask | EXTENDED | REMOTE) for identifier, mask in filters)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
 
-    def _note_error_frame(self, identifier: int, data: bytes) -> None:
+    def _record_error_frame(self, identifier: int, data: bytes) -> None:
         self._errors.extend(decode_error_frame(identifier, data, self.channel))
 
-    def _note_failure(self, error: OSError) -> None:
+    def _record_os_error(self, error: OSError) -> None:
         """Report a full queue or an interface that went down. Raises BackendError for any other error."""
         match error.errno:
             case errno.ENOBUFS | errno.EAGAIN:  # the interface's queue, or this socket's share of it
                 self._errors.append(BusError("queue_full", self.channel, "the transmit queue is full"))
             case errno.ENETDOWN:
-                self._note_down()
+                self._record_interface_down()
             case errno.ENODEV | errno.ENXIO:
-                self._gone = True
-                self._note_down()
+                self._is_unplugged = True
+                self._record_interface_down()
             case _:
                 raise BackendError(f"{self.channel}: {error.strerror}", code="bus/io-failed") from error
 
-    def _note_down(self) -> None:
-        if not self._down:
-            state = "gone" if self._gone else "down"
+    def _record_interface_down(self) -> None:
+        if not self._is_down:
+            state = "gone" if self._is_unplugged else "down"
             self._errors.append(BusError("interface_down", self.channel, f"the interface is {state}"))
-        self._down = True
+        self._is_down = True
 
-    def _note_up(self) -> None:
-        if self._gone:  # an adapter that was plugged in again is another interface of the same name
+    def _record_interface_up(self) -> None:
+        if self._is_unplugged:  # an adapter that was plugged in again is another interface of the same name
             try:
                 self._socket.bind((self.channel,))
                 self._set_filters()  # the kernel dropped them with the interface
             except OSError:
                 return
-        self._down = False
-        self._gone = False
+        self._is_down = False
+        self._is_unplugged = False
         self._errors.append(BusError("interface_up", self.channel, "the interface is up again"))
 
-    def _count_drops(self) -> int:
+    def _read_drop_count(self) -> int:
         """Return how many received frames the kernel has dropped since the socket was opened; 0 if it is unknown."""
         try:
             raw = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_FORMAT.size)
@@ -247,12 +248,12 @@ class VirtualPeer(Protocol):
         """Run briefly.
 
         Returns:
-            Seconds until the next run is due. None: not before this end receives something.
+            Seconds until the next run is due; None if none is due before this end receives something.
         """
         ...
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Begin or end a fault of a module there."""
+        """Start or end a fault of a module there."""
         ...
 
     def close(self) -> None:
@@ -275,13 +276,13 @@ class VirtualWire:
         """Open one end.
 
         Args:
-            channel: name of the bus; both ends open the same one.
-            peer: runs the other end whenever this one is idle; None: the other end runs by itself.
-            fd: whether the bus is CAN FD.
+            channel: Name of the bus; both ends open the same one.
+            peer: Other end of the bus, which is run whenever this end is idle; None if it runs by itself.
+            fd: Whether the bus is CAN FD.
         """
         self.channel = channel
         self.peer = peer
-        self._fd = fd
+        self._uses_fd = fd
         protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._bus = VirtualBus(channel=channel, protocol=protocol)
         self._faults = VirtualFaults(channel)
@@ -289,7 +290,7 @@ class VirtualWire:
     def send(self, frame: Frame) -> bool:
         """Send a frame, and return whether the bus accepted it. It always does, unless a fault is active."""
         if self._faults.active:
-            match self._faults.judge_send():
+            match self._faults.simulate_send():
                 case SendOutcome.REJECTED:
                     return False
                 case SendOutcome.LOST:
@@ -297,7 +298,7 @@ class VirtualWire:
                 case SendOutcome.SENT:
                     pass
         try:
-            self._bus.send(to_python_can(frame, fd=self._fd))
+            self._bus.send(to_python_can(frame, fd=self._uses_fd))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
         return True
@@ -316,7 +317,7 @@ class VirtualWire:
 
     def errors(self) -> list[BusError]:
         """Return the injected errors since the last call; a virtual bus has no others."""
-        return self._faults.take_errors()
+        return self._faults.pop_errors()
 
     def fileno(self) -> int | None:
         """Return None, because there is no file descriptor to wait on."""
@@ -324,11 +325,11 @@ class VirtualWire:
 
     def idle(self) -> float | None:
         """Let the other end run, and return when it must run again."""
-        pause_s = math.inf if self.peer is None else self.peer()
-        return pause_s if self._bus.queue.empty() else 0.0
+        idle_duration_s = math.inf if self.peer is None else self.peer()
+        return idle_duration_s if self._bus.queue.empty() else 0.0
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end a fault, as an interface of the kernel would have it; the other end is not affected."""
+        """Start or end a fault, as an interface of the kernel would have it; the other end is not affected."""
         self._faults.inject(kind, begins=begins)
 
     def close(self) -> None:
@@ -347,14 +348,14 @@ def drain_socket(
     """Read frames from a non-blocking raw CAN socket until it is empty, at most MAX_AT_ONCE.
 
     Args:
-        source: the socket.
-        buffer: memory for one frame of the kernel.
-        frames: gets the data frames.
-        on_error: gets id and data of the kernel's error frames.
+        source: Socket to read from.
+        buffer: Memory for one frame of the kernel, which is overwritten.
+        frames: List to which the data frames are appended.
+        on_error: Function that is called with id and data of each error frame of the kernel.
     """
     # This loop runs for every frame: local names, and a Frame that is made without its argument handling.
     receive_into = source.recv_into
-    unpack = _wire_format.unpack
+    unpack = _RAW_FRAME_FORMAT.unpack
     append = frames.append
     new_tuple = tuple.__new__
     with contextlib.suppress(BlockingIOError):
@@ -368,30 +369,30 @@ def drain_socket(
 
 
 def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
-    """Wait until a frame may have arrived on any bus, or the timeout. Emulators in this process run meanwhile.
+    """Run the emulators in this process, then wait until a frame may have arrived on any bus, or until a timeout.
 
     Args:
-        wires: ends of the buses.
-        timeout_s: maximum time to wait.
+        wires: This end of each bus.
+        timeout_s: Maximum duration to wait.
 
     Returns:
-        False if nothing can arrive before this end sends something.
+        False if it did not wait, because nothing can arrive before this end sends something; otherwise True.
 
     Raises:
-        BackendError: a bus cannot be waited for.
+        BackendError: The file descriptor of a bus cannot be waited for.
     """
-    pauses_s: list[float] = []
+    idle_durations_s: list[float] = []
     for wire in wires:
-        pause_s = wire.idle()
-        if pause_s is not None:
-            pauses_s.append(pause_s)
-    if not pauses_s:
+        idle_duration_s = wire.idle()
+        if idle_duration_s is not None:
+            idle_durations_s.append(idle_duration_s)
+    if not idle_durations_s:
         return False
-    wait_s = max(min([timeout_s, *pauses_s]), 0.0)
-    descriptors = [number for wire in wires if (number := wire.fileno()) is not None]
-    if descriptors:
+    wait_s = max(min([timeout_s, *idle_durations_s]), 0.0)
+    file_descriptors = [number for wire in wires if (number := wire.fileno()) is not None]
+    if file_descriptors:
         try:
-            select.select(descriptors, [], [], wait_s)
+            select.select(file_descriptors, [], [], wait_s)
         except IO_ERRORS as error:
             channels = ", ".join(wire.channel for wire in wires)
             raise BackendError(f"{channels}: cannot be waited for: {error}", code="bus/io-failed") from error
@@ -400,9 +401,9 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     return True
 
 
-def receive_frames(wires: Sequence[Wire], limit_s: float = MAX_WAIT_S) -> Iterator[tuple[Wire, Frame]]:
+def receive_frames(wires: Sequence[Wire], timeout_s: float = MAX_WAIT_S) -> Iterator[tuple[Wire, Frame]]:
     """Wait for at most MAX_WAIT_S and yield what has arrived. For the time before control cycles begin."""
-    if not wait(wires, min(limit_s, MAX_WAIT_S)):
+    if not wait(wires, min(timeout_s, MAX_WAIT_S)):
         time.sleep(PAUSE_S)
     for wire in wires:
         for frame in wire.receive():
@@ -410,26 +411,31 @@ def receive_frames(wires: Sequence[Wire], limit_s: float = MAX_WAIT_S) -> Iterat
 
 
 def inject_into(wires: Sequence[Wire], injection: Injection, *, begins: bool) -> bool:
-    """Begin or end a fault of a bus.
+    """Start or end an injected fault if its target is a bus.
 
     Returns:
-        False for a fault of something else.
+        True if the target is a bus; False, without any effect, for a fault of something else.
 
     Raises:
-        ConfigError: there is no such bus, or the fault cannot be injected there.
+        ConfigError: There is no such bus, or the fault cannot be injected there.
     """
     if injection.target_type != "bus":
         return False
-    if injection.number >= len(wires):
+    if injection.target_index >= len(wires):
         raise ConfigError(
             f"there is no {injection.target}; this robot has bus_1 to bus_{len(wires)}", code="injection/unknown-target"
         )
-    wires[injection.number].inject(injection.kind, begins=begins)
+    wires[injection.target_index].inject(injection.kind, begins=begins)
     return True
 
 
-def check_interface(channel: str) -> None:
-    """Raise ConfigError unless a SocketCAN interface exists and is up; the message explains how to bring it up."""
+def validate_interface(channel: str) -> None:
+    """Check that a SocketCAN interface exists and is up.
+
+    Raises:
+        ConfigError: The kernel has no CAN, or the interface does not exist or is down. The message
+            contains the command that brings it up.
+    """
     if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
         raise ConfigError(
             f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "

@@ -51,9 +51,9 @@ def decode_error_frame(identifier: int, data: bytes, channel: str) -> list[BusEr
     """Return the bus errors in an error frame of the kernel.
 
     Args:
-        identifier: id of the frame, with the bits of its error classes.
-        data: all 8 bytes of the frame: the controller's state in the second, error counters in the last two.
-        channel: the bus that the frame came from.
+        identifier: Id of the frame, with the bits of its error classes.
+        data: All 8 bytes of the frame: the controller's state in the second, error counters in the last two.
+        channel: The bus that the frame came from.
     """
     kinds: list[Kind] = [kind for bit, kind in ERROR_CLASSES if identifier & bit]
     if identifier & CONTROLLER_CLASS:

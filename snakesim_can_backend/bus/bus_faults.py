@@ -64,7 +64,7 @@ class VirtualFaults:
         self.active: set[str] = set()
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end a fault; a fault that already has, is left as it is."""
+        """Start or end a fault; a fault that already has, is left as it is."""
         if kind != "error_passive":  # which is reported once, and has no end
             is_active = kind in self.active
             if begins == is_active:
@@ -77,7 +77,7 @@ class VirtualFaults:
             error_kind, detail = REPORTED_ERRORS[kind, begins]
             self._errors.append(BusError(error_kind, self._channel, detail))
 
-    def judge_send(self) -> SendOutcome:
+    def simulate_send(self) -> SendOutcome:
         """Return what becomes of a frame that is sent now."""
         if "cut" in self.active:
             return SendOutcome.REJECTED
@@ -99,7 +99,7 @@ class VirtualFaults:
             return []
         return frames
 
-    def take_errors(self) -> list[BusError]:
+    def pop_errors(self) -> list[BusError]:
         """Return the bus errors since the last call."""
         errors = self._errors
         self._errors = []
@@ -107,7 +107,7 @@ class VirtualFaults:
 
 
 def inject_into_interface(channel: str, kind: str, *, begins: bool) -> None:
-    """Begin or end a fault of an interface of the kernel. Raises ConfigError if that is not possible."""
+    """Start or end a fault of an interface of the kernel. Raises ConfigError if that is not possible."""
     if kind == "cut":
         _set_link(channel, "down" if begins else "up")
     elif (kind, begins) in ERROR_FRAMES:

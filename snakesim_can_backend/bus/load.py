@@ -17,11 +17,11 @@ from snakesim_hal.model.scenario import RunConfig
 
 BIT_RATE = 1_000_000
 MAX_LOAD = 0.8  # of a bus's time; the rest is for commands, parameters and repeated frames
-MAX_EVERY = 255  # Syncs between reports; limit of the modules' parameters
+MAX_SYNCS_PER_REPORT = 255  # Syncs between reports; limit of the modules' parameters
 MIN_RATE_HZ = 20  # a slower control rate is not proposed
 MAX_PROPOSED_BUSES = 8
 FRAME_BITS = 47  # of a classic frame, without its data
-STUFFED_FROM = 34  # of these bits, those that can be stuffed
+STUFFABLE_BITS = 34  # of these bits, those that can be stuffed
 FD_START_BITS = 36  # of a frame of CAN FD with an id of 29 bits, up to the switch of bit rates
 FD_END_BITS = 13  # after the CRC
 FD_LENGTH_BITS = 5
@@ -33,12 +33,12 @@ def format_bit_rate(bit_rate: int) -> str:
     return f"{bit_rate / 1e6:g} Mbit/s"
 
 
-def worst_frame_bits(length: int) -> int:
+def compute_max_frame_bits(length: int) -> int:
     """Return the bits of a classic frame with `length` bytes, with the maximum of stuff bits."""
-    return FRAME_BITS + 8 * length + (STUFFED_FROM + 8 * length - 1) // 4
+    return FRAME_BITS + 8 * length + (STUFFABLE_BITS + 8 * length - 1) // 4
 
 
-def worst_frame_s(length: int, bit_rate: int, data_bit_rate: int | None = None) -> float:
+def compute_max_frame_duration_s(length: int, bit_rate: int, data_bit_rate: int | None = None) -> float:
     """Return the time that a frame occupies the bus with the maximum number of stuff bits.
 
     On CAN FD, identifier and end are sent at the first bit rate; length, data and CRC at the second. The CRC has 17
@@ -46,12 +46,16 @@ def worst_frame_s(length: int, bit_rate: int, data_bit_rate: int | None = None) 
     four bits.
 
     Args:
-        length: bytes of data.
-        bit_rate: in bit/s.
-        data_bit_rate: in bit/s, of CAN FD with an id of 29 bits; None: classic CAN with an id of 11 bits.
+        length: Number of data bytes.
+        bit_rate: Bit rate in bit/s.
+        data_bit_rate: Second bit rate in bit/s, for CAN FD with an id of 29 bits; None for classic CAN with an id of
+            11 bits.
+
+    Returns:
+        Duration of the frame in s.
     """
     if data_bit_rate is None:
-        return worst_frame_bits(length) / bit_rate
+        return compute_max_frame_bits(length) / bit_rate
     crc_bits = FD_STUFF_COUNT_BITS + (17 if length <= 16 else 21)
     data_bits = FD_LENGTH_BITS + 8 * length
     slow_bits = FD_START_BITS + (FD_START_BITS - 1) // 4 + FD_END_BITS
@@ -80,15 +84,15 @@ class Stream:
     @property
     def bits_per_s(self) -> float:
         """Return the bits per second at worst-case stuffing."""
-        return self.frames_per_s * worst_frame_bits(load_layouts()[self.opcode].length)
+        return self.frames_per_s * compute_max_frame_bits(load_layouts()[self.opcode].length)
 
 
 def list_streams(joints: int, reports: ReportSchedule) -> list[Stream]:
     """Return all kinds of frames on one bus while the robot runs, each with its mean rate.
 
     Args:
-        joints: number of joints on the bus.
-        reports: which reports the modules send, and how often.
+        joints: Number of joints on the bus.
+        reports: Which reports the modules send, and how often.
     """
     rate_hz = reports.rate_hz
     contact_hz = rate_hz / reports.contact_every if reports.contact_every else 0.0
@@ -108,7 +112,7 @@ def list_streams(joints: int, reports: ReportSchedule) -> list[Stream]:
     ]
 
 
-def bus_load(joints: int, reports: ReportSchedule) -> float:
+def compute_bus_load(joints: int, reports: ReportSchedule) -> float:
     """Return the worst-case load of a bus, as a fraction of its time."""
     return sum(stream.bits_per_s for stream in list_streams(joints, reports)) / reports.bit_rate
 
@@ -123,7 +127,7 @@ def busiest_period_s(joints: int, reports: ReportSchedule) -> float:
 
 def is_feasible(joints: int, reports: ReportSchedule) -> bool:
     """Return whether a bus can carry this many joints, on average and in the longest period."""
-    fits_on_average = bus_load(joints, reports) <= MAX_LOAD
+    fits_on_average = compute_bus_load(joints, reports) <= MAX_LOAD
     return fits_on_average and busiest_period_s(joints, reports) * reports.rate_hz <= 1
 
 
@@ -134,7 +138,7 @@ def syncs_per_report(rate_hz: float, report_hz: float) -> int:
     """Return the number of Syncs between reports at about `report_hz`; 0 for never."""
     if report_hz <= 0:
         return 0
-    return round(min(max(rate_hz / report_hz, 1.0), MAX_EVERY))
+    return round(min(max(rate_hz / report_hz, 1.0), MAX_SYNCS_PER_REPORT))
 
 
 def plan_reports(config: RunConfig, settings: CanSettings) -> ReportSchedule:
@@ -161,18 +165,18 @@ def plan_reports_at(rate_hz: float, config: RunConfig, settings: CanSettings) ->
     )
 
 
-def joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
-    """Distribute the joints of a robot over its buses, as the settings say, or as evenly as possible.
+def count_joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
+    """Distribute the joints of a robot over its buses, as the settings say or as evenly as possible.
 
     Args:
-        config: configuration of the run, with the robot.
-        settings: settings of the backend, with its channels.
+        config: Configuration of the run, with the robot.
+        settings: Settings of the backend, with its channels.
 
     Returns:
-        The number of joints on each bus, tail to head.
+        The number of joints on each bus, from tail to head.
 
     Raises:
-        ConfigError: a channel is named twice, or the numbers do not fit the robot.
+        ConfigError: A channel is named twice, or the numbers do not fit the robot.
     """
     joints = config.robot.chain.modules
     buses = max(len(settings.channels), 1)
@@ -198,15 +202,15 @@ def joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
         )
     if joint_counts:
         return list(joint_counts)
-    each, left_over = divmod(joints, buses)
-    return [each + (bus < left_over) for bus in range(buses)]
+    min_joints, remainder = divmod(joints, buses)
+    return [min_joints + (bus < remainder) for bus in range(buses)]  # the first buses have one more
 
 
 def plan_buses(config: RunConfig, settings: CanSettings) -> list[tuple[int, ReportSchedule]]:
     """Return joints and reports of every bus, tail to head. Only the first carries TailContact. Raises ConfigError."""
     reports = plan_reports(config, settings)
     buses: list[tuple[int, ReportSchedule]] = []
-    for bus, joints in enumerate(joints_per_bus(config, settings)):
+    for bus, joints in enumerate(count_joints_per_bus(config, settings)):
         has_tail = reports.tail and bus == 0
         buses.append((joints, replace(reports, tail=has_tail)))
     return buses
@@ -215,45 +219,46 @@ def plan_buses(config: RunConfig, settings: CanSettings) -> list[tuple[int, Repo
 # --- the check ----------------------------------------------------------------------------------------------------
 
 
-def check_load(config: RunConfig, settings: CanSettings) -> list[float]:
+def validate_bus_load(config: RunConfig, settings: CanSettings) -> list[float]:
     """Check that every bus can carry the frames of its joints.
 
     Args:
-        config: configuration of the run, with the control rate.
-        settings: settings of the backend, with its channels.
+        config: Configuration of the run, with the control rate.
+        settings: Settings of the backend, with its channels.
 
     Returns:
         The load of every bus, as a fraction of its time.
 
     Raises:
-        ConfigError: a load is above `MAX_LOAD`, or a single period is too long. The error has the sum, and alternatives
-            that fit.
+        ConfigError: A load is above `MAX_LOAD`, or the frames of a single control period do not fit into it. The error
+            lists the load by kind of frame, and alternatives that fit.
     """
     buses = plan_buses(config, settings)
     joints = [count for count, _ in buses]
-    loads = [bus_load(*bus) for bus in buses]
-    fullest = max(range(len(loads)), key=lambda i: loads[i])
-    if loads[fullest] > MAX_LOAD:
+    loads = [compute_bus_load(*bus) for bus in buses]
+    fullest_bus = max(range(len(loads)), key=lambda i: loads[i])
+    if loads[fullest_bus] > MAX_LOAD:
         raise ConfigError(
-            f"{joints[fullest]} joints at {config.rate_hz:g} Hz do not fit on {_bus_name(settings, fullest)}:",
-            *explain_load(*buses[fullest]),
+            f"{joints[fullest_bus]} joints at {config.rate_hz:g} Hz do not fit on "
+            f"{_describe_bus(settings, fullest_bus)}:",
+            *explain_load(*buses[fullest_bus]),
             suggest_alternatives(joints, config, settings),
             code="bus/overloaded",
         )
     periods_s = [busiest_period_s(*bus) for bus in buses]
-    longest = max(range(len(buses)), key=lambda i: periods_s[i])
-    if periods_s[longest] * config.rate_hz > 1:
+    longest_period_bus = max(range(len(buses)), key=lambda i: periods_s[i])
+    if periods_s[longest_period_bus] * config.rate_hz > 1:
         raise ConfigError(
-            f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_bus_name(settings, longest)}: a period "
-            f"with force reports takes {periods_s[longest] * 1000:.2f} ms of bus time and lasts "
-            f"{1000 / config.rate_hz:.2f} ms.",
+            f"{joints[longest_period_bus]} joints at {config.rate_hz:g} Hz do not fit on "
+            f"{_describe_bus(settings, longest_period_bus)}: a period with force reports takes "
+            f"{periods_s[longest_period_bus] * 1000:.2f} ms of bus time and lasts {1000 / config.rate_hz:.2f} ms.",
             suggest_alternatives(joints, config, settings),
             code="bus/overloaded",
         )
     return loads
 
 
-def _bus_name(settings: CanSettings, bus: int) -> str:
+def _describe_bus(settings: CanSettings, bus: int) -> str:
     return settings.channels[bus] if settings.channels else "the virtual bus"
 
 
@@ -264,32 +269,32 @@ def explain_load(joints: int, reports: ReportSchedule) -> list[str]:
         if not stream.frames_per_s:
             continue
         layout = load_layouts()[stream.opcode]
-        bits = worst_frame_bits(layout.length)
+        bits = compute_max_frame_bits(layout.length)
         percent = 100 * stream.bits_per_s / reports.bit_rate
         lines.append(
             f"  {layout.name:<14}{stream.frames_per_s:7.0f} frames/s x {bits:3d} bits ({layout.length} bytes)"
             f" = {percent:5.1f} %"
         )
-    total_percent = 100 * bus_load(joints, reports)
+    total_percent = 100 * compute_bus_load(joints, reports)
     bit_rate = format_bit_rate(reports.bit_rate)
     lines.append(f"  together {total_percent:.1f} % of {bit_rate} at worst-case stuffing; at most {MAX_LOAD:.0%}")
     return lines
 
 
 def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: CanSettings) -> str:
-    """Return a sentence with alternatives that fit: a lower rate, more buses, fewer reports.
+    """Return a sentence with alternatives that fit: a lower control rate, more buses, or fewer contact reports.
 
     Args:
-        joints: number of joints on each bus.
-        config: configuration of the run, with the robot and the settings of its backend.
-        settings: settings of the backend.
+        joints: Number of joints on each bus.
+        config: Configuration of the run, with the robot and the settings of its backend.
+        settings: Settings of the backend.
     """
-    fullest = max(joints)
+    fullest_bus = max(joints)
     total = sum(joints)
     reports = plan_reports(config, settings)
     alternatives: list[str] = []
 
-    rate_hz = max_rate_hz(fullest, config, settings)
+    rate_hz = max_rate_hz(fullest_bus, config, settings)
     if rate_hz is not None:
         buses = f"{len(joints)} bus" if len(joints) == 1 else f"{len(joints)} buses"
         alternatives.append(f"rate_hz = {rate_hz} on {buses}")
@@ -302,9 +307,9 @@ def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: Can
 
     for factor in (2, 4):
         contact_every = factor * reports.contact_every
-        if not 0 < contact_every <= MAX_EVERY:
+        if not 0 < contact_every <= MAX_SYNCS_PER_REPORT:
             continue
-        if is_feasible(fullest, replace(reports, contact_every=contact_every)):
+        if is_feasible(fullest_bus, replace(reports, contact_every=contact_every)):
             alternatives.append(f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}")
             break
 

@@ -25,11 +25,11 @@ def open_log(path: Path, backend: str = "can") -> TextIO:
     """Open a new log file.
 
     Args:
-        path: the file.
-        backend: section of the settings that names the file, for the error message.
+        path: Path of the file.
+        backend: Name of the backend whose settings name the file, used in the error message.
 
     Raises:
-        ConfigError: the file cannot be written.
+        ConfigError: The file cannot be written.
     """
     try:
         return path.open("w", encoding="utf-8", errors="backslashreplace", buffering=FLUSH_BYTES)

@@ -20,27 +20,27 @@ import can
 
 from snakesim_hal.base.errors import ConfigError
 
-KINDS = ".log, .asc, .blf"
+FILE_SUFFIXES = ".log, .asc, .blf"
 MAX_NAMED_LINES = 3  # dropped lines that are shown; the others are counted
 MAX_SHOWN_CHARACTERS = 60  # of a dropped line
 MAX_ERROR_CHARACTERS = 200  # of an error of python-can
-PROBED_LINES = 500  # to know whether their times are differences
-STEP_S = 1e-6  # between frames of a log without times
+MAX_PROBED_LINES = 500  # to know whether their times are differences
+FRAME_INTERVAL_S = 1e-6  # between frames of a log without times
 ERROR_FLAG = 0x20000000  # in the id of an error frame
 ID_MASK = 0x1FFFFFFF  # id without flags
 EXTENDED_ID_DIGITS = 8  # a shorter id has 11 bits
-FAST_DATA = 1  # flag of CAN FD: the data had a second bit rate
+BIT_RATE_SWITCH_FLAG = 1  # flag of CAN FD: the data had a second bit rate
 
-COMPACT = re.compile(  # (1700000000.000000) can0 105#00112233 R
+COMPACT_LINE_PATTERN = re.compile(  # (1700000000.000000) can0 105#00112233 R
     r"\((?P<time>\d+\.\d+)\)\s+(?P<channel>\S+)\s+(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
     r"#(?:(?P<remote>R\d?)|(?P<flags>#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2})*)(?:_[0-9A-F])?)"
     r"(?:\s+(?P<direction>[RT]))?\s*"
 )
-PRINTED = re.compile(  # can0  105   [8]  00 11 22 33 44 55 66 77; of CAN FD the length has two digits
+PRINTED_LINE_PATTERN = re.compile(  # can0  105   [8]  00 11 22 33 44 55 66 77; of CAN FD the length has two digits
     r"\s*(?:\((?P<time>[^)]+)\)\s+)?(?P<channel>\S+)\s+(?:(?P<direction>[RT])X\s+\S+\s+\S+\s+)?"
     r"(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[(?P<length>\d{1,2})\](?P<rest>.*)"
 )
-BYTE = re.compile(r"\s+([0-9A-Fa-f]{2})(?=\s|$)")
+HEX_BYTE_PATTERN = re.compile(r"\s+([0-9A-Fa-f]{2})(?=\s|$)")
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class BusLog:
             frames += 1
             yield message
         if frames == 0 and self.dropped:
-            raise self._refusal(str(self.dropped[0]))
+            raise self._make_read_error(str(self.dropped[0]))
 
     def report(self) -> Iterator[str]:
         """Yield lines for a person: what was left out, and what is not known of the rest."""
@@ -93,47 +93,47 @@ class BusLog:
         return suffixes[-1:] == [".log"] or suffixes[-2:] == [".log", ".gz"]
 
     def _read_candump(self) -> Iterator[can.Message]:
-        times_are_steps = self._times_are_steps()
+        has_relative_times = self._has_relative_times()
         time_s = 0.0
-        for number, line in self._lines():
+        for number, line in self._read_lines():
             if not line.strip():
                 continue
             message = parse_line(line)
             if message is None:
-                self._drop(f"line {number}", line)
+                self._record_dropped_line(f"line {number}", line)
                 continue
             if not message.timestamp:
-                message.timestamp = time_s + STEP_S
-            elif times_are_steps:
+                message.timestamp = time_s + FRAME_INTERVAL_S
+            elif has_relative_times:
                 message.timestamp += time_s
             time_s = message.timestamp
             yield message
 
-    def _times_are_steps(self) -> bool:
+    def _has_relative_times(self) -> bool:
         """Return whether each time is the one since the frame before; also set `has_times`.
 
         `candump -t d` prints such times. They are differences, so that some of them are smaller than the one before.
         """
         times_s: list[float] = []
-        for _, line in islice(self._lines(), PROBED_LINES):
+        for _, line in islice(self._read_lines(), MAX_PROBED_LINES):
             message = parse_line(line)
             if message is not None:
                 times_s.append(message.timestamp)
         self.has_times = not times_s or any(times_s)
         return any(after_s < before_s for before_s, after_s in pairwise(times_s))
 
-    def _lines(self) -> Iterator[tuple[int, str]]:
+    def _read_lines(self) -> Iterator[tuple[int, str]]:
         number = 0
         try:
-            with closing(self._open()) as file:
+            with closing(self._open_file()) as file:
                 for number, line in enumerate(file, start=1):
                     yield number, line.decode("utf-8", errors="replace")
         except OSError as error:
-            raise self._refusal(error.strerror or str(error)) from None
+            raise self._make_read_error(error.strerror or str(error)) from None
         except EOFError as error:  # a compressed file that was cut
-            self._drop(f"after line {number}", str(error))
+            self._record_dropped_line(f"after line {number}", str(error))
 
-    def _open(self) -> gzip.GzipFile | BinaryIO:
+    def _open_file(self) -> gzip.GzipFile | BinaryIO:
         if self.path.suffix.lower() == ".gz":
             return gzip.open(self.path, "rb")
         return self.path.open("rb")
@@ -149,12 +149,12 @@ class BusLog:
                     yield message
         except Exception as error:  # noqa: BLE001 - a damaged file makes python-can's readers raise almost anything
             if frames == 0:
-                raise self._refusal(str(error)[:MAX_ERROR_CHARACTERS]) from None
-            self._drop(f"after frame {frames}", str(error) or type(error).__name__)
+                raise self._make_read_error(str(error)[:MAX_ERROR_CHARACTERS]) from None
+            self._record_dropped_line(f"after frame {frames}", str(error) or type(error).__name__)
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    def _drop(self, where: str, text: str) -> None:
+    def _record_dropped_line(self, where: str, text: str) -> None:
         self.dropped_count += 1
         if len(self.dropped) >= MAX_NAMED_LINES:
             return
@@ -163,20 +163,24 @@ class BusLog:
             shown = f"{shown[:MAX_SHOWN_CHARACTERS]}..."
         self.dropped.append(DroppedLine(where, shown))
 
-    def _refusal(self, reason: str) -> ConfigError:
+    def _make_read_error(self, reason: str) -> ConfigError:
         return ConfigError(
-            f"{self.path} cannot be read as a log of a CAN bus ({KINDS}): {reason}", code="recording/not-readable"
+            f"{self.path} cannot be read as a log of a CAN bus ({FILE_SUFFIXES}): {reason}",
+            code="recording/not-readable",
         )
 
 
 def parse_line(line: str) -> can.Message | None:
-    """Return the frame of a line of candump; None if it is not whole. A time of 0 means that the line has none."""
-    compact = COMPACT.fullmatch(line)
+    """Parse a line of candump, and return its frame; None if the line is incomplete.
+
+    A timestamp of 0 means that the line has none.
+    """
+    compact = COMPACT_LINE_PATTERN.fullmatch(line)
     if compact is not None:
         # A line without its end may have lost bytes, but not if the direction is there, which comes after them.
         is_whole = line.endswith("\n") or compact["direction"] is not None
         return _parse_compact(compact) if is_whole else None
-    printed = PRINTED.fullmatch(line.rstrip("\r\n"))
+    printed = PRINTED_LINE_PATTERN.fullmatch(line.rstrip("\r\n"))
     if printed is not None:
         return _parse_printed(printed)
     return None
@@ -186,16 +190,16 @@ def _parse_compact(match: re.Match[str]) -> can.Message:
     """Return the CAN frame of a line in the compact format of `candump -L`.
 
     Args:
-        match: the parts of the line; flags are such as "#1" for CAN FD, and remote is such as "R8".
+        match: Match of `COMPACT_LINE_PATTERN` with the parts of the line.
     """
     data = bytes.fromhex(match["data"] or "")
     flags = match["flags"]  # such as "#1"; None: classic CAN
-    has_fast_data = flags is not None and bool(int(flags[1:], 16) & FAST_DATA)
+    has_fast_data = flags is not None and bool(int(flags[1:], 16) & BIT_RATE_SWITCH_FLAG)
     remote = match["remote"]  # such as "R8", with the length; None: a data frame
     length = len(data)
     if remote:
         length = int(remote[1:] or 0)
-    return _make_message(
+    return _make_can_message(
         match,
         float(match["time"]),
         data,
@@ -211,12 +215,12 @@ def _parse_printed(match: re.Match[str]) -> can.Message | None:
     length = int(match["length"])
     is_fd = len(match["length"]) > 1
     is_remote = match["rest"].strip().startswith("remote request")
-    hex_bytes = BYTE.findall(match["rest"])[:length]
+    hex_bytes = HEX_BYTE_PATTERN.findall(match["rest"])[:length]
     data = bytes.fromhex("".join(hex_bytes))
     time_s = _parse_time(match["time"])
     if time_s is None or (len(data) < length and not is_remote):
         return None
-    return _make_message(match, time_s, data, is_fd=is_fd, is_remote=is_remote, length=length)
+    return _make_can_message(match, time_s, data, is_fd=is_fd, is_remote=is_remote, length=length)
 
 
 def _parse_time(text: str | None) -> float | None:
@@ -235,7 +239,7 @@ def _parse_time(text: str | None) -> float | None:
         return None
 
 
-def _make_message(
+def _make_can_message(
     match: re.Match[str],
     time_s: float,
     data: bytes,
@@ -248,13 +252,13 @@ def _make_message(
     """Return the CAN frame of a line of a log, with the id, channel and direction of that line.
 
     Args:
-        match: the parts of the line.
-        time_s: timestamp of the line.
-        data: bytes of data.
-        is_fd: whether it is a frame of CAN FD.
-        is_remote: whether it is a remote frame, which has a length but no data.
-        length: number of bytes.
-        has_fast_data: whether the data were sent at the second bit rate.
+        match: Match with the parts of the line: `id`, `channel` and `direction`.
+        time_s: Timestamp of the line; 0 if the line has none.
+        data: Data bytes.
+        is_fd: Whether it is a frame of CAN FD.
+        is_remote: Whether it is a remote frame, which has a length but no data.
+        length: Number of data bytes, or the length that a remote frame requests.
+        has_fast_data: Whether the data were sent at the second bit rate.
     """
     identifier = int(match["id"], 16)
     is_extended = len(match["id"]) == EXTENDED_ID_DIGITS

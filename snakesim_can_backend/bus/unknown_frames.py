@@ -52,43 +52,43 @@ class UnknownFrames:
         return f"{digits}  {self.length} B  {self.frames} frames  {self.origin or 'unknown'}"
 
 
-def listen_for_unknown_frames(bus: can.BusABC, seconds: float) -> list[UnknownFrames]:
+def listen_for_unknown_frames(bus: can.BusABC, duration_s: float) -> list[UnknownFrames]:
     """Collect the frames on a bus that do not belong to the protocol of joint modules, without sending anything.
 
     Args:
-        bus: an open bus of python-can.
-        seconds: how long to listen; it ends earlier after MAX_FRAMES frames.
+        bus: An open bus of python-can.
+        duration_s: How long to listen; it ends earlier after MAX_FRAMES frames.
 
     Returns:
         The unknown frames by id, with their number and a guess at their origin.
 
     Raises:
-        BackendError: the bus cannot be read.
+        BackendError: The bus cannot be read.
     """
-    counts: Counter[tuple[int, bool]] = Counter()  # by id, and whether it is extended
-    newest: dict[tuple[int, bool], can.Message] = {}
-    end_s = time.monotonic() + seconds
+    frame_count_by_key: Counter[tuple[int, bool]] = Counter()  # by id, and whether it is extended
+    newest_message_by_key: dict[tuple[int, bool], can.Message] = {}
+    deadline_s = time.monotonic() + duration_s
     try:
-        while counts.total() < MAX_FRAMES:
-            left_s = end_s - time.monotonic()
-            if left_s <= 0:
+        while frame_count_by_key.total() < MAX_FRAMES:
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0:
                 break
-            message = bus.recv(left_s)
-            if message is None or message.is_error_frame or matches_protocol(message):
+            message = bus.recv(remaining_s)
+            if message is None or message.is_error_frame or is_joint_module_frame(message):
                 continue
             key = message.arbitration_id, message.is_extended_id
-            counts[key] += 1
-            newest[key] = message
+            frame_count_by_key[key] += 1
+            newest_message_by_key[key] = message
     except (OSError, ValueError, can.CanError) as error:
         raise BackendError(f"{bus.channel_info}: cannot be listened to: {error}", code="bus/io-failed") from error
     unknown: list[UnknownFrames] = []
-    for (identifier, extended), count in sorted(counts.items()):
-        message = newest[identifier, extended]
-        unknown.append(UnknownFrames(identifier, extended, len(message.data), count, guess_origin(message)))
+    for (identifier, extended), count in sorted(frame_count_by_key.items()):
+        message = newest_message_by_key[identifier, extended]
+        unknown.append(UnknownFrames(identifier, extended, len(message.data), count, guess_frame_origin(message)))
     return unknown
 
 
-def matches_protocol(message: can.Message) -> bool:
+def is_joint_module_frame(message: can.Message) -> bool:
     """Return whether id, length and, where there is one, checksum are those of the joint modules' protocol."""
     if message.is_extended_id or message.is_remote_frame or message.is_fd:
         return False
@@ -102,8 +102,8 @@ def matches_protocol(message: can.Message) -> bool:
     return opcode not in WITH_CHECKSUM or has_valid_checksum(frame)
 
 
-def guess_origin(message: can.Message) -> str:
-    """Return what an unknown frame looks like; empty: unknown."""
+def guess_frame_origin(message: can.Message) -> str:
+    """Return a guess at what has sent an unknown frame, such as "29-bit id"; empty if it is unknown."""
     identifier = message.arbitration_id
     data = bytes(message.data)
     if message.is_fd:

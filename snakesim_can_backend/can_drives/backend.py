@@ -6,20 +6,26 @@ from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
 
-from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import is_emulated, open_wire, validate_channels
 from snakesim_can_backend.bus.bus import VirtualWire, Wire, make_virtual_channel
-from snakesim_can_backend.bus.load import format_bit_rate, worst_frame_s
+from snakesim_can_backend.bus.load import compute_max_frame_duration_s, format_bit_rate
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
 from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
 from snakesim_can_backend.can_drives.traffic import BusLoad, CycleTraffic, compute_load
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_settings import DriveSettings, answer_limit_s, assign_ports, joint_label, make_body
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, group_by_port
+from snakesim_drivers.kit.drive_settings import (
+    DriveSettings,
+    assign_ports,
+    compute_response_timeout_s,
+    make_emulated_body,
+    make_joint_label,
+)
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import KINDS
+from snakesim_hal.model.fault_kinds import FAULT_KINDS
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
@@ -40,7 +46,7 @@ class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
 
     @property
     def fd_rate(self) -> int | None:
-        """Bit rate of the data on CAN FD; None: classic CAN."""
+        """Bit rate of the data on CAN FD; None for classic CAN."""
         return None
 
 
@@ -48,7 +54,7 @@ class CanDriveBackend(DriverTypeBackend):
     """A backend for drives on CAN, real or emulated.
 
     A driver type sets the class variables, with a subclass of `CanDriveSettings` as `Settings`, and may override
-    `check_joint`.
+    `validate_joint`.
     """
 
     drives_class: ClassVar[Callable[[CanDrivesContext], CanDrives]]
@@ -61,11 +67,11 @@ class CanDriveBackend(DriverTypeBackend):
     report_period_s: ClassVar[float | None] = None  # of a drive's state; None: a drive reports it when requested
 
     @classmethod
-    def check_joint(cls, config: RunConfig, settings: Any, joint: Joint) -> None:
+    def validate_joint(cls, config: RunConfig, settings: Any, joint: Joint) -> None:
         """Check that a drive of this type suits a joint.
 
         Raises:
-            ConfigError: it does not.
+            ConfigError: A drive of this type does not suit the joint.
         """
         del config, settings, joint
 
@@ -75,36 +81,39 @@ class CanDriveBackend(DriverTypeBackend):
 
     @classmethod
     def list_bus_faults(cls, settings: Any) -> Collection[str]:
-        """Return the kinds of faults that can be injected. A full queue is one of the kernel, which a real bus has."""
-        impossible = {"slow"}
+        """Return the kinds of faults that can be injected into the buses.
+
+        A full queue can be injected only into a virtual bus in this process: a real bus has the queue of the kernel.
+        """
+        impossible_kinds = {"slow"}
         if settings.channels:
-            impossible.add("full")
-        return {*KINDS["bus"]} - impossible
+            impossible_kinds.add("full")
+        return {*FAULT_KINDS["bus"]} - impossible_kinds
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
         """Check channels, ids, joints and bus load of the joints that have drives of this type.
 
         Args:
-            config: configuration of the run.
-            settings: settings of the driver type.
-            joints: the joints with drives of this type.
+            config: Configuration of the run.
+            settings: Settings of the driver type.
+            joints: Joints with drives of this type.
 
         Raises:
-            ConfigError: one of them does not suit this driver type.
+            ConfigError: A channel, an id, a joint or the load of a bus does not suit this driver type.
         """
-        check_channels(settings.channels, fd=settings.fd_rate is not None)
+        validate_channels(settings.channels, fd=settings.fd_rate is not None)
         for joint in joints:
             if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
-                    f"{joint_label(config, joint)}: `id` = {joint.id}, and {cls.plural_noun} have ids of "
+                    f"{make_joint_label(config, joint)}: `id` = {joint.id}, and {cls.plural_noun} have ids of "
                     f"{cls.first_id} to {cls.last_id}: {cls.reserved_ids}. Give its drive another id, and set it as "
                     f"`id` of the joint",
                     code="drive/unsupported-setting",
                 )
-            cls.check_joint(config, settings, joint)
+            cls.validate_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.decimation
-        cls.compute_load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.describe_rates(settings))
+        cls.compute_load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.describe_bit_rates(settings))
 
     @staticmethod
     def has_real_bus(settings: Any) -> bool:
@@ -113,15 +122,21 @@ class CanDriveBackend(DriverTypeBackend):
 
     @classmethod
     def compute_load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> BusLoad:
-        """Return the load of the fullest bus."""
+        """Return the load of the bus with the most drives.
 
-        def frame_s(length: int) -> float:
-            return worst_frame_s(length, settings.bit_rate, settings.fd_rate)
+        Args:
+            rate_hz: Rate of the control cycle on the bus.
+            settings: Settings of the driver type, with channels and bit rates.
+            joints: Joints with drives of this type.
+        """
 
-        return compute_load(cls.traffic, assign_ports(joints, settings.channels), rate_hz, frame_s)
+        def compute_frame_duration_s(length: int) -> float:
+            return compute_max_frame_duration_s(length, settings.bit_rate, settings.fd_rate)
+
+        return compute_load(cls.traffic, assign_ports(joints, settings.channels), rate_hz, compute_frame_duration_s)
 
     @staticmethod
-    def describe_rates(settings: Any) -> str:
+    def describe_bit_rates(settings: Any) -> str:
         """Return the bit rates in words."""
         rates = format_bit_rate(settings.bit_rate)
         if settings.fd_rate:
@@ -129,30 +144,30 @@ class CanDriveBackend(DriverTypeBackend):
         return rates
 
     @classmethod
-    def emulator_on(
+    def make_emulator(
         cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: DriverClock, pose_address: str | None
     ) -> CanEmulator:
-        """Return the emulated drives of a whole robot.
+        """Create the emulated drives of a whole robot, on buses that are already open.
 
         Args:
             config: Configuration of the run, with the robot and the settings of its backend.
-            settings: The settings of the driver type.
-            wires: The open buses, in the order of the channels.
-            clock: The time of the drives.
-            pose_address: HOST:PORT to which its emulated motion capture sends; None: it does not send.
+            settings: Settings of the driver type.
+            wires: Open buses, in the order of the channels.
+            clock: Clock of the drives.
+            pose_address: HOST:PORT to which emulated motion capture sends poses; None if it does not send.
         """
-        body = make_body(config, settings, cls.name, pose_address)
+        body = make_emulated_body(config, settings, cls.name, pose_address)
         joints = config.robot.joint_table
-        wire_of_joint = [wires[bus] for bus in assign_ports(joints, settings.channels)]
-        return cls.emulator_class(CanEmulatorContext(joints, settings, body, wire_of_joint, clock.now_ns))
+        wire_by_joint = [wires[bus] for bus in assign_ports(joints, settings.channels)]
+        return cls.emulator_class(CanEmulatorContext(joints, settings, body, wire_by_joint, clock.now_ns))
 
     @classmethod
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
-        """Return one bus for each channel, or a virtual one with emulated drives.
+        """Return the specification of one bus for each channel, or of one virtual bus with emulated drives.
 
         Args:
-            context: configuration, settings, joints, clock, and the body that emulated drives move; without a body the
-                drives are real.
+            context: Configuration, settings, joints, clock, and the body that emulated drives move; without a body the
+                drives are on real buses.
         """
         config = context.config
         settings = context.settings
@@ -170,14 +185,14 @@ class CanDriveBackend(DriverTypeBackend):
             """Open the bus of a channel, virtual if the drives are emulated, and return its drives; nothing is sent.
 
             Args:
-                channel: name of the channel.
-                indices: joints with drives on this bus, by their indices in the robot.
-                readings: gets the values that the drives report.
+                channel: Name of the channel.
+                indices: Indices in the robot of the joints with drives on this bus.
+                readings: Object that stores the values that the drives report.
             """
             emulator = None
             if body is not None:
-                other_end = VirtualWire(channel, fd=uses_fd)
-                wires = [other_end] * len(all_joints)
+                emulator_wire = VirtualWire(channel, fd=uses_fd)
+                wires = [emulator_wire] * len(all_joints)
                 emulator = cls.emulator_class(CanEmulatorContext(all_joints, settings, body, wires, clock.now_ns))
                 wire: Wire = VirtualWire(channel, emulator, fd=uses_fd)
             else:
@@ -192,8 +207,8 @@ class CanDriveBackend(DriverTypeBackend):
                 readings=readings,
                 emulator=emulator,
                 emulated=body is not None or is_emulated(channel),
-                answer_s=answer_limit_s(config, settings.decimation),
-                bring_up_s=settings.bring_up_limit_s,
+                response_timeout_s=compute_response_timeout_s(config, settings.decimation),
+                bring_up_timeout_s=settings.bring_up_limit_s,
                 cycle_ns=config.period_ns * settings.decimation,
                 report_period_ns=report_period_ns,
                 clock_ns=clock.now_ns,
@@ -201,4 +216,4 @@ class CanDriveBackend(DriverTypeBackend):
             return cls.drives_class(drives_context)
 
         channels = settings.channels if body is None else [make_virtual_channel()]
-        return group_by_port(joints, settings, channels, open_drives)
+        return make_bus_specs_by_port(joints, settings, channels, open_drives)

@@ -8,34 +8,34 @@ from typing import Any
 import msgspec
 
 from snakesim_can_backend.arguments import DEFAULT_CHANNEL
-from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import is_emulated, open_wire, validate_channels
 from snakesim_can_backend.bus.bus import wait
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_drivers.emulation.drive_emulator import serve_until_stopped
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import die_with_parent
+from snakesim_hal.base.process import set_parent_death_signal
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
-from snakesim_hal.programs.preflight import backend_settings
+from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, parse_set_option
+from snakesim_hal.programs.preflight import decode_backend_settings
 
 
 def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
-    """Emulate the drives of a driver type on some channels until a stop signal arrives.
+    """Run `snakesim drive emulate`: emulate the drives of a driver type until a stop signal arrives.
 
     Args:
-        backend: the driver type.
-        arguments: the parsed command line.
+        backend: Class of the driver type.
+        arguments: Parsed command line.
 
     Returns:
-        The exit code, 0.
+        Exit code 0.
 
     Raises:
-        SnakesimError: the configuration is invalid, or a channel is not virtual or cannot be opened.
+        SnakesimError: The configuration is invalid, or a channel is not virtual or cannot be opened.
     """
     if arguments.parent is not None:
-        die_with_parent(arguments.parent)
+        set_parent_death_signal(arguments.parent)
     config, settings = _load_settings(backend, "drive emulate", arguments)
     for channel in settings.channels:
         if not is_emulated(channel):
@@ -43,10 +43,10 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
                 f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous",
                 code="bus/not-virtual",
             )
-    check_channels(settings.channels, fd=settings.fd_rate is not None)
+    validate_channels(settings.channels, fd=settings.fd_rate is not None)
     config = msgspec.structs.replace(config, clock_mode="realtime")
     wires = [open_wire(channel, None, settings.bit_rate, settings.fd_rate) for channel in settings.channels]
-    emulator = backend.emulator_on(config, settings, wires, DriverClock(config), arguments.pose)
+    emulator = backend.make_emulator(config, settings, wires, DriverClock(config), arguments.pose)
     ready_text = f"{backend.plural_noun} ready: {len(emulator.wires)} on {', '.join(settings.channels)}"
     with contextlib.closing(emulator):
         serve_until_stopped(ready_text, emulator, partial(wait, wires))
@@ -54,17 +54,17 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
 
 
 def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
-    """Print the bus load of the drives of a driver type, and the highest control rate that fits.
+    """Run `snakesim drive load`: print the bus load of a driver type, and the highest control rate that fits.
 
     Args:
-        backend: the driver type.
-        arguments: the parsed command line.
+        backend: Class of the driver type.
+        arguments: Parsed command line.
 
     Returns:
-        The exit code, 0.
+        Exit code 0.
 
     Raises:
-        SnakesimError: the configuration is invalid.
+        SnakesimError: The configuration is invalid.
     """
     config, settings = _load_settings(backend, "drive load", arguments)
     bus_load = backend.compute_load(config.rate_hz, settings, config.robot.joint_table)
@@ -72,17 +72,18 @@ def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) ->
         print_json(
             {
                 "rate_hz": config.rate_hz,
-                "drives": bus_load.drives,
+                "drives": bus_load.drive_count,
                 "load": bus_load.fraction,
                 "max_load": MAX_LOAD,
-                "max_rate_hz": bus_load.fits_hz,
+                "max_rate_hz": bus_load.max_rate_hz,
             }
         )
         return 0
-    rates = backend.describe_rates(settings)
+    rates = backend.describe_bit_rates(settings)
     print_line(
-        f"{bus_load.drives} {backend.plural_noun} at {config.rate_hz:g} Hz on {rates}: "
-        f"{bus_load.fraction:.0%} at worst-case stuffing; {MAX_LOAD:.0%} are allowed, so up to {bus_load.fits_hz} Hz"
+        f"{bus_load.drive_count} {backend.plural_noun} at {config.rate_hz:g} Hz on {rates}: "
+        f"{bus_load.fraction:.0%} at worst-case stuffing; {MAX_LOAD:.0%} are allowed, so up to "
+        f"{bus_load.max_rate_hz} Hz"
     )
     return 0
 
@@ -90,9 +91,18 @@ def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) ->
 def _load_settings(
     backend: type[CanDriveBackend], command: str, arguments: argparse.Namespace
 ) -> tuple[RunConfig, Any]:
-    """Return the configuration for a backend, and its settings with the buses of the command line."""
-    overrides = [Override("backend", backend.name, f"{command} {backend.name}"), *map(parse_set, arguments.set)]
-    loaded = load(arguments.scenario, overrides)
-    settings = backend_settings(loaded.config, backend, loaded.table)
+    """Load the scenario of a command line for a backend, with the channels that the command line names.
+
+    Args:
+        backend: Class of the driver type.
+        command: Name of the command, used as the origin of settings in error messages.
+        arguments: Parsed command line.
+
+    Returns:
+        The configuration of the run and the settings of the backend.
+    """
+    overrides = [Override("backend", backend.name, f"{command} {backend.name}"), *map(parse_set_option, arguments.set)]
+    loaded = load_scenario(arguments.scenario, overrides)
+    settings = decode_backend_settings(loaded.config, backend, loaded.table)
     channels = arguments.channel or settings.channels or [DEFAULT_CHANNEL]
     return loaded.config, msgspec.structs.replace(settings, channels=channels)

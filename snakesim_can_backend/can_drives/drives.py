@@ -25,8 +25,8 @@ from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode
 
-REQUEST_PERIOD_S = 0.1  # between two requests to the same drive in bring-up
-DUPLICATE_WAIT_S = 0.06  # after the last drive has answered: a second drive with its id may answer later
+REQUEST_PERIOD_S = 0.1  # from one request to the next one to the same drive in bring-up
+DUPLICATE_WAIT_S = 0.06  # after the last drive has responded: a second drive with its id may respond later
 MIN_UNKNOWN_NODE_FRAMES = 3  # a single frame of an unknown node may be left in a queue from before
 HOST = -1  # the sender of a frame that only a host sends
 
@@ -42,8 +42,8 @@ class CanDrivesContext:
     readings: DriveReadings
     emulator: VirtualPeer | None  # the drives, if they are emulated in this process
     emulated: bool  # True: no real motor moves
-    answer_s: float  # time that a reading waits for answers
-    bring_up_s: float  # time that drives have to answer in bring-up
+    response_timeout_s: float  # time that a reading waits for answers
+    bring_up_timeout_s: float  # time that drives have to answer in bring-up
     cycle_ns: int  # from one setpoint to the next
     report_period_ns: int  # from one report of a drive's state to the next
     clock_ns: Callable[[], int]
@@ -54,7 +54,7 @@ class CanDrives(Drives):
 
     The abstract methods are what a driver type implements. They are called in the thread of the bus, in this order:
 
-    * bring-up: `forget_identities`; `request_identity` until every drive `is_identified`; `find_mismatch`; for each
+    * bring-up: `forget_identities`; `request_identity` until every drive `is_identified`; `validate_drive`; for each
       drive `send_command` with "idle", `clear_leftover_errors` and `write_settings`; then `request_motion` until motion
       and torque of every drive are known
     * a control cycle: `request_motion` to all, `request_health` to one; `send_setpoint` to the drives that follow, then
@@ -62,16 +62,16 @@ class CanDrives(Drives):
     * the operator's reset of a fault: `clear_errors`, then `write_settings`
     * the end: `send_command` with "idle", then `restore_settings`
 
-    `find_sender` and `handle_answer` are called for frames that arrive, at any time.
+    `find_sender` and `handle_response` are called for frames that arrive, at any time.
     """
 
-    missing_identity_reason: str  # why a drive may not send its firmware version, for a message
+    missing_identity_text: str  # why a drive may not send its firmware version, for a message
 
     def __init__(self, context: CanDrivesContext) -> None:
         """Prepare to drive the joints on an open bus; nothing is sent before `bring_up`.
 
         Args:
-            context: the bus, its joints, the object that stores their readings, and the times of the driver.
+            context: The open bus, its joints, the object that stores their readings, and the timeouts of the driver.
         """
         self._context = context
         self.emulated = context.emulated
@@ -80,30 +80,35 @@ class CanDrives(Drives):
         self.wire = context.wire
         self.nodes = [joint.id for joint in context.joints]
         self._index_of_node = {node: i for i, node in enumerate(self.nodes)}
-        self._may_write = False  # True: bring-up has found every drive and no other program
+        self._is_brought_up = False  # whether every drive was found and no other program uses the bus
         # What drives report.
         self.readings = context.readings
         labels = [f"{joint.name} (node {joint.id} on {context.wire.channel})" for joint in context.joints]
         self.states = DriveStates(labels, context.report_period_ns, context.clock_ns)
         self.firmware: list[tuple[int, ...]] = [()] * len(self.nodes)  # (): not reported yet
-        self._serials: list[list[str]] = [[] for _ in self.nodes]  # that answer with a joint's id; the first is its own
-        self._health_turn = 0  # the drive whose health was requested last
-        # Others on the bus.
-        self._unknown_nodes: Counter[int] = Counter()  # frames, by node
-        self._second_host = False  # whether another program commands drives
+        # Serial numbers that respond with the id of each joint. Two of them are two drives with one id.
+        self._serials: list[list[str]] = [[] for _ in self.nodes]
+        self._health_drive_index = 0  # index of the drive whose health was requested last
+        # Other nodes on the bus.
+        self._frame_count_by_unknown_node: Counter[int] = Counter()  # frames, by node
+        self._was_second_host_seen = False  # whether another program commands drives
 
     # --- the protocol of a driver type: frames that arrive ----------------------------------------------------
 
     @abstractmethod
     def find_sender(self, frame: Frame) -> int | None:
-        """Return the node that sent a frame, `HOST` if only a host sends it, or None if the frame does not matter."""
+        """Return the id of the node that sent a frame.
+
+        Returns:
+            The node id; `HOST` if only a host sends such a frame; None if the frame is to be ignored.
+        """
 
     @abstractmethod
-    def handle_answer(self, i: int, frame: Frame) -> None:
+    def handle_response(self, i: int, frame: Frame) -> None:
         """Store what a drive reports in `readings`, `states` and `firmware`.
 
         Raises:
-            ValueError, LookupError, struct.error: the frame is malformed, and is ignored.
+            ValueError, LookupError, struct.error: The frame is malformed; the caller ignores it.
         """
 
     # --- the protocol of a driver type: bring-up, reset and end -----------------------------------------------
@@ -117,16 +122,24 @@ class CanDrives(Drives):
         return bool(self.firmware[i])
 
     def forget_identities(self) -> None:
-        """Forget what drives have reported, as a bring-up begins."""
+        """Forget what drives have reported, at the start of a bring-up."""
         self.firmware = [()] * len(self.nodes)
         self._serials = [[] for _ in self.nodes]
 
     @abstractmethod
-    def find_mismatch(self, i: int) -> str:
-        """Return why an identified drive cannot be used; empty if it can."""
+    def validate_drive(self, i: int) -> str:
+        """Check an identified drive, and store what later commands need of its configuration.
 
-    def find_start_problem(self, i: int) -> str:
-        """Return why a drive cannot be used although its settings were written; empty if it can, or may."""
+        Returns:
+            The reason why the drive cannot be used, to be put after its name; an empty string if it can be used.
+        """
+
+    def find_start_up_problem(self, i: int) -> str:
+        """Return why a drive cannot be used although its settings were written.
+
+        Returns:
+            The reason; an empty string if the drive can be used, or if that is not known yet.
+        """
         del i
         return ""
 
@@ -152,8 +165,8 @@ class CanDrives(Drives):
     def request_motion(self, i: int) -> bool:
         """Request motion and torque. Returns whether the bus accepted the request."""
 
-    def awaits_answers(self) -> bool:
-        """Return whether a drive is about to answer something else, for which a control cycle may wait as well."""
+    def is_awaiting_responses(self) -> bool:
+        """Return whether a drive owes another response than motion and torque for which a reading should wait."""
         return False
 
     @abstractmethod
@@ -162,12 +175,12 @@ class CanDrives(Drives):
 
     @abstractmethod
     def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
-        """Send a setpoint.
+        """Send a setpoint to a drive.
 
         Args:
-            i: Number of the drive on its bus, from 0 at the tail.
-            mode: Its mode.
-            target: At the shaft, in rad, rad/s or N·m by the mode; 0 if passive.
+            i: Index of the drive on its bus, from 0 at the tail.
+            mode: Control mode of the setpoint.
+            target: Target at the shaft in rad, rad/s or N·m, by the mode; 0 for a passive drive.
             limit_nm: Torque limit at the shaft.
         """
 
@@ -178,42 +191,48 @@ class CanDrives(Drives):
     # --- `Drives`: bring-up, reset and end --------------------------------------------------------------------
 
     def bring_up(self) -> None:
-        """Find and check every drive, and write its settings. Every drive is idle afterwards.
+        """Find and check every drive, write its settings, and wait for its first motion and torque.
+
+        Every drive is off afterwards. Nothing but requests is sent before all drives are found and checked.
 
         Raises:
-            BackendError: a drive is missing or unsuitable, or another program uses the bus.
+            BackendError: A drive is missing or unsuitable, or another program commands drives on this bus.
         """
         drives = range(len(self.nodes))
         self.forget_identities()
-        self._request_until(self.is_identified, self.request_identity)
+        self._request_until_done(self.is_identified, self.request_identity)
         self._wait_for_duplicates()
-        problems = [f"  {self.states.drives[i].label} {problem}" for i in drives for problem in self._find_problems(i)]
-        if self._second_host:
+        problems = [
+            f"  {self.states.drives[i].label} {problem}" for i in drives for problem in self._find_identity_problems(i)
+        ]
+        if self._was_second_host_seen:
             raise BackendError(
                 "another program commands drives on this bus; end it first. Nothing was sent", code="bus/second-host"
             )
         if problems:
             raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
-        self._may_write = True
+        self._is_brought_up = True
         for i in drives:
             self.send_command(i, "idle")
             self.clear_leftover_errors(i)
             self.write_settings(i)
-        self._request_until(self._is_started, self.request_motion)
-        start_problems = {i: self.find_start_problem(i) for i in drives}
+        self._request_until_done(self._is_start_up_decided, self.request_motion)
+        start_problems = {i: self.find_start_up_problem(i) for i in drives}
         problems = [f"  {self.states.drives[i].label} {problem}" for i, problem in start_problems.items() if problem]
         if problems:
             raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
-        silent = [self.states.drives[i].label for i in drives if not self.readings.is_known(i)]
-        if silent:
-            raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled", code="drive/silent")
+        silent_drives = [self.states.drives[i].label for i in drives if not self.readings.has_reported(i)]
+        if silent_drives:
+            raise BackendError(
+                f"{', '.join(silent_drives)}: no motion and torque; nothing was enabled", code="drive/silent"
+            )
         for i in drives:
             self.request_health(i)
         self._receive()
-        self._unknown_nodes.clear()
+        self._frame_count_by_unknown_node.clear()
 
-    def note_serial(self, i: int, serial: str) -> None:
-        """Remember a serial number that answers with a joint's id: two of them are two drives with one id."""
+    def record_serial(self, i: int, serial: str) -> None:
+        """Store a serial number that a drive has sent: two serial numbers for one id are two drives with that id."""
         if serial not in self._serials[i]:
             self._serials[i].append(serial)
         self.readings.set_identity(i, serial=self._serials[i][0])
@@ -228,7 +247,7 @@ class CanDrives(Drives):
 
     def close(self) -> None:
         """Switch all drives off, as far as the bus still works, and close the bus."""
-        if self._may_write:
+        if self._is_brought_up:
             for i in range(len(self.nodes)):
                 try:
                     self.send_command(i, "idle")
@@ -243,37 +262,37 @@ class CanDrives(Drives):
     # --- `Drives`: a control cycle ----------------------------------------------------------------------------
 
     def read(self) -> None:
-        """Request motion and torque of all drives and the health of one, and wait for drives that answered lately."""
+        """Request motion and torque of all drives and the health of one, and wait for drives that responded lately."""
         self._receive()
         for i in range(len(self.nodes)):
             if not self.request_motion(i):
                 self.readings.skip_request(i)
-        self._health_turn = (self._health_turn + 1) % len(self.nodes)
-        self.request_health(self._health_turn)
-        end_s = time.monotonic() + self._context.answer_s
-        while self.readings.is_incomplete() or self.awaits_answers():
-            left_s = end_s - time.monotonic()
-            if left_s <= 0 or not wait([self.wire], left_s):
+        self._health_drive_index = (self._health_drive_index + 1) % len(self.nodes)
+        self.request_health(self._health_drive_index)
+        deadline_s = time.monotonic() + self._context.response_timeout_s
+        while self.readings.is_awaiting_responses() or self.is_awaiting_responses():
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0 or not wait([self.wire], remaining_s):
                 break
             self._receive()
 
     def send_setpoints(self, command: BusCommand) -> None:
-        """Send setpoints to the drives that follow, then commands to those that change or did not obey."""
-        following = command.following
+        """Send setpoints to the enabled drives, then commands to drives that have to be switched on or off."""
+        enabled_drives = command.enabled_drives
         if not command.may_enable:
-            following &= self.states.following_drives()
-        for i in sorted(following):
+            enabled_drives &= self.states.get_enabled_drives()
+        for i in sorted(enabled_drives):
             self.send_setpoint(i, command.modes[i], float(command.targets[i]), float(command.limits_nm[i]))
-        for i, drive_command in self.states.next_commands(following, emergency=command.emergency):
+        for i, drive_command in self.states.update_commands(enabled_drives, emergency=command.emergency):
             self.send_command(i, drive_command)
 
     def poll(self) -> None:
-        """Receive what has arrived; drives that are emulated here simulate up to the present time."""
+        """Receive what has arrived; drives that are emulated here simulate up to the current time."""
         wait([self.wire], 0.0)
         self._receive()
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault of the bus or of a drive that is emulated here; return False for any other fault."""
+        """Start or end a fault of the bus or of a drive that is emulated here; return False for any other fault."""
         if inject_into([self.wire], injection, begins=begins):
             return True
         if self._emulator is None or injection.kind not in FAULTS:
@@ -285,26 +304,26 @@ class CanDrives(Drives):
         """Return what is wrong with the bus, with other nodes on it, and with its drives."""
         return [
             *self._find_bus_errors(),
-            *self._find_others(),
+            *self._find_unauthorized_nodes(),
             *self._find_duplicates(),
             *self.states.findings(),
         ]
 
     def handle_frame(self, frame: Frame) -> None:
-        """Handle a frame of the bus by its sender: a drive, another host or an unknown node."""
+        """Handle a received frame by its sender: store a drive's report, note another host or an unknown node."""
         sender = self.find_sender(frame)
         if sender is None:
             return
         i = self._index_of_node.get(sender)
         if i is not None:
             try:
-                self.handle_answer(i, frame)
+                self.handle_response(i, frame)
             except (ValueError, LookupError, struct.error):
                 return
         elif sender == HOST:
-            self._second_host = True
+            self._was_second_host_seen = True
         else:
-            self._unknown_nodes[sender] += 1
+            self._frame_count_by_unknown_node[sender] += 1
 
     # --- inside: findings -------------------------------------------------------------------------------------
 
@@ -316,13 +335,13 @@ class CanDrives(Drives):
                 findings.append(Finding(error.kind, cause))
         return findings
 
-    def _find_others(self) -> list[Finding]:
+    def _find_unauthorized_nodes(self) -> list[Finding]:
         """Return findings for another host and for unknown nodes."""
         findings: list[Finding] = []
-        if self._second_host:
+        if self._was_second_host_seen:
             findings.append(Finding("second_host", "another program commands drives on this bus; end one of the two"))
-            self._second_host = False
-        for node, frame_count in self._unknown_nodes.items():
+            self._was_second_host_seen = False
+        for node, frame_count in self._frame_count_by_unknown_node.items():
             if frame_count >= MIN_UNKNOWN_NODE_FRAMES:
                 findings.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
         return findings
@@ -339,13 +358,13 @@ class CanDrives(Drives):
                 findings.append(Finding("duplicate_node", cause, i))
         return findings
 
-    def _find_problems(self, i: int) -> list[str]:
-        """Return why the robot cannot be used with what answered in bring-up with the id of a joint."""
+    def _find_identity_problems(self, i: int) -> list[str]:
+        """Return what is wrong with the drive, or the drives, that responded in bring-up with the id of a joint."""
         problems: list[str] = []
         if not self.firmware[i]:
-            problems.append(self.missing_identity_reason)
+            problems.append(self.missing_identity_text)
         else:
-            mismatch = self.find_mismatch(i)
+            mismatch = self.validate_drive(i)
             if mismatch:
                 problems.append(mismatch)
         serials = self._serials[i]
@@ -355,9 +374,9 @@ class CanDrives(Drives):
             )
         return problems
 
-    def _is_started(self, i: int) -> bool:
-        """Return whether the start of a drive is over: it has sent motion and torque, or it cannot be used."""
-        return self.readings.is_known(i) or bool(self.find_start_problem(i))
+    def _is_start_up_decided(self, i: int) -> bool:
+        """Return whether waiting for a drive is over: it has sent motion and torque, or it cannot be used."""
+        return self.readings.has_reported(i) or bool(self.find_start_up_problem(i))
 
     # --- inside: the bus --------------------------------------------------------------------------------------
 
@@ -366,23 +385,31 @@ class CanDrives(Drives):
             self.handle_frame(frame)
 
     def _wait_for_duplicates(self) -> None:
-        """Receive for a while. Emulated drives in this process end the wait when they have nothing more to send."""
-        end_s = time.monotonic() + DUPLICATE_WAIT_S
+        """Receive until a second drive with a known id would have responded.
+
+        Emulated drives in this process end the wait earlier, when they have nothing more to send.
+        """
+        deadline_s = time.monotonic() + DUPLICATE_WAIT_S
         while True:
-            left_s = end_s - time.monotonic()
-            if left_s <= 0 or not wait([self.wire], left_s):
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0 or not wait([self.wire], remaining_s):
                 break
             self._receive()
         self._receive()
 
-    def _request_until(self, is_done: Callable[[int], bool], request: Callable[[int], object]) -> None:
-        """Send requests to all drives, again and again, until all are done or the time for bring-up is over."""
+    def _request_until_done(self, is_done: Callable[[int], bool], request: Callable[[int], object]) -> None:
+        """Repeat requests to all drives until all are done or the time for bring-up is over.
+
+        Args:
+            is_done: Function that returns whether a drive, by its index, needs no more requests.
+            request: Function that sends the request to a drive, by its index.
+        """
         drives = range(len(self.nodes))
-        end_s = time.monotonic() + self._context.bring_up_s
+        deadline_s = time.monotonic() + self._context.bring_up_timeout_s
         next_request_s = 0.0
         while True:
             now_s = time.monotonic()
-            if now_s >= end_s or all(is_done(i) for i in drives):
+            if now_s >= deadline_s or all(is_done(i) for i in drives):
                 return
             if now_s >= next_request_s:
                 for i in drives:

@@ -37,7 +37,7 @@ class CanEmulator(DriveEmulator[Wire]):
     broadcast_id: ClassVar[int] = NO_BROADCAST  # the address of frames that every drive receives
 
     def __init__(self, context: CanEmulatorContext) -> None:
-        """Begin to receive."""
+        """Start to simulate the drives and to receive frames on their buses."""
         body = context.body
         self.wires = list(context.wires)
         self.watchdog_us = context.settings.watchdog_s * 1e6
@@ -47,7 +47,7 @@ class CanEmulator(DriveEmulator[Wire]):
         super().__init__(body, self.wires, context.clock_ns)
 
     @abstractmethod
-    def find_addressee(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: Frame) -> int:
         """Return the node that a frame is for."""
 
     @abstractmethod
@@ -55,7 +55,7 @@ class CanEmulator(DriveEmulator[Wire]):
         """Handle a frame that a drive receives.
 
         Raises:
-            ValueError, LookupError, struct.error: the frame is malformed, and is ignored.
+            ValueError, LookupError, struct.error: The frame is malformed, and is ignored.
         """
 
     @abstractmethod
@@ -66,32 +66,33 @@ class CanEmulator(DriveEmulator[Wire]):
         """
 
     def __call__(self) -> float | None:
-        """Handle the frames that have arrived, and simulate up to the present time."""
+        """Handle the frames that have arrived, and simulate up to the current time."""
         with self.body.lock:
-            self._handle_arrivals()
+            self._handle_received_frames()
         return None
 
     def send_frame(self, i: int, frame: Frame) -> None:
-        """Send a frame of a drive, unless the drive is silent."""
+        """Send a frame of a drive, unless the drive is silent; twice if an injected fault duplicates the drive."""
         if self.body.is_silent(i):
             return
         self.wires[i].send(frame)
         if self.body.is_duplicated(i):
             self.wires[i].send(self.duplicate_frame(frame))
 
-    def _handle_arrivals(self) -> None:
+    def _handle_received_frames(self) -> None:
         self.catch_up()
         for wire in self._bus_ends:
             for frame in wire.receive():
-                for i in self._find_receivers(wire, frame):
+                for i in self._find_receiving_drives(wire, frame):
                     if self.body.is_booting(i):
                         continue
                     with contextlib.suppress(ValueError, LookupError, struct.error):
                         self.handle_frame(i, frame)
-        self.pass_time()
+        self.simulate_to_now()
 
-    def _find_receivers(self, wire: Wire, frame: Frame) -> list[int]:
-        node = self.find_addressee(frame)
+    def _find_receiving_drives(self, wire: Wire, frame: Frame) -> list[int]:
+        """Return the indices of the drives on a bus that a frame is for: one drive, all after a broadcast, or none."""
+        node = self.find_destination_node(frame)
         if node == self.broadcast_id:
             return [i for i, drive_wire in enumerate(self.wires) if drive_wire is wire]
         i = self._index_of_node.get((id(wire), node))

@@ -11,57 +11,58 @@ HEARTBEAT_BYTES = 8
 
 @dataclass(frozen=True)
 class CycleTraffic:
-    """The frames of a driver type, by their lengths in bytes."""
+    """The frames of a driver type, as the number of data bytes of each frame."""
 
-    each_drive: tuple[int, ...]  # in each control cycle, for every drive
-    one_drive: tuple[int, ...] = ()  # in each control cycle, for one drive in turn
-    heartbeats_hz: float = 0.0  # of every drive
+    bytes_per_drive: tuple[int, ...]  # frames in each control cycle for every drive
+    bytes_per_cycle: tuple[int, ...] = ()  # frames in each control cycle for one drive in turn
+    heartbeats_hz: float = 0.0  # rate of the heartbeats of every drive
 
 
 @dataclass(frozen=True)
 class BusLoad:
-    """The load of the fullest bus."""
+    """The load of the bus with the most drives."""
 
-    fraction: float  # of its time, 0 to 1
-    fits_hz: int  # the highest rate that is allowed
-    drives: int
+    fraction: float  # of the time of the bus, 0 to 1
+    max_rate_hz: int  # highest control rate that is allowed
+    drive_count: int  # drives on the bus
 
     def check(self, name: str, rate_hz: float, bus: str) -> None:
-        """Refuse a load that is too high.
+        """Check that the load is not higher than `MAX_LOAD`.
 
         Args:
-            name: Name of the backend.
+            name: Name of the backend, used in the error message.
             rate_hz: Rate of the control cycle on the bus.
-            bus: Bit rate of the bus, in words.
+            bus: Bit rate of the bus in words, used in the error message.
 
         Raises:
-            ConfigError: the load is higher than `MAX_LOAD`.
+            ConfigError: The load is higher than `MAX_LOAD`.
         """
         if self.fraction > MAX_LOAD:
             raise ConfigError(
-                f"{self.drives} drives at {rate_hz:g} Hz need {self.fraction:.0%} of a bus of {bus}, at worst-case "
-                f"stuffing; at most {MAX_LOAD:.0%}: use rate_hz = {self.fits_hz}, or more `backends.{name}.channels`",
+                f"{self.drive_count} drives at {rate_hz:g} Hz need {self.fraction:.0%} of a bus of {bus}, at "
+                f"worst-case stuffing; at most {MAX_LOAD:.0%}: use rate_hz = {self.max_rate_hz}, or more "
+                f"`backends.{name}.channels`",
                 code="bus/overloaded",
             )
 
 
 def compute_load(
-    traffic: CycleTraffic, bus_indices: Sequence[int], rate_hz: float, frame_s: Callable[[int], float]
+    traffic: CycleTraffic, bus_indices: Sequence[int], rate_hz: float, compute_frame_duration_s: Callable[[int], float]
 ) -> BusLoad:
     """Return the load of the bus with the most drives, and the highest control rate that it allows.
 
     Args:
-        traffic: The frames that a driver type sends and receives in each cycle.
+        traffic: Frames of a driver type in each control cycle.
         bus_indices: Index of the bus of every joint.
         rate_hz: Rate of the control cycle on the bus.
-        frame_s: Returns the maximum time that a frame occupies the bus, from its number of data bytes.
+        compute_frame_duration_s: Function that returns the maximum duration of a frame from its number of data bytes.
     """
-    drives = max(bus_indices.count(bus) for bus in set(bus_indices))
-    each_drive_s = sum(map(frame_s, traffic.each_drive))
-    one_drive_s = sum(map(frame_s, traffic.one_drive))
-    cycle_s = drives * each_drive_s + one_drive_s
-    heartbeat_fraction = 0.0
+    drive_count = max(bus_indices.count(bus) for bus in set(bus_indices))
+    each_drive_s = sum(map(compute_frame_duration_s, traffic.bytes_per_drive))
+    one_drive_s = sum(map(compute_frame_duration_s, traffic.bytes_per_cycle))
+    cycle_s = drive_count * each_drive_s + one_drive_s
+    heartbeat_fraction = 0.0  # heartbeats have a rate of their own, whatever the control rate is
     if traffic.heartbeats_hz:
-        heartbeat_fraction = drives * traffic.heartbeats_hz * frame_s(HEARTBEAT_BYTES)
+        heartbeat_fraction = drive_count * traffic.heartbeats_hz * compute_frame_duration_s(HEARTBEAT_BYTES)
     max_rate_hz = int((MAX_LOAD - heartbeat_fraction) / cycle_s)
-    return BusLoad(cycle_s * rate_hz + heartbeat_fraction, max_rate_hz, drives)
+    return BusLoad(cycle_s * rate_hz + heartbeat_fraction, max_rate_hz, drive_count)

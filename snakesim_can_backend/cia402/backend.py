@@ -9,7 +9,7 @@ from snakesim_can_backend.cia402.eds import read_all_eds
 from snakesim_can_backend.cia402.emulator import EmulatedCia402
 from snakesim_can_backend.cia402.frames import FIRST_NODE, LAST_NODE
 from snakesim_can_backend.cia402.settings import Cia402Settings
-from snakesim_drivers.kit.drive_settings import joint_label
+from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -28,21 +28,34 @@ class Cia402Backend(CanDriveBackend):
     reserved_ids = "0 means all nodes, and 127 is the host's as shipped"
     report_period_s = 0.1  # a drive reports with every SYNC, but its way to Operation enabled takes a while
     traffic = CycleTraffic(
-        each_drive=(8, 8, 7),  # a setpoint and two answers to SYNC; a change of the mode is rare
-        one_drive=(0, 1, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8),  # SYNC and heartbeat; five reads of health and serial number
+        bytes_per_drive=(8, 8, 7),  # a setpoint and two answers to SYNC; a change of the mode is rare
+        bytes_per_cycle=(
+            0,
+            1,
+            8,
+            8,
+            8,
+            8,
+            8,
+            8,
+            8,
+            8,
+            8,
+            8,
+        ),  # SYNC and heartbeat; five reads of health and serial number
         heartbeats_hz=10.0,
     )
 
     @classmethod
-    def check_joint(cls, config: RunConfig, settings: Cia402Settings, joint: Joint) -> None:
+    def validate_joint(cls, config: RunConfig, settings: Cia402Settings, joint: Joint) -> None:
         """Check that no joint has the node id of the host.
 
         Raises:
-            ConfigError: it has.
+            ConfigError: The joint has the node id of the host.
         """
         if joint.id == settings.host_id:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `id` = {joint.id} is the node id of the host, "
+                f"{make_joint_label(config, joint)}: `id` = {joint.id} is the node id of the host, "
                 f"`backends.cia402.host_id`: change one of the two",
                 code="drive/unsupported-setting",
             )

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from snakesim_can_backend.cia402.frames import NmtCommand
 from snakesim_can_backend.cia402.objects import (
-    ABORT_CONNECTION,
+    ABORT_CONNECTION_OPTION_CODE,
     COB_ID_MASK,
     CONSUMER_HEARTBEAT,
     CONTROLWORD,
@@ -24,7 +24,7 @@ from snakesim_can_backend.cia402.objects import (
     PDO_OFF,
     PDOS,
     PRODUCER_HEARTBEAT,
-    PRODUCT,
+    PRODUCT_CODE,
     QUICK_STOP_OPTION,
     RATED_CURRENT,
     RATED_TORQUE,
@@ -33,7 +33,7 @@ from snakesim_can_backend.cia402.objects import (
     STATUSWORD,
     SUPPORTED_MODES,
     UNUSED_PDOS,
-    VENDOR,
+    VENDOR_ID,
     Entry,
     Pdo,
     encode_mapping,
@@ -44,31 +44,31 @@ from snakesim_can_backend.cia402.state_machine import Control
 
 FAULT_ON_ABORT = 1  # 6007h
 TORQUE_OFF_ON_FAULT = 0  # 605Eh
-STAY_OPERATIONAL = 1  # 1029h: the drive still reports its state
-QUICK_STOPS = {"torque_off": 0, "ramp": 2}  # 605Ah
+NO_NMT_STATE_CHANGE = 1  # 1029h: the drive still reports its state
+QUICK_STOP_OPTION_CODES = {"torque_off": 0, "ramp": 2}  # 605Ah
 CYCLE_EXPONENTS = (-3, -4, -5, -6, -2, -1)  # of 10, in seconds
 MAX_CYCLE_VALUE = 255
 
-REQUIRED = (DEVICE_TYPE, VENDOR, STATUSWORD, SUPPORTED_MODES, MAX_TORQUE)
-OPTIONAL = (
-    *(PRODUCT, REVISION, SERIAL, ERROR_CODE, ABORT_CONNECTION, RATED_CURRENT, RATED_TORQUE, MAX_SPEED),
+REQUIRED_ENTRIES = (DEVICE_TYPE, VENDOR_ID, STATUSWORD, SUPPORTED_MODES, MAX_TORQUE)
+OPTIONAL_ENTRIES = (
+    *(PRODUCT_CODE, REVISION, SERIAL, ERROR_CODE, ABORT_CONNECTION_OPTION_CODE, RATED_CURRENT, RATED_TORQUE, MAX_SPEED),
     *(MIN_POSITION, MAX_POSITION, ENCODER_INCREMENTS, ENCODER_REVOLUTIONS),
 )
 
 
-def list_identification() -> list[Read]:
+def list_identification_steps() -> list[Read]:
     """Return the steps that read identity, limits and units of a drive, and change nothing."""
-    required = [Read(entry) for entry in REQUIRED]
-    optional = [Read(entry, optional=True) for entry in OPTIONAL]
+    required = [Read(entry) for entry in REQUIRED_ENTRIES]
+    optional = [Read(entry, optional=True) for entry in OPTIONAL_ENTRIES]
     return required + optional
 
 
-def list_switch_off() -> list[Step]:
+def list_switch_off_steps() -> list[Step]:
     """Return the steps that switch a drive off which has no PDOs yet."""
     return [Write(CONTROLWORD, Control.DISABLE_VOLTAGE)]
 
 
-def list_fault_reset() -> list[Step]:
+def list_fault_reset_steps() -> list[Step]:
     """Return the steps of a fault reset: it works when its bit changes from 0 to 1."""
     return [
         Write(CONTROLWORD, Control.DISABLE_VOLTAGE),
@@ -77,27 +77,29 @@ def list_fault_reset() -> list[Step]:
     ]
 
 
-def list_configuration(node: int, settings: Cia402Settings, period_s: float) -> list[Step]:
-    """Return the steps that make a drive ready for control cycles. Each value is read back.
+def list_configuration_steps(node: int, settings: Cia402Settings, period_s: float) -> list[Step]:
+    """Return the steps that make a drive ready for control cycles; required values are read back and compared.
+
+    The drive is pre-operational while it is configured, and operational after the last step.
 
     Args:
-        node: The drive.
-        settings: The settings of the driver type.
-        period_s: Time from one setpoint to the next.
+        node: Node id of the drive.
+        settings: Settings of the driver type.
+        period_s: Duration from one setpoint to the next.
     """
     steps: list[Step] = [Nmt(NmtCommand.ENTER_PRE_OPERATIONAL)]
     steps += _write_and_check(CONSUMER_HEARTBEAT, encode_consumer_heartbeat(settings))
     steps += _write_and_check(PRODUCER_HEARTBEAT, round(settings.heartbeat_s * 1000))
-    steps += _write_and_check(ERROR_BEHAVIOR, STAY_OPERATIONAL, optional=True)
-    steps += _write_and_check(ABORT_CONNECTION, FAULT_ON_ABORT, optional=settings.allow_unverified_watchdog)
+    steps += _write_and_check(ERROR_BEHAVIOR, NO_NMT_STATE_CHANGE, optional=True)
+    steps += _write_and_check(ABORT_CONNECTION_OPTION_CODE, FAULT_ON_ABORT, optional=settings.allow_unverified_watchdog)
     # Many drives have one reaction only, so a refusal is no failure.
     steps.append(Write(FAULT_REACTION, TORQUE_OFF_ON_FAULT, optional=True))
-    steps.append(Write(QUICK_STOP_OPTION, QUICK_STOPS[settings.quick_stop], optional=True))
-    value, exponent = encode_cycle(period_s)
+    steps.append(Write(QUICK_STOP_OPTION, QUICK_STOP_OPTION_CODES[settings.quick_stop], optional=True))
+    value, exponent = encode_cycle_period(period_s)
     steps.append(Write(CYCLE_VALUE, value, optional=True))
     steps.append(Write(CYCLE_INDEX, exponent, optional=True))
     for pdo in PDOS:
-        steps += _list_pdo(pdo, node)
+        steps += _list_pdo_steps(pdo, node)
     for pdo in UNUSED_PDOS:
         steps.append(Write(pdo.cob_id_entry(), PDO_OFF | pdo.base | node, optional=True))
     steps.append(Nmt(NmtCommand.START))
@@ -109,8 +111,8 @@ def encode_consumer_heartbeat(settings: Cia402Settings) -> int:
     return settings.host_id << 16 | round(settings.watchdog_s * 1000)
 
 
-def encode_cycle(period_s: float) -> tuple[int, int]:
-    """Return a period as 60C2h has it: a value of 8 bits, and an exponent of 10 in seconds.
+def encode_cycle_period(period_s: float) -> tuple[int, int]:
+    """Encode a period for object 60C2h as an 8-bit value and an exponent of 10, in seconds.
 
     The first exponent with which the period is exact to 0.1 % is taken, or else the most exact one.
     """
@@ -132,7 +134,7 @@ def _write_and_check(entry: Entry, value: int, *, optional: bool = False) -> Ite
     yield Read(entry, expected=value, optional=optional)
 
 
-def _list_pdo(pdo: Pdo, node: int) -> Iterator[Step]:
+def _list_pdo_steps(pdo: Pdo, node: int) -> Iterator[Step]:
     """Yield the steps that map a PDO: a drive allows it only while the PDO is off and its number of entries is 0."""
     cob_id = pdo.base | node
     yield Write(pdo.cob_id_entry(), PDO_OFF | cob_id)

@@ -10,10 +10,10 @@ from functools import partial
 
 from snakesim_can_backend.can_drives.drives import HOST, CanDrives, CanDrivesContext
 from snakesim_can_backend.cia402.configuration import (
-    list_configuration,
-    list_fault_reset,
-    list_identification,
-    list_switch_off,
+    list_configuration_steps,
+    list_fault_reset_steps,
+    list_identification_steps,
+    list_switch_off_steps,
 )
 from snakesim_can_backend.cia402.eds import BUNDLED, find_eds, read_all_eds
 from snakesim_can_backend.cia402.frames import (
@@ -22,7 +22,7 @@ from snakesim_can_backend.cia402.frames import (
     RECEIVE_PDOS,
     SYNC_ID,
     TRANSMIT_PDOS,
-    UPLOAD_ANSWER,
+    UPLOAD_RESPONSE,
     Emergency,
     Function,
     NmtCommand,
@@ -37,23 +37,23 @@ from snakesim_can_backend.cia402.frames import (
     encode_write,
     split_id,
 )
-from snakesim_can_backend.cia402.limits import MODES, find_objections, read_scaling
+from snakesim_can_backend.cia402.limits import MODES, determine_scaling, find_incompatibilities
 from snakesim_can_backend.cia402.objects import (
-    ABORT_CONNECTION,
+    ABORT_CONNECTION_OPTION_CODE,
     CONSUMER_HEARTBEAT,
     ERROR_CODE,
     MAX_TORQUE,
     MODE_PDO,
     MOTION_PDO,
     POSITION_PDO,
-    PRODUCT,
+    PRODUCT_CODE,
     REVISION,
     SERIAL,
     STATE_PDO,
     STATUSWORD,
     TORQUE_PDO,
     VELOCITY_PDO,
-    VENDOR,
+    VENDOR_ID,
     Pdo,
 )
 from snakesim_can_backend.cia402.sdo import Read, SdoQueue, StepResult
@@ -77,15 +77,18 @@ _log = logging.getLogger("snakesim.drivers")
 class Cia402Drives(CanDrives):
     """All CiA 402 drives of a bus."""
 
-    missing_identity_reason = (
+    missing_identity_text = (
         "does not answer SDO requests: it is off, has another node id or bit rate, or is no CANopen device"
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
-        """Read the EDS files that the settings name.
+        """Prepare to drive the drives on an open bus, and read the EDS files that the settings name.
+
+        Args:
+            context: The open bus, its joints, the settings, and the timeouts of the driver.
 
         Raises:
-            ConfigError: a file cannot be read, or describes a drive that this driver cannot drive.
+            ConfigError: An EDS file cannot be read, or describes a drive that this driver cannot drive.
         """
         super().__init__(context)
         self._settings = context.settings
@@ -97,25 +100,31 @@ class Cia402Drives(CanDrives):
         self._eds = read_all_eds(paths)
         self._health = make_health_objects(self._settings, uses_bundled_eds=uses_bundled_eds)
         self._watchdog_ns = round(self._settings.watchdog_s * 1e9)
-        self._sends_heartbeats = False  # from the first enabling on, because drives then watch the host
-        self._sync_accepted = False
+        self._should_send_heartbeats = False  # from the first enabling on, because drives then watch the host
+        self._was_sync_accepted = False
         self.servos = [self._make_servo(i) for i in range(len(context.joints))]
 
     # --- frames that arrive -----------------------------------------------------------------------------------
 
     def find_sender(self, frame: Frame) -> int | None:
-        """Return the sender. Requests of other programs that only read disturb nothing."""
-        function, node = split_id(frame)
-        if not node:
+        """Return the node id of the drive that sent a frame.
+
+        Returns:
+            The node id; `HOST` if only a host sends such a frame; None if any program may send it, such as an SDO
+            request that only reads.
+        """
+        function_code, node = split_id(frame)
+        if node == 0:  # a broadcast
             return HOST if frame.id in (Function.NMT, SYNC_ID) else None
-        if function in RECEIVE_PDOS:
+        if function_code in RECEIVE_PDOS:  # received by the drive (RPDO), so sent by a host
             return HOST
-        if function in TRANSMIT_PDOS:
+        if function_code in TRANSMIT_PDOS:  # transmitted by the drive (TPDO)
             return node
-        match function:
-            case Function.EMERGENCY | Function.SDO_ANSWER:
+        match function_code:
+            case Function.EMERGENCY | Function.SDO_RESPONSE:
                 return node
             case Function.SDO_REQUEST:
+                # The upper three bits are the command specifier. Every write starts with an initiate download.
                 is_write = bool(frame.data) and frame.data[0] >> 5 == DOWNLOAD_REQUEST
                 return HOST if is_write else None
             case Function.HEARTBEAT:
@@ -123,15 +132,15 @@ class Cia402Drives(CanDrives):
             case _:
                 return None
 
-    def handle_answer(self, i: int, frame: Frame) -> None:
-        """Store what a drive sends."""
+    def handle_response(self, i: int, frame: Frame) -> None:
+        """Store what a drive reports in a PDO, an SDO response, an emergency message or a heartbeat."""
         function, _ = split_id(frame)
         match function:
             case STATE_PDO.base:
                 self._handle_state(i, *STATE_PDO.layout.unpack(frame.data))
             case MOTION_PDO.base:
                 self._handle_motion(i, *MOTION_PDO.layout.unpack(frame.data))
-            case Function.SDO_ANSWER:
+            case Function.SDO_RESPONSE:
                 self._handle_sdo(i, decode_sdo(frame.data))
             case Function.EMERGENCY:
                 self._handle_emergency(i, decode_emergency(frame.data))
@@ -158,7 +167,7 @@ class Cia402Drives(CanDrives):
         self.states.drives[i].errors = servo.describe_errors()
 
     def _store_motion(self, i: int) -> None:
-        """Put angle and velocity into the readings once both PDOs that answer a SYNC have arrived."""
+        """Store angle and velocity in the readings once both PDOs that answer a SYNC have arrived."""
         servo = self.servos[i]
         if servo.position is None or servo.velocity is None or servo.scaling is None:
             return
@@ -172,26 +181,26 @@ class Cia402Drives(CanDrives):
         servo = self.servos[i]
         servo.state = state
         self.readings.mark_checked(i)
-        if state == PowerState.ENABLED and servo.is_stepping:
-            servo.is_stepping = False
-            servo.has_arrived = True
+        if state == PowerState.ENABLED and servo.is_enabling:
+            servo.is_enabling = False
+            servo.was_enabled = True
         if state not in FAULT_STATES:
             servo.emergency = None
-        self.states.note_report(i, enabled=state == PowerState.ENABLED, state=f"in the state {state.value!r}")
+        self.states.record_report(i, enabled=state == PowerState.ENABLED, state=f"in the state {state.value!r}")
         self.states.drives[i].errors = servo.describe_errors()
-        self._end_quick_stop(i)
+        self._disable_after_quick_stop(i)
 
-    def _end_quick_stop(self, i: int) -> None:
+    def _disable_after_quick_stop(self, i: int) -> None:
         """Switch a drive off that brakes for longer than a watchdog's time, or holds its position after a stop."""
         servo = self.servos[i]
         if servo.state != PowerState.QUICK_STOP:
-            servo.quick_stop_ns = None
+            servo.quick_stop_start_ns = None
             return
         now_ns = self._now_ns()
-        if servo.quick_stop_ns is None:
-            servo.quick_stop_ns = now_ns
-        elif now_ns - servo.quick_stop_ns > self._watchdog_ns:
-            self._send_off(i, Control.DISABLE_VOLTAGE)
+        if servo.quick_stop_start_ns is None:
+            servo.quick_stop_start_ns = now_ns
+        elif now_ns - servo.quick_stop_start_ns > self._watchdog_ns:
+            self._send_disable(i, Control.DISABLE_VOLTAGE)
 
     def _handle_emergency(self, i: int, emergency: Emergency) -> None:
         servo = self.servos[i]
@@ -206,7 +215,7 @@ class Cia402Drives(CanDrives):
     def _handle_heartbeat(self, i: int, nmt_state: int) -> None:
         """Configure a drive that has restarted, or that has left the NMT state operational. It stays off."""
         servo = self.servos[i]
-        servo.heartbeat_ns = self._now_ns()
+        servo.last_heartbeat_ns = self._now_ns()
         if nmt_state == NmtState.BOOT_UP:
             if servo.phase != "unknown":
                 self._configure(i)
@@ -238,23 +247,23 @@ class Cia402Drives(CanDrives):
             return
         servo = self.servos[i]
         self._enter_phase(servo, "ready")
-        servo.heartbeat_ns = self._now_ns()
+        servo.last_heartbeat_ns = self._now_ns()
         servo.pre_operational_heartbeats = 0
-        is_last_of_bring_up = all(other.phase == "ready" for other in self.servos) and not self.readings.is_known(i)
+        is_last_of_bring_up = all(other.phase == "ready" for other in self.servos) and not self.readings.has_reported(i)
         if is_last_of_bring_up:
             self._send_sync()  # so that bring-up need not wait for its next requests
 
-    def _handle_sdo(self, i: int, answer: SdoFrame) -> None:
-        is_serial = (answer.index, answer.sub) == (SERIAL.index, SERIAL.sub)
-        if is_serial and answer.kind == UPLOAD_ANSWER:
-            self._note_serial_number(i, SERIAL.decode(answer.data))
-        self.servos[i].queue.handle_answer(answer)
+    def _handle_sdo(self, i: int, response: SdoFrame) -> None:
+        is_serial = (response.index, response.sub) == (SERIAL.index, SERIAL.sub)
+        if is_serial and response.kind == UPLOAD_RESPONSE:
+            self._record_identity(i, SERIAL.decode(response.data))
+        self.servos[i].queue.handle_response(response)
 
-    def _note_serial_number(self, i: int, serial: int) -> None:
-        """Remember the identity of a drive. One that reports 0 has no serial number."""
+    def _record_identity(self, i: int, serial: int) -> None:
+        """Store vendor, product and serial number of a drive; a serial number of 0 means that the drive has none."""
         values = self.servos[i].values
-        if serial and VENDOR in values:
-            self.note_serial(i, f"{values[VENDOR]:08X}-{values.get(PRODUCT, 0):08X}-{serial:08X}")
+        if serial and VENDOR_ID in values:
+            self.record_serial(i, f"{values[VENDOR_ID]:08X}-{values.get(PRODUCT_CODE, 0):08X}-{serial:08X}")
 
     def _store_result(self, i: int, result: StepResult) -> None:
         servo = self.servos[i]
@@ -273,16 +282,16 @@ class Cia402Drives(CanDrives):
     def _store_identity(self, i: int, result: StepResult) -> None:
         servo = self.servos[i]
         servo.failure = servo.failure or result.failure
-        servo.unread.discard(result.step.entry)
+        servo.unread_entries.discard(result.step.entry)
         if result.value is not None:
             servo.values[result.step.entry] = result.value
-        if not servo.unread:
+        if not servo.unread_entries:
             revision = servo.values.get(REVISION, 0)
             self.firmware[i] = (revision >> 16, revision & 0xFFFF)
             self.readings.set_identity(i, firmware=f"{revision >> 16}.{revision & 0xFFFF}")
 
     def _store_health(self, i: int, result: StepResult) -> None:
-        """Store a value of a drive's health; with the last one the readings get all."""
+        """Store a value of a drive's health; after the last one, store all values in the readings."""
         servo = self.servos[i]
         entry = result.step.entry
         if result.value is not None:
@@ -300,45 +309,53 @@ class Cia402Drives(CanDrives):
     def request_identity(self, i: int) -> None:
         """Read identity, limits and units, one entry after the other."""
         servo = self.servos[i]
-        if not servo.unread and not self.firmware[i]:
-            steps = list_identification()
-            servo.unread = {step.entry for step in steps}
+        if not servo.unread_entries and not self.firmware[i]:
+            steps = list_identification_steps()
+            servo.unread_entries = {step.entry for step in steps}
             servo.queue.add(steps)
-        servo.queue.repeat_if_late()
+        servo.queue.repeat_late_request()
 
     def forget_identities(self) -> None:
         """Forget everything that drives have reported."""
         super().forget_identities()
         self.servos = [self._make_servo(i) for i in range(len(self.nodes))]
 
-    def find_mismatch(self, i: int) -> str:
-        """Return why a drive cannot be used: its EDS, identity, modes, units or limits; empty if it can."""
+    def validate_drive(self, i: int) -> str:
+        """Check EDS, identity, modes, units and limits of a drive, and store its scaling.
+
+        Args:
+            i: Index of the drive on the bus, whose identity, limits and units have been read.
+
+        Returns:
+            The reasons why the drive cannot be used, as one text; an empty string if it can be used.
+        """
         servo = self.servos[i]
         if servo.failure:
             return servo.failure
         joint = self._joints[i]
-        vendor = servo.values[VENDOR]
-        product = servo.values.get(PRODUCT, 0)
+        vendor = servo.values[VENDOR_ID]
+        product = servo.values.get(PRODUCT_CODE, 0)  # unlike the vendor, this entry is optional
         if self._eds and find_eds(self._eds, vendor, product) is None:
             files = ", ".join(f"0x{file.vendor:X} and 0x{file.product:X}" for file in self._eds)
             return (
                 f"has vendor 0x{vendor:X} and product 0x{product:X}, and `backends.cia402.eds` names files of {files}: "
                 f"add the EDS of this drive"
             )
-        scaling = read_scaling(servo.values, self._settings, joint)
+        scaling = determine_scaling(servo.values, self._settings, joint)
         if isinstance(scaling, str):
             return scaling
         servo.scaling = scaling
-        objections = list(find_objections(servo.values, scaling, self._settings, joint))
-        if ABORT_CONNECTION not in servo.values and not self._settings.allow_unverified_watchdog:
-            objections.append(
-                f"has no {ABORT_CONNECTION.name} ({ABORT_CONNECTION.address}), so it cannot be verified that it stops "
-                f"when the host is silent: test it, and set `backends.cia402.allow_unverified_watchdog`"
+        problems = list(find_incompatibilities(servo.values, scaling, self._settings, joint))
+        if ABORT_CONNECTION_OPTION_CODE not in servo.values and not self._settings.allow_unverified_watchdog:
+            problems.append(
+                f"has no {ABORT_CONNECTION_OPTION_CODE.name} ({ABORT_CONNECTION_OPTION_CODE.address}), so it cannot "
+                "be verified that it stops when the host is silent: test it, and set "
+                "`backends.cia402.allow_unverified_watchdog`"
             )
-        return "; ".join(objections)
+        return "; ".join(problems)
 
-    def find_start_problem(self, i: int) -> str:
-        """Return why a drive could not be configured; empty if it could, or is not yet."""
+    def find_start_up_problem(self, i: int) -> str:
+        """Return why a drive could not be configured; empty if it could, or if that is not known yet."""
         failure = self.servos[i].failure
         return f"cannot be configured: {failure}" if failure else ""
 
@@ -359,12 +376,12 @@ class Cia402Drives(CanDrives):
     def clear_errors(self, i: int) -> None:
         """Reset the fault of a drive. One that is silent keeps it: the reset might arrive much later."""
         servo = self.servos[i]
-        if servo.phase != "ready" or self.readings.unanswered_requests(i):
+        if servo.phase != "ready" or self.readings.count_unanswered_requests(i):
             return
         if servo.error_code in NEEDS_COMMUNICATION_RESET:
             self._restart_communication(i)
         elif servo.state in FAULT_STATES:
-            servo.queue.add(list_fault_reset())
+            servo.queue.add(list_fault_reset_steps())
 
     def restore_settings(self, i: int) -> None:
         """End the drive's watch of the host, which is about to be silent. Torque limits are restored by "idle"."""
@@ -375,7 +392,7 @@ class Cia402Drives(CanDrives):
         """Restart the communication of a drive; its boot-up message leads to its configuration and fault reset."""
         servo = self.servos[i]
         servo.queue.clear()
-        servo.resets_fault = True
+        servo.should_reset_fault = True
         self._enter_phase(servo, "booting")
         self._send_nmt(i, NmtCommand.RESET_COMMUNICATION)
 
@@ -383,16 +400,16 @@ class Cia402Drives(CanDrives):
         """Switch a drive off, and write all that it needs for control cycles."""
         servo = self.servos[i]
         servo.failure = ""
-        servo.is_stepping = False
+        servo.is_enabling = False
         self._enter_phase(servo, "configuring")
         servo.queue.clear()
-        servo.queue.add(list_fault_reset() if servo.resets_fault else list_switch_off())
-        servo.queue.add(list_configuration(self.nodes[i], self._settings, self._period_s))
-        servo.resets_fault = False
+        servo.queue.add(list_fault_reset_steps() if servo.should_reset_fault else list_switch_off_steps())
+        servo.queue.add(list_configuration_steps(self.nodes[i], self._settings, self._period_s))
+        servo.should_reset_fault = False
 
     def _enter_phase(self, servo: Servo, phase: Phase) -> None:
         servo.phase = phase
-        servo.phase_ns = self._now_ns()
+        servo.phase_start_ns = self._now_ns()
 
     # --- a control cycle --------------------------------------------------------------------------------------
 
@@ -405,14 +422,14 @@ class Cia402Drives(CanDrives):
         servo = self.servos[i]
         if i == 0:
             self._send_sync()
-        servo.queue.repeat_if_late()
-        if servo.phase == "booting" and self._now_ns() - servo.phase_ns > MAX_BOOT_NS:
+        servo.queue.repeat_late_request()
+        if servo.phase == "booting" and self._now_ns() - servo.phase_start_ns > MAX_BOOT_NS:
             self._configure(i)
-        return self._sync_accepted and not self._is_starting(servo)
+        return self._was_sync_accepted and not self._is_configuring(servo)
 
-    def awaits_answers(self) -> bool:
+    def is_awaiting_responses(self) -> bool:
         """Return whether a drive is being configured: it takes many answers."""
-        return any(self._is_starting(servo) and servo.queue.awaits_answer for servo in self.servos)
+        return any(self._is_configuring(servo) and servo.queue.is_awaiting_response for servo in self.servos)
 
     def request_health(self, i: int) -> None:
         """Read voltage, current and temperatures; and the serial number, to notice a second drive with this id."""
@@ -423,20 +440,30 @@ class Cia402Drives(CanDrives):
 
     def send_setpoints(self, command: BusCommand) -> None:
         """Send setpoints and commands, and with them the heartbeat that the drives watch."""
-        if command.following and command.may_enable:
-            self._sends_heartbeats = True
-        if self._sends_heartbeats:
+        if command.enabled_drives and command.may_enable:
+            self._should_send_heartbeats = True
+        if self._should_send_heartbeats:
             self.wire.send(encode_heartbeat(self._settings.host_id, NmtState.OPERATIONAL))
         super().send_setpoints(command)
 
     def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
-        """Send a setpoint and the command that leads the drive towards Operation enabled, while it may."""
+        """Send a setpoint, with the controlword that leads the drive one step towards Operation enabled.
+
+        Nothing is sent to a drive that is not configured. A drive that has left Operation enabled by itself gets the
+        command that keeps it off.
+
+        Args:
+            i: Index of the drive on the bus.
+            mode: Control mode of the setpoint.
+            target: Target at the shaft in rad, rad/s or N·m, by the mode; 0 for a passive drive.
+            limit_nm: Torque limit at the shaft.
+        """
         servo = self.servos[i]
         scaling = servo.scaling
         if servo.phase != "ready" or scaling is None:
             return
-        wanted_mode = MODES[mode]
-        control = servo.choose_control(wanted_mode)
+        target_mode = MODES[mode]
+        control = servo.choose_controlword(target_mode)
         max_torque = min(scaling.to_max_torque(limit_nm), servo.values[MAX_TORQUE])
         match mode:
             case Mode.POSITION:
@@ -445,50 +472,52 @@ class Cia402Drives(CanDrives):
                 self._send_pdo(i, VELOCITY_PDO, control, scaling.to_velocity(target), max_torque)
             case Mode.TORQUE | Mode.PASSIVE:
                 self._send_pdo(i, TORQUE_PDO, control, scaling.to_torque(target), max_torque)
-        if servo.mode != wanted_mode:
-            self._send_pdo(i, MODE_PDO, wanted_mode)
+        if servo.mode != target_mode:
+            self._send_pdo(i, MODE_PDO, target_mode)
 
     def send_command(self, i: int, command: DriveCommand) -> None:
-        """Let a drive step towards Operation enabled, switch it off, or stop it by its quick stop."""
+        """Start to enable a drive, switch it off, or stop it by its quick stop."""
         servo = self.servos[i]
         if command == "follow":  # the next setpoints carry the commands
-            servo.is_stepping = not servo.has_arrived
+            servo.is_enabling = not servo.was_enabled
             return
-        servo.is_stepping = False
-        servo.has_arrived = False
+        servo.is_enabling = False
+        servo.was_enabled = False
         match command:
             case "idle":
-                self._send_off(i, Control.DISABLE_VOLTAGE)
+                self._send_disable(i, Control.DISABLE_VOLTAGE)
             case "stop":
-                self._send_off(i, Control.QUICK_STOP)
+                self._send_disable(i, Control.QUICK_STOP)
 
     def findings(self) -> list[Finding]:
-        """Return also the drives that answer SYNC but send no heartbeats any more."""
+        """Return what is wrong, including drives that answer SYNC but have stopped to send heartbeats."""
         findings = super().findings()
-        limit_ns = MAX_MISSED_HEARTBEATS * self._settings.heartbeat_s * 1e9
+        timeout_ns = MAX_MISSED_HEARTBEATS * self._settings.heartbeat_s * 1e9
         for i, servo in enumerate(self.servos):
-            if servo.phase != "ready" or self.readings.unanswered_requests(i):
-                servo.heartbeat_ns = self._now_ns()  # it is silent anyhow: the time counts from its next answer on
-            age_ns = self._now_ns() - servo.heartbeat_ns
-            if age_ns > limit_ns:
+            if servo.phase != "ready" or self.readings.count_unanswered_requests(i):
+                servo.last_heartbeat_ns = (
+                    self._now_ns()
+                )  # a silent drive has a finding of its own; count from its next response on
+            age_ns = self._now_ns() - servo.last_heartbeat_ns
+            if age_ns > timeout_ns:
                 cause = (
                     f"{self.states.drives[i].label} answers SYNC, but has sent no heartbeat for {age_ns * 1e-6:.0f} ms"
                 )
-                findings.append(Finding("drive_silent", cause, i, alone=True))
+                findings.append(Finding("drive_silent", cause, i, affects_only_joint=True))
         return findings
 
-    def _is_starting(self, servo: Servo) -> bool:
-        """Return whether a drive boots or is configured, and has time left for it."""
+    def _is_configuring(self, servo: Servo) -> bool:
+        """Return whether a drive is booting or being configured, and its time limit for that is not exceeded."""
         is_due = servo.phase in ("booting", "configuring") and not servo.failure
-        return is_due and self._now_ns() - servo.phase_ns <= MAX_START_NS
+        return is_due and self._now_ns() - servo.phase_start_ns <= MAX_START_NS
 
     def _send_sync(self) -> None:
         for servo in self.servos:
             servo.position = None
             servo.velocity = None
-        self._sync_accepted = self.wire.send(Frame(SYNC_ID, b""))
+        self._was_sync_accepted = self.wire.send(Frame(SYNC_ID, b""))
 
-    def _send_off(self, i: int, control: Control) -> None:
+    def _send_disable(self, i: int, control: Control) -> None:
         """Send a command that ends motion, with no torque, and with the torque limit that the drive had before."""
         servo = self.servos[i]
         if servo.phase == "ready":

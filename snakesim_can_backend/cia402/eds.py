@@ -18,7 +18,7 @@ from snakesim_can_backend.cia402.objects import (
     PDOS,
     PRODUCER_HEARTBEAT,
     SUPPORTED_MODES,
-    VENDOR,
+    VENDOR_ID,
     Entry,
 )
 from snakesim_hal.base.errors import ConfigError
@@ -29,9 +29,9 @@ NODE_ID = "$NODEID"
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}  # bytes of the types of whole numbers, by their number
 WRITABLE = ("rw", "rww", "rwr", "wo")
 READABLE = ("ro", "rw", "rww", "rwr", "const")
-CONTAINERS = (0x8, 0x9)  # object types: array, record
-ADVICE = "take the EDS file that the vendor publishes with the drive's firmware"
-NEEDED = (DEVICE_TYPE, VENDOR, CONSUMER_HEARTBEAT, PRODUCER_HEARTBEAT, MODE, MAX_TORQUE, SUPPORTED_MODES)
+CONTAINER_OBJECT_TYPES = (0x8, 0x9)  # object types: array, record
+SUGGESTION = "take the EDS file that the vendor publishes with the drive's firmware"
+REQUIRED_ENTRIES = (DEVICE_TYPE, VENDOR_ID, CONSUMER_HEARTBEAT, PRODUCER_HEARTBEAT, MODE, MAX_TORQUE, SUPPORTED_MODES)
 
 
 @dataclass(frozen=True)
@@ -68,22 +68,22 @@ class Eds:
     objects: Mapping[tuple[int, int], EdsObject]  # by index and subindex
 
     def find(self, entry: Entry) -> EdsObject | None:
-        """Return the description of an entry; None: the drive does not have it."""
+        """Return the description of an entry; None if the drive does not have it."""
         return self.objects.get((entry.index, entry.sub))
 
-    def find_objections(self) -> Iterator[str]:
+    def find_missing_objects(self) -> Iterator[str]:
         """Yield what the driver needs and a drive of this type does not have."""
-        for entry in NEEDED:
+        for entry in REQUIRED_ENTRIES:
             if self.find(entry) is None:
                 yield f"has no {entry.name} ({entry.address})"
         for pdo in PDOS:
-            for needed in (pdo.cob_id_entry(), pdo.mapping_entry(0)):
-                if self.find(needed) is None:
-                    yield f"has no {needed.name} ({needed.address})"
+            for required_entry in (pdo.cob_id_entry(), pdo.mapping_entry(0)):
+                if self.find(required_entry) is None:
+                    yield f"has no {required_entry.name} ({required_entry.address})"
             for entry in pdo.entries:
-                yield from self._find_mapping_objections(entry)
+                yield from self._find_mapping_problems(entry)
 
-    def _find_mapping_objections(self, entry: Entry) -> Iterator[str]:
+    def _find_mapping_problems(self, entry: Entry) -> Iterator[str]:
         found = self.find(entry)
         if found is None:
             yield f"has no {entry.name} ({entry.address})"
@@ -94,13 +94,17 @@ class Eds:
 
 
 def read_all_eds(paths: Sequence[str]) -> list[Eds]:
-    """Read the EDS files that the scenario names, and check them. Raises ConfigError."""
+    """Read the EDS files that the scenario names, and check that they have all objects that the driver needs.
+
+    Raises:
+        ConfigError: A file cannot be read, or an object is missing in it.
+    """
     files = [read_eds(path) for path in paths]
     for file in files:
-        objections = list(dict.fromkeys(file.find_objections()))
-        if objections:
+        problems = list(dict.fromkeys(file.find_missing_objects()))
+        if problems:
             raise ConfigError(
-                f"`backends.cia402.eds`: {file.path}: a drive of this type {'; '.join(objections)}: this driver cannot "
+                f"`backends.cia402.eds`: {file.path}: a drive of this type {'; '.join(problems)}: this driver cannot "
                 f"drive it",
                 code="drive/unsupported-setting",
             )
@@ -108,25 +112,32 @@ def read_all_eds(paths: Sequence[str]) -> list[Eds]:
 
 
 def read_eds(path: str | Path) -> Eds:
-    """Read one EDS file, without checking what the drive has. Raises ConfigError."""
-    where = "`backends.cia402.eds`"
+    """Read one EDS file, without checking which objects the drive has.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        ConfigError: The file cannot be read, is malformed, or describes no object.
+    """
+    context = "`backends.cia402.eds`"
     try:
         text = read_text(Path(path))
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}; {ADVICE}", code="file/not-readable") from None
+        raise ConfigError(f"{context}: {error}; {SUGGESTION}", code="file/not-readable") from None
     parser = RawConfigParser(strict=False, comment_prefixes=(";", "#"), inline_comment_prefixes=None)
     try:
         parser.read_string(text)
     except ParserError as error:
         reason = str(error).splitlines()[0]
-        raise ConfigError(f"{where}: {path}: {reason}; {ADVICE}", code="file/not-readable") from None
+        raise ConfigError(f"{context}: {path}: {reason}; {SUGGESTION}", code="file/not-readable") from None
     objects: dict[tuple[int, int], EdsObject] = {}
     for section in parser.sections():
         address = _parse_address(section)
         if address is not None:
-            objects |= _read_object(str(path), parser[section], *address)
+            objects |= _read_object_entries(str(path), parser[section], *address)
     if not objects:
-        raise ConfigError(f"{where}: {path}: describes no object; {ADVICE}", code="file/not-readable")
+        raise ConfigError(f"{context}: {path}: describes no object; {SUGGESTION}", code="file/not-readable")
     vendor = 0
     product = 0
     if parser.has_section("DeviceInfo"):
@@ -145,7 +156,7 @@ def find_eds(files: Sequence[Eds], vendor: int, product: int) -> Eds | None:
 
 
 def _parse_address(section: str) -> tuple[int, int] | None:
-    """Return index and subindex of a section such as 607D or 607Dsub1; None: it describes no entry."""
+    """Return index and subindex of a section such as 607D or 607Dsub1; None if the section describes no entry."""
     index_text, _, sub_text = section.lower().partition("sub")
     try:
         if len(index_text) != 4:
@@ -155,11 +166,22 @@ def _parse_address(section: str) -> tuple[int, int] | None:
         return None
 
 
-def _read_object(path: str, section: SectionProxy, index: int, sub: int) -> dict[tuple[int, int], EdsObject]:
-    """Return the entries of a section: one, or several of a compact array; an array itself is none."""
+def _read_object_entries(path: str, section: SectionProxy, index: int, sub: int) -> dict[tuple[int, int], EdsObject]:
+    """Return the object dictionary entries that a section of an EDS file describes.
+
+    Args:
+        path: Path of the file, used in error messages.
+        section: Section of one object or subindex.
+        index: Index of the object.
+        sub: Subindex of the entry.
+
+    Returns:
+        The entries by index and subindex: one, or all of a compact array. Empty for an array or a record, whose
+        entries have sections of their own.
+    """
     object_type = _read_number(path, section, "ObjectType", 0x7)
     compact_count = _read_number(path, section, "CompactSubObj", 0)
-    if object_type in CONTAINERS and not compact_count:
+    if object_type in CONTAINER_OBJECT_TYPES and not compact_count:
         return {}
     number = _read_number(path, section, "DataType", 0)
     entry = EdsObject(
@@ -184,6 +206,6 @@ def _read_number(path: str, section: SectionProxy, key: str, default: int) -> in
         return int(text, 0)
     except ValueError:
         raise ConfigError(
-            f"`backends.cia402.eds`: {path}: [{section.name}] {key} = {text!r} is no whole number; {ADVICE}",
+            f"`backends.cia402.eds`: {path}: [{section.name}] {key} = {text!r} is no whole number; {SUGGESTION}",
             code="file/not-readable",
         ) from None

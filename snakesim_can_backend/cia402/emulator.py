@@ -13,7 +13,7 @@ from snakesim_can_backend.cia402.frames import (
     HEARTBEAT_LOST,
     RECEIVE_PDOS,
     SYNC_ID,
-    UPLOAD_ANSWER,
+    UPLOAD_RESPONSE,
     Emergency,
     Function,
     NmtCommand,
@@ -21,13 +21,13 @@ from snakesim_can_backend.cia402.frames import (
     decode_sdo,
     encode_emergency,
     encode_heartbeat,
-    encode_read_answer,
+    encode_read_response,
     split_id,
 )
-from snakesim_can_backend.cia402.limits import REVOLUTION_RAD, THOUSANDTHS, Scaling, shaft_range_rad
+from snakesim_can_backend.cia402.limits import REVOLUTION_RAD, THOUSANDTHS, Scaling, compute_shaft_range_rad
 from snakesim_can_backend.cia402.node import Address, Node
 from snakesim_can_backend.cia402.objects import (
-    ABORT_CONNECTION,
+    ABORT_CONNECTION_OPTION_CODE,
     CONSUMER_HEARTBEAT,
     CONTROLWORD,
     CURRENT,
@@ -44,7 +44,7 @@ from snakesim_can_backend.cia402.objects import (
     MODE_DISPLAY,
     POSITION,
     PRODUCER_HEARTBEAT,
-    PRODUCT,
+    PRODUCT_CODE,
     QUICK_STOP_OPTION,
     RATED_CURRENT,
     RATED_TORQUE,
@@ -56,7 +56,7 @@ from snakesim_can_backend.cia402.objects import (
     TARGET_VELOCITY,
     TORQUE,
     VELOCITY,
-    VENDOR,
+    VENDOR_ID,
     VOLTAGE,
     Entry,
 )
@@ -66,7 +66,7 @@ from snakesim_can_backend.cia402.state_machine import (
     FAULT_STATES,
     OperationMode,
     PowerState,
-    apply_control,
+    apply_controlword,
     encode_statusword,
 )
 from snakesim_can_backend.protocol.definitions import Frame
@@ -83,7 +83,7 @@ DUPLICATE_SERIAL_BITS = 0x0100_0000  # in which the serial number of a second dr
 OVER_TEMPERATURE = Emergency(0x4210, 0x09)  # generic and temperature
 NO_HEARTBEAT = Emergency(HEARTBEAT_LOST, 0x11)  # generic and communication
 STAYS_IN_QUICK_STOP = 5  # from this option code on
-AT_REST_RAD_S = 0.05  # shaft speed at which a quick stop ends
+AT_REST_SPEED_RAD_S = 0.05  # shaft speed at which a quick stop ends
 TORQUE_OFF = 0  # quick stop option code
 DRIVE_MODES: dict[int, Mode] = {
     OperationMode.CYCLIC_POSITION: Mode.POSITION,
@@ -103,9 +103,9 @@ class EmulatedDrive:
     controlword: int = 0
     error: Emergency | None = None  # that led to the fault
     is_booting: bool = True
-    heartbeat_us: float = -math.inf  # when it sent one last
-    host_heartbeat_us: float | None = None  # when it received one last; None: none since the start
-    saved: dict[Entry, int] = field(default_factory=dict[Entry, int])  # in its nonvolatile memory
+    last_heartbeat_us: float = -math.inf  # when it sent one last
+    last_host_heartbeat_us: float | None = None  # when it received one last; None: none since the start
+    saved_values: dict[Entry, int] = field(default_factory=dict[Entry, int])  # in its nonvolatile memory
 
 
 class EmulatedCia402(CanEmulator):
@@ -114,7 +114,7 @@ class EmulatedCia402(CanEmulator):
     broadcast_id = BROADCAST
 
     def __init__(self, context: CanEmulatorContext) -> None:
-        """Start all drives."""
+        """Create one emulated drive for each joint, with the objects of the first EDS file of the settings."""
         super().__init__(context)
         self._settings: Cia402Settings = context.settings
         paths = self._settings.eds or [str(BUNDLED)]
@@ -123,7 +123,7 @@ class EmulatedCia402(CanEmulator):
         self.drives = [self._make_drive(i) for i in range(len(context.joints))]
         self.on_step(0.0)
 
-    def find_addressee(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: Frame) -> int:
         """Return the node that a frame is for; all nodes receive NMT commands to all, SYNC and heartbeats."""
         function, node = split_id(frame)
         if frame.id == Function.NMT:
@@ -135,13 +135,13 @@ class EmulatedCia402(CanEmulator):
     def duplicate_frame(self, frame: Frame) -> Frame:
         """Return the frame of a second drive: it has another serial number."""
         function, _ = split_id(frame)
-        if function != Function.SDO_ANSWER:
+        if function != Function.SDO_RESPONSE:
             return frame
-        answer = decode_sdo(frame.data)
-        if answer.kind != UPLOAD_ANSWER or (answer.index, answer.sub) != (SERIAL.index, SERIAL.sub):
+        response = decode_sdo(frame.data)
+        if response.kind != UPLOAD_RESPONSE or (response.index, response.sub) != (SERIAL.index, SERIAL.sub):
             return frame
-        serial = SERIAL.decode(answer.data) ^ DUPLICATE_SERIAL_BITS
-        return Frame(frame.id, encode_read_answer(answer.index, answer.sub, SERIAL.encode(serial)))
+        serial = SERIAL.decode(response.data) ^ DUPLICATE_SERIAL_BITS
+        return Frame(frame.id, encode_read_response(response.index, response.sub, SERIAL.encode(serial)))
 
     def restart(self, i: int) -> None:
         """Restart a drive: it loses all settings that it has not saved, and sends its boot-up message later."""
@@ -151,22 +151,29 @@ class EmulatedCia402(CanEmulator):
         self._drive_motor(i)
 
     def handle_frame(self, i: int, frame: Frame) -> None:
-        """Obey an NMT command, answer SYNC or a request, apply a PDO, or note the heartbeat of the host."""
+        """Handle a frame that a drive receives: SYNC, NMT command, SDO request, heartbeat of the host, or PDO.
+
+        A drive that is booting ignores all frames.
+
+        Args:
+            i: Index of the drive.
+            frame: Frame for this drive, or for all nodes.
+        """
         drive = self.drives[i]
         function, node = split_id(frame)
         if drive.is_booting:
             return
         if frame.id == SYNC_ID:
-            for cob_id, data in drive.objects.list_synchronous():
+            for cob_id, data in drive.objects.list_synchronous_pdos():
                 self.send_frame(i, Frame(cob_id & ~0x7F | drive.node, data))
         elif frame.id == Function.NMT:
-            self._obey_nmt(i, frame.data[0])
+            self._execute_nmt_command(i, frame.data[0])
         elif function == Function.SDO_REQUEST:
-            answer = drive.objects.answer_sdo(decode_sdo(frame.data))
-            self.send_frame(i, Frame(Function.SDO_ANSWER | drive.node, answer))
+            response = drive.objects.handle_sdo_request(decode_sdo(frame.data))
+            self.send_frame(i, Frame(Function.SDO_RESPONSE | drive.node, response))
         elif function == Function.HEARTBEAT:
-            if node == self._consumer(drive)[0]:
-                drive.host_heartbeat_us = self.body.now_us
+            if node == self._get_consumer_heartbeat(drive)[0]:
+                drive.last_host_heartbeat_us = self.body.now_us
         elif function in RECEIVE_PDOS:
             self._receive_pdo(i, frame)
 
@@ -177,46 +184,51 @@ class EmulatedCia402(CanEmulator):
                 continue
             if drive.is_booting:
                 drive.is_booting = False
-                drive.heartbeat_us = now_us
+                drive.last_heartbeat_us = now_us
                 self.send_frame(i, encode_heartbeat(drive.node, NmtState.BOOT_UP))
-            self._watch_host(i, now_us)
+            self._check_host_heartbeat(i, now_us)
             if self.body.is_too_hot(i) and drive.state not in FAULT_STATES:
                 self._fail(i, OVER_TEMPERATURE)
             self._end_quick_stop(i)
-            period_us = drive.objects.get(_address(PRODUCER_HEARTBEAT)) * 1000
-            if period_us and now_us - drive.heartbeat_us >= period_us:
-                drive.heartbeat_us = now_us
+            period_us = drive.objects.get(_get_address(PRODUCER_HEARTBEAT)) * 1000
+            if period_us and now_us - drive.last_heartbeat_us >= period_us:
+                drive.last_heartbeat_us = now_us
                 self.send_frame(i, encode_heartbeat(drive.node, drive.objects.nmt_state))
 
     # --- what happens to a drive ------------------------------------------------------------------------------
 
     def _make_drive(self, i: int) -> EmulatedDrive:
+        """Create a drive as it is after power-on: its object dictionary has the defaults of the EDS and saved values.
+
+        Args:
+            i: Index of the drive.
+        """
         joint = self._joints[i]
         node = Node(
             eds=self._eds,
             node=self.body.joints[i].id,
-            on_write=lambda address, value: self._apply_write(i, address, value),
-            read_live=lambda address: self._read_live(i, address),
+            on_write=lambda address, value: self._handle_write(i, address, value),
+            compute_live_value=lambda address: self._compute_live_value(i, address),
         )
         mounted = self._settings.mounted.get(joint.name, MountedCia402())
-        rated_mnm = max(math.ceil(joint.limits.torque_nm / joint.drive.gear * 1000), 1)
+        rated_torque_mnm = max(math.ceil(joint.limits.torque_nm / joint.drive.gear * 1000), 1)
         if self._settings.rated_torque_nm is not None:
-            rated_mnm = max(round(self._settings.rated_torque_nm * 1000), 1)
+            rated_torque_mnm = max(round(self._settings.rated_torque_nm * 1000), 1)
         counts = round(self._settings.counts_per_turn or COUNTS_PER_TURN)
-        scaling = Scaling(counts, self._settings.velocity_units_per_turn_s or counts, rated_mnm / 1000)
-        saved = make_saved_values(joint, mounted, scaling, self._settings.max_speed_units_per_turn_s)
-        saved |= {
-            VENDOR: self._eds.vendor,
-            PRODUCT: self._eds.product,
+        scaling = Scaling(counts, self._settings.velocity_units_per_turn_s or counts, rated_torque_mnm / 1000)
+        saved_values = make_saved_values(joint, mounted, scaling, self._settings.max_speed_units_per_turn_s)
+        saved_values |= {
+            VENDOR_ID: self._eds.vendor,
+            PRODUCT_CODE: self._eds.product,
             REVISION: EMULATED_REVISION,
             SERIAL: FIRST_SERIAL + i,
         }
-        for entry, value in saved.items():
-            if _address(entry) in node.values:
-                node.values[_address(entry)] = int.from_bytes(entry.encode(value), "little")
-        return EmulatedDrive(node.node, node, scaling, saved=saved)
+        for entry, value in saved_values.items():
+            if _get_address(entry) in node.values:
+                node.values[_get_address(entry)] = int.from_bytes(entry.encode(value), "little")
+        return EmulatedDrive(node.node, node, scaling, saved_values=saved_values)
 
-    def _obey_nmt(self, i: int, command: int) -> None:
+    def _execute_nmt_command(self, i: int, command: int) -> None:
         drive = self.drives[i]
         if not drive.objects.apply_nmt(command):
             return
@@ -224,50 +236,50 @@ class EmulatedCia402(CanEmulator):
             self.restart(i)
             return
         drive.objects.reset_communication()
-        for entry in (VENDOR, PRODUCT, REVISION, SERIAL):
-            drive.objects.values[_address(entry)] = drive.saved[entry]
+        for entry in (VENDOR_ID, PRODUCT_CODE, REVISION, SERIAL):
+            drive.objects.values[_get_address(entry)] = drive.saved_values[entry]
         drive.objects.nmt_state = NmtState.PRE_OPERATIONAL
-        drive.host_heartbeat_us = None
+        drive.last_host_heartbeat_us = None
         self.send_frame(i, encode_heartbeat(drive.node, NmtState.BOOT_UP))
 
     def _receive_pdo(self, i: int, frame: Frame) -> None:
         drive = self.drives[i]
-        for address, value in drive.objects.find_received(frame.id, frame.data) or []:
+        for address, value in drive.objects.unpack_received_pdo(frame.id, frame.data) or []:
             drive.objects.values[address] = value
-            self._apply_write(i, address, value)
+            self._handle_write(i, address, value)
         self._drive_motor(i)
 
-    def _apply_write(self, i: int, address: Address, value: int) -> None:
-        """Let a value that a host has written take effect."""
+    def _handle_write(self, i: int, address: Address, value: int) -> None:
+        """Apply the effect of a value that a host has written, such as a controlword."""
         drive = self.drives[i]
-        if address == _address(CONTROLWORD):
+        if address == _get_address(CONTROLWORD):
             was_fault = drive.state == PowerState.FAULT
-            drive.state = apply_control(drive.state, value, drive.controlword)
+            drive.state = apply_controlword(drive.state, value, drive.controlword)
             drive.controlword = value
             if was_fault and drive.state != PowerState.FAULT:
                 drive.error = None
                 self.send_frame(i, encode_emergency(drive.node, Emergency(0, 0)))
-        elif address == _address(CONSUMER_HEARTBEAT):
-            drive.host_heartbeat_us = None  # the watch begins with the next heartbeat
+        elif address == _get_address(CONSUMER_HEARTBEAT):
+            drive.last_host_heartbeat_us = None  # the watch begins with the next heartbeat
         self._end_quick_stop(i)
         self._drive_motor(i)
 
-    def _watch_host(self, i: int, now_us: float) -> None:
+    def _check_host_heartbeat(self, i: int, now_us: float) -> None:
         drive = self.drives[i]
-        _, limit_ms = self._consumer(drive)
-        if not limit_ms or drive.host_heartbeat_us is None:
+        _, timeout_ms = self._get_consumer_heartbeat(drive)
+        if not timeout_ms or drive.last_host_heartbeat_us is None:
             return
-        if now_us - drive.host_heartbeat_us <= limit_ms * 1000:
+        if now_us - drive.last_host_heartbeat_us <= timeout_ms * 1000:
             return
-        drive.host_heartbeat_us = None
-        if not drive.objects.get(_address(ERROR_BEHAVIOR)):
+        drive.last_host_heartbeat_us = None
+        if not drive.objects.get(_get_address(ERROR_BEHAVIOR)):
             drive.objects.nmt_state = NmtState.PRE_OPERATIONAL
-        if drive.objects.get(_address(ABORT_CONNECTION)) and drive.state not in FAULT_STATES:
+        if drive.objects.get(_get_address(ABORT_CONNECTION_OPTION_CODE)) and drive.state not in FAULT_STATES:
             self._fail(i, NO_HEARTBEAT)
 
-    def _consumer(self, drive: EmulatedDrive) -> tuple[int, int]:
-        """Return the node whose heartbeats a drive watches, and the time in ms; 0: it does not watch."""
-        value = drive.objects.get(_address(CONSUMER_HEARTBEAT))
+    def _get_consumer_heartbeat(self, drive: EmulatedDrive) -> tuple[int, int]:
+        """Return the node whose heartbeats a drive monitors, and the timeout in ms; 0 if it does not monitor them."""
+        value = drive.objects.get(_get_address(CONSUMER_HEARTBEAT))
         return value >> 16 & 0x7F, value & 0xFFFF
 
     def _fail(self, i: int, error: Emergency) -> None:
@@ -282,22 +294,30 @@ class EmulatedCia402(CanEmulator):
         drive = self.drives[i]
         if drive.state != PowerState.QUICK_STOP:
             return
-        option = drive.objects.get(_address(QUICK_STOP_OPTION))
-        is_at_rest = abs(self.body.read_shaft(i).velocity_rad_s) < AT_REST_RAD_S
+        option = drive.objects.get(_get_address(QUICK_STOP_OPTION))
+        is_at_rest = abs(self.body.read_shaft(i).velocity_rad_s) < AT_REST_SPEED_RAD_S
         if option == TORQUE_OFF or (option < STAYS_IN_QUICK_STOP and is_at_rest):
             drive.state = PowerState.SWITCH_ON_DISABLED
             self._drive_motor(i)
 
     # --- what a drive measures and does -----------------------------------------------------------------------
 
-    def _read_live(self, i: int, address: Address) -> int | None:
-        """Return a value that changes by itself; None for all others."""
+    def _compute_live_value(self, i: int, address: Address) -> int | None:
+        """Return the current value of an object that changes by itself, such as a measurement.
+
+        Args:
+            i: Index of the drive.
+            address: Index and subindex of the object.
+
+        Returns:
+            The value in the units of the drive; None if the object does not change by itself.
+        """
         drive = self.drives[i]
         match address:
             case (STATUSWORD.index, 0):
                 return encode_statusword(drive.state)
             case (MODE_DISPLAY.index, 0):
-                return drive.objects.values.get(_address(MODE), 0)
+                return drive.objects.values.get(_get_address(MODE), 0)
             case (ERROR_CODE.index, 0):
                 return 0 if drive.error is None else drive.error.code
             case (ERROR_REGISTER.index, 0):
@@ -318,7 +338,13 @@ class EmulatedCia402(CanEmulator):
                 return None
 
     def _drive_motor(self, i: int) -> None:
-        """Apply the mode and the target of a drive to its motor."""
+        """Apply state, mode and target of a drive to its motor.
+
+        The motor is passive unless operation is enabled, or a quick stop brakes it to a velocity of 0.
+
+        Args:
+            i: Index of the drive.
+        """
         drive = self.drives[i]
         joint = self._joints[i]
         gear = joint.drive.gear
@@ -336,12 +362,12 @@ class EmulatedCia402(CanEmulator):
         damping = joint.motor.damping_nm_s_per_rad
         if mode == Mode.VELOCITY:
             damping = joint.motor.velocity_gain_nm_s_per_rad
-        max_speed = drive.objects.get(_address(MAX_SPEED))
+        max_speed = drive.objects.get(_get_address(MAX_SPEED))
         self.body.drive_motor(
             i,
             mode,
             target,
-            limit_nm=scaling.to_torque_nm(drive.objects.get(_address(MAX_TORQUE))),
+            limit_nm=scaling.to_torque_nm(drive.objects.get(_get_address(MAX_TORQUE))),
             stiffness=joint.motor.stiffness_nm_per_rad / gear**2,
             damping=damping / gear**2,
             speed_rad_s=max_speed / self._settings.max_speed_units_per_turn_s * REVOLUTION_RAD,
@@ -368,19 +394,19 @@ class EmulatedCia402(CanEmulator):
 def make_saved_values(
     joint: Joint, mounted: MountedCia402, scaling: Scaling, max_speed_units_per_turn_s: float
 ) -> dict[Entry, int]:
-    """Return what a drive is configured with: what its joint in the robot file needs, unless `mounted` differs.
+    """Return the values in the nonvolatile memory of a drive: what its joint needs, unless `mounted` overrides it.
 
     Args:
-        joint: The joint, as the robot file describes it.
-        mounted: How the drive is really configured.
-        scaling: The units of the drive.
-        max_speed_units_per_turn_s: Units of its speed limit for one turn/s.
+        joint: Joint as the robot file describes it.
+        mounted: Overrides for an emulated drive that is configured otherwise.
+        scaling: Units of the drive.
+        max_speed_units_per_turn_s: Units of the drive's speed limit for one turn/s.
     """
     gear = joint.drive.gear
-    rated_a = scaling.rated_torque_nm / (joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A)
+    rated_current_a = scaling.rated_torque_nm / (joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A)
     max_torque_nm = mounted.max_torque_nm or joint.limits.torque_nm / gear
     max_speed_rad_s = mounted.max_speed_rad_s or joint.limits.speed_rad_s * gear
-    lower_rad, upper_rad = shaft_range_rad(joint)
+    lower_rad, upper_rad = compute_shaft_range_rad(joint)
     margin_rad = POSITION_MARGIN * (upper_rad - lower_rad)
     min_position = mounted.min_position
     if min_position is None:
@@ -392,7 +418,7 @@ def make_saved_values(
         ENCODER_INCREMENTS: round(scaling.counts_per_turn),
         ENCODER_REVOLUTIONS: 1,
         RATED_TORQUE: round(scaling.rated_torque_nm * 1000),
-        RATED_CURRENT: round(rated_a * 1000),
+        RATED_CURRENT: round(rated_current_a * 1000),
         MAX_TORQUE: math.ceil(max_torque_nm / scaling.rated_torque_nm * THOUSANDTHS - 1e-6),
         MAX_SPEED: math.ceil(max_speed_rad_s / REVOLUTION_RAD * max_speed_units_per_turn_s - 1e-6),
         MIN_POSITION: min_position,
@@ -400,9 +426,9 @@ def make_saved_values(
     }
 
 
-def _address(entry: Entry) -> Address:
+def _get_address(entry: Entry) -> Address:
     return entry.index, entry.sub
 
 
 def _read_signed(drive: EmulatedDrive, entry: Entry) -> int:
-    return entry.decode(drive.objects.get(_address(entry)).to_bytes(entry.size, "little"))
+    return entry.decode(drive.objects.get(_get_address(entry)).to_bytes(entry.size, "little"))

@@ -32,7 +32,7 @@ class Function(IntEnum):
     RECEIVE_PDO_3 = 0x400
     TRANSMIT_PDO_4 = 0x480
     RECEIVE_PDO_4 = 0x500
-    SDO_ANSWER = 0x580
+    SDO_RESPONSE = 0x580
     SDO_REQUEST = 0x600
     HEARTBEAT = 0x700
 
@@ -63,11 +63,11 @@ class NmtState(IntEnum):
 # SDO: kinds of frames, the upper three bits of the first byte.
 DOWNLOAD_REQUEST = 1  # write
 UPLOAD_REQUEST = 2  # read
-UPLOAD_ANSWER = 2
-DOWNLOAD_ANSWER = 3
+UPLOAD_RESPONSE = 2
+DOWNLOAD_RESPONSE = 3
 ABORT = 4
 EXPEDITED_WITH_SIZE = 0x03  # flags of a transfer in one frame
-SDO_HEAD = Struct("<BHB")  # kind and flags, index, subindex
+SDO_HEADER = Struct("<BHB")  # kind and flags, index, subindex
 ABORT_CODE = Struct("<I")
 EMERGENCY_LAYOUT = Struct("<HB5s")  # error code, error register, vendor's data
 
@@ -89,7 +89,7 @@ ABORTS = {
     0x0800_0021: "local control does not allow it",
     0x0800_0022: "the state of the device does not allow it",
 }
-MISSING = (0x0602_0000, 0x0609_0011)  # codes of objects that a device does not have
+MISSING_OBJECT_ABORT_CODES = (0x0602_0000, 0x0609_0011)  # codes of objects that a device does not have
 ERROR_CLASSES = (  # by the high byte of an error code; the first one that fits
     (0xFF, 0x81, "communication"),
     (0xFF, 0x82, "protocol"),
@@ -166,7 +166,7 @@ def decode_emergency(data: bytes) -> Emergency:
 
 def encode_read(entry: Entry) -> bytes:
     """Return the request to read an entry."""
-    return SDO_HEAD.pack(UPLOAD_REQUEST << 5, entry.index, entry.sub).ljust(8, b"\0")
+    return SDO_HEADER.pack(UPLOAD_REQUEST << 5, entry.index, entry.sub).ljust(8, b"\0")
 
 
 def encode_write(entry: Entry, value: int) -> bytes:
@@ -174,40 +174,41 @@ def encode_write(entry: Entry, value: int) -> bytes:
     return _encode_expedited(DOWNLOAD_REQUEST, entry.index, entry.sub, entry.encode(value))
 
 
-def encode_read_answer(index: int, sub: int, data: bytes) -> bytes:
+def encode_read_response(index: int, sub: int, data: bytes) -> bytes:
     """Return the answer with a value of one to four bytes."""
-    return _encode_expedited(UPLOAD_ANSWER, index, sub, data)
+    return _encode_expedited(UPLOAD_RESPONSE, index, sub, data)
 
 
-def encode_write_answer(index: int, sub: int) -> bytes:
+def encode_write_response(index: int, sub: int) -> bytes:
     """Return the answer that confirms a write."""
-    return SDO_HEAD.pack(DOWNLOAD_ANSWER << 5, index, sub).ljust(8, b"\0")
+    return SDO_HEADER.pack(DOWNLOAD_RESPONSE << 5, index, sub).ljust(8, b"\0")
 
 
 def encode_abort(index: int, sub: int, code: int) -> bytes:
     """Return the answer that refuses a transfer."""
-    return SDO_HEAD.pack(ABORT << 5, index, sub) + ABORT_CODE.pack(code)
+    return SDO_HEADER.pack(ABORT << 5, index, sub) + ABORT_CODE.pack(code)
 
 
 def decode_sdo(data: bytes) -> SdoFrame:
-    """Return a request or an answer.
+    """Decode the data of an SDO request or response.
 
     Raises:
-        ValueError, struct.error: it is malformed, or part of a transfer of more than four bytes.
+        ValueError, struct.error: The frame is malformed, or starts a transfer of more than four bytes with its size
+            unknown.
     """
     if len(data) != 8:
         raise ValueError(f"an SDO frame of {len(data)} bytes")
-    head, index, sub = SDO_HEAD.unpack_from(data)
-    kind = head >> 5
+    header, index, sub = SDO_HEADER.unpack_from(data)
+    kind = header >> 5
     if kind == ABORT:
-        (code,) = ABORT_CODE.unpack_from(data, SDO_HEAD.size)
+        (code,) = ABORT_CODE.unpack_from(data, SDO_HEADER.size)
         return SdoFrame(kind, index, sub, abort=code)
-    if not head & EXPEDITED_WITH_SIZE:  # no value, or a transfer of several frames
+    if not header & EXPEDITED_WITH_SIZE:  # no value, or a transfer of several frames
         return SdoFrame(kind, index, sub)
-    if head & EXPEDITED_WITH_SIZE != EXPEDITED_WITH_SIZE:
-        raise ValueError(f"an SDO frame 0x{head:02X} without a size in one frame")
-    length = 4 - (head >> 2 & 0x03)
-    return SdoFrame(kind, index, sub, data[SDO_HEAD.size : SDO_HEAD.size + length])
+    if header & EXPEDITED_WITH_SIZE != EXPEDITED_WITH_SIZE:
+        raise ValueError(f"an SDO frame 0x{header:02X} without a size in one frame")
+    length = 4 - (header >> 2 & 0x03)
+    return SdoFrame(kind, index, sub, data[SDO_HEADER.size : SDO_HEADER.size + length])
 
 
 def describe_abort(code: int) -> str:
@@ -233,5 +234,5 @@ def describe_register(register: int) -> str:
 
 def _encode_expedited(kind: int, index: int, sub: int, data: bytes) -> bytes:
     unused = 4 - len(data)
-    head = kind << 5 | unused << 2 | EXPEDITED_WITH_SIZE
-    return SDO_HEAD.pack(head, index, sub) + data.ljust(4, b"\0")
+    header = kind << 5 | unused << 2 | EXPEDITED_WITH_SIZE
+    return SDO_HEADER.pack(header, index, sub) + data.ljust(4, b"\0")

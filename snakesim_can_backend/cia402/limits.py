@@ -25,7 +25,7 @@ from snakesim_hal.wire.messages import Mode
 
 REVOLUTION_RAD = 2 * math.pi  # rad
 THOUSANDTHS = 1000  # torques are thousandths of the rated torque
-ROUNDING = 0.01  # relative: limits are whole numbers, and people round them
+RELATIVE_TOLERANCE = 0.01  # relative: limits are whole numbers, and people round them
 INT16 = (-(2**15), 2**15 - 1)
 INT32 = (-(2**31), 2**31 - 1)
 UINT16_MAX = 2**16 - 1
@@ -41,7 +41,7 @@ MODE_NAMES = {
     OperationMode.CYCLIC_TORQUE: "cyclic synchronous torque (CST)",
 }
 
-Values = Mapping[Entry, int]  # that a drive has reported; entries that it does not have are missing
+EntryValues = Mapping[Entry, int]  # that a drive has reported; entries that it does not have are missing
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,16 @@ class Scaling:
         return thousandths / THOUSANDTHS * self.rated_torque_nm
 
 
-def read_scaling(values: Values, settings: Cia402Settings, joint: Joint) -> Scaling | str:
-    """Return the units of a drive, or why they are unknown.
+def determine_scaling(values: EntryValues, settings: Cia402Settings, joint: Joint) -> Scaling | str:
+    """Determine the units of a drive from its reported values and the settings.
 
     Args:
-        values: What the drive has reported.
-        settings: Units in the settings replace those of the drive.
-        joint: The joint, whose torque constant may be needed.
+        values: Values that the drive has reported, by entry.
+        settings: Settings of the driver type; units in them replace those that the drive reports.
+        joint: Joint of the drive, whose torque constant may be needed.
+
+    Returns:
+        The units, or a text with the reason why they are unknown, to be put after the drive's name.
     """
     counts = settings.counts_per_turn or _read_counts(values)
     if not counts:
@@ -96,46 +99,50 @@ def read_scaling(values: Values, settings: Cia402Settings, joint: Joint) -> Scal
             f"does not report its encoder resolution ({ENCODER_INCREMENTS.address}): set "
             f"`backends.cia402.counts_per_turn`"
         )
-    rated_nm = settings.rated_torque_nm or _read_rated_torque_nm(values, joint)
-    if not rated_nm:
+    rated_torque_nm = settings.rated_torque_nm or _read_rated_torque_nm(values, joint)
+    if not rated_torque_nm:
         return (
             f"does not report its rated torque ({RATED_TORQUE.address}), nor its rated current with a "
             f"`torque_constant_nm_per_a` in the robot file: set `backends.cia402.rated_torque_nm`"
         )
-    return Scaling(counts, settings.velocity_units_per_turn_s or counts, rated_nm)
+    return Scaling(counts, settings.velocity_units_per_turn_s or counts, rated_torque_nm)
 
 
-def find_objections(values: Values, scaling: Scaling, settings: Cia402Settings, joint: Joint) -> Iterator[str]:
-    """Yield what in a drive does not suit its joint.
+def find_incompatibilities(
+    values: EntryValues, scaling: Scaling, settings: Cia402Settings, joint: Joint
+) -> Iterator[str]:
+    """Yield a text for each mode, unit or limit of a drive that does not suit its joint.
+
+    Each text is a predicate, such as "has a torque limit ...", to be put after the name of the drive.
 
     Args:
-        values: What the drive has reported.
-        scaling: Its units.
-        settings: The settings of the driver type.
-        joint: The joint.
+        values: Values that the drive has reported, by entry.
+        scaling: Units of the drive.
+        settings: Settings of the driver type.
+        joint: Joint that the drive moves.
     """
-    yield from _find_mode_objections(values, joint)
-    yield from _find_unit_objections(values, settings, joint)
-    torque_nm = joint.limits.torque_nm / joint.drive.gear
+    yield from _find_mode_problems(values, joint)
+    yield from _find_unit_problems(values, settings, joint)
+    motor_torque_nm = joint.limits.torque_nm / joint.drive.gear  # at the shaft of the drive
     max_torque_nm = scaling.to_torque_nm(values[MAX_TORQUE])
-    if torque_nm > max_torque_nm * (1 + ROUNDING):
+    if motor_torque_nm > max_torque_nm * (1 + RELATIVE_TOLERANCE):
         yield (
             f"has a torque limit ({MAX_TORQUE.address}) of {max_torque_nm:.3g} N·m, and its joint may command "
-            f"{torque_nm:.3g} N·m: raise the one, or lower `torque_nm`. A driver that was killed may have left a "
+            f"{motor_torque_nm:.3g} N·m: raise the one, or lower `torque_nm`. A driver that was killed may have left a "
             f"lower limit: restart the drive"
         )
     if MAX_SPEED in values:
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear
         max_speed_rad_s = values[MAX_SPEED] / settings.max_speed_units_per_turn_s * REVOLUTION_RAD
-        if speed_rad_s > max_speed_rad_s * (1 + ROUNDING):
+        if speed_rad_s > max_speed_rad_s * (1 + RELATIVE_TOLERANCE):
             yield (
                 f"has a speed limit ({MAX_SPEED.address}) of {max_speed_rad_s:.4g} rad/s, and its joint may turn at "
                 f"{speed_rad_s:.4g} rad/s: raise the one, or lower `speed_rad_s`"
             )
-    yield from _find_range_objections(values, scaling, joint)
+    yield from _find_position_limit_problems(values, scaling, joint)
 
 
-def shaft_range_rad(joint: Joint) -> tuple[float, float]:
+def compute_shaft_range_rad(joint: Joint) -> tuple[float, float]:
     """Return the lowest and the highest angle of a drive's shaft within the limits of its joint."""
     drive = joint.drive
     ratio = drive.sign * drive.gear
@@ -143,43 +150,48 @@ def shaft_range_rad(joint: Joint) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _find_mode_objections(values: Values, joint: Joint) -> Iterator[str]:
+def _find_mode_problems(values: EntryValues, joint: Joint) -> Iterator[str]:
     profile = values[DEVICE_TYPE] & 0xFFFF
     if profile != DS402:
         yield f"has the device profile {profile}, and this driver knows {DS402} ({DEVICE_TYPE.address})"
-    needed = [OperationMode.CYCLIC_TORQUE]  # of passive joints
-    needed += [MODES[Mode[name.upper()]] for name in joint.drive.modes]
-    for mode in sorted(set(needed)):
+    required_modes = [OperationMode.CYCLIC_TORQUE]  # of passive joints
+    required_modes += [MODES[Mode[name.upper()]] for name in joint.drive.modes]
+    for mode in sorted(set(required_modes)):
         if not values[SUPPORTED_MODES] >> (mode - 1) & 1:
             yield f"does not support mode {mode:d}, {MODE_NAMES[mode]} ({SUPPORTED_MODES.address})"
 
 
-def _find_unit_objections(values: Values, settings: Cia402Settings, joint: Joint) -> Iterator[str]:
+def _find_unit_problems(values: EntryValues, settings: Cia402Settings, joint: Joint) -> Iterator[str]:
     """Yield units in the settings that differ from those that the drive reports."""
     counts = _read_counts(values)
-    named_counts = settings.counts_per_turn
-    if counts and named_counts and abs(counts - named_counts) > ROUNDING * named_counts:
+    configured_counts = settings.counts_per_turn
+    if counts and configured_counts and abs(counts - configured_counts) > RELATIVE_TOLERANCE * configured_counts:
         yield (
             f"has an encoder resolution ({ENCODER_INCREMENTS.address}) of {counts:g} a turn, and "
-            f"`backends.cia402.counts_per_turn` = {named_counts:g}: correct the one that is wrong"
+            f"`backends.cia402.counts_per_turn` = {configured_counts:g}: correct the one that is wrong"
         )
-    rated_nm = _read_rated_torque_nm(values, joint)
-    named_nm = settings.rated_torque_nm
-    if RATED_TORQUE in values and rated_nm and named_nm and abs(rated_nm - named_nm) > ROUNDING * named_nm:
+    rated_torque_nm = _read_rated_torque_nm(values, joint)
+    configured_torque_nm = settings.rated_torque_nm
+    if (
+        RATED_TORQUE in values
+        and rated_torque_nm
+        and configured_torque_nm
+        and abs(rated_torque_nm - configured_torque_nm) > RELATIVE_TOLERANCE * configured_torque_nm
+    ):
         yield (
-            f"has a rated torque ({RATED_TORQUE.address}) of {rated_nm:.4g} N·m, and "
-            f"`backends.cia402.rated_torque_nm` = {named_nm:g}: correct the one that is wrong"
+            f"has a rated torque ({RATED_TORQUE.address}) of {rated_torque_nm:.4g} N·m, and "
+            f"`backends.cia402.rated_torque_nm` = {configured_torque_nm:g}: correct the one that is wrong"
         )
 
 
-def _find_range_objections(values: Values, scaling: Scaling, joint: Joint) -> Iterator[str]:
+def _find_position_limit_problems(values: EntryValues, scaling: Scaling, joint: Joint) -> Iterator[str]:
     """Yield position limits that stop the drive within the range of its joint. Equal ones mean that there are none."""
     if MIN_POSITION not in values or MAX_POSITION not in values:
         return
     if values[MIN_POSITION] >= values[MAX_POSITION]:
         return
-    lower_rad, upper_rad = shaft_range_rad(joint)
-    tolerance_rad = ROUNDING * (upper_rad - lower_rad)
+    lower_rad, upper_rad = compute_shaft_range_rad(joint)
+    tolerance_rad = RELATIVE_TOLERANCE * (upper_rad - lower_rad)
     min_rad = scaling.to_angle_rad(values[MIN_POSITION])
     max_rad = scaling.to_angle_rad(values[MAX_POSITION])
     if lower_rad < min_rad - tolerance_rad or upper_rad > max_rad + tolerance_rad:
@@ -189,19 +201,19 @@ def _find_range_objections(values: Values, scaling: Scaling, joint: Joint) -> It
         )
 
 
-def _read_counts(values: Values) -> float:
+def _read_counts(values: EntryValues) -> float:
     """Return the position units for one turn that a drive reports; 0 if it does not report them."""
     increments = values.get(ENCODER_INCREMENTS, 0)
     revolutions = values.get(ENCODER_REVOLUTIONS, 0) or 1
     return increments / revolutions
 
 
-def _read_rated_torque_nm(values: Values, joint: Joint) -> float:
+def _read_rated_torque_nm(values: EntryValues, joint: Joint) -> float:
     """Return the rated torque that a drive reports or that its rated current gives; 0 if both are unknown."""
     if values.get(RATED_TORQUE):
         return values[RATED_TORQUE] / 1000
-    constant = joint.motor.torque_constant_nm_per_a or 0.0
-    return values.get(RATED_CURRENT, 0) / 1000 * constant
+    torque_constant_nm_per_a = joint.motor.torque_constant_nm_per_a or 0.0
+    return values.get(RATED_CURRENT, 0) / 1000 * torque_constant_nm_per_a
 
 
 def _clip(value: float, limits: tuple[int, int]) -> int:

@@ -14,8 +14,8 @@ from snakesim_can_backend.cia402.frames import (
     NmtState,
     SdoFrame,
     encode_abort,
-    encode_read_answer,
-    encode_write_answer,
+    encode_read_response,
+    encode_write_response,
 )
 from snakesim_can_backend.cia402.objects import PDO_OFF
 
@@ -63,31 +63,33 @@ class Node:
     eds: Eds
     node: int
     on_write: Callable[[Address, int], None]  # gets every value that a host has written
-    read_live: Callable[[Address], int | None]  # returns a value that changes by itself; None: the stored one counts
+    compute_live_value: Callable[
+        [Address], int | None
+    ]  # returns a value that changes by itself; None: the stored one counts
     nmt_state: NmtState = NmtState.PRE_OPERATIONAL
     values: dict[Address, int] = field(default_factory=dict[Address, int])
 
     def __post_init__(self) -> None:
         """Set every object to its default."""
-        for address, described in self.eds.objects.items():
-            self.values[address] = described.default_value(self.node)
+        for address, description in self.eds.objects.items():
+            self.values[address] = description.default_value(self.node)
 
     # --- values -----------------------------------------------------------------------------------------------
 
     def get(self, address: Address) -> int:
-        """Return the present value of an object, without a sign; 0 if it does not exist."""
-        live = self.read_live(address)
+        """Return the current value of an object, without a sign; 0 if the object does not exist."""
+        live = self.compute_live_value(address)
         if live is None:
             return self.values.get(address, 0)
-        described = self.eds.objects.get(address)
-        bits = 8 * (described.size or 4) if described is not None else 32
+        description = self.eds.objects.get(address)
+        bits = 8 * (description.size or 4) if description is not None else 32
         return live & ((1 << bits) - 1)
 
     def reset_communication(self) -> None:
         """Set the communication objects to their defaults."""
-        for address, described in self.eds.objects.items():
+        for address, description in self.eds.objects.items():
             if address[0] in COMMUNICATION_OBJECTS:
-                self.values[address] = described.default_value(self.node)
+                self.values[address] = description.default_value(self.node)
 
     # --- NMT --------------------------------------------------------------------------------------------------
 
@@ -108,53 +110,53 @@ class Node:
 
     # --- SDO --------------------------------------------------------------------------------------------------
 
-    def answer_sdo(self, request: SdoFrame) -> bytes:
-        """Return the answer to a request."""
+    def handle_sdo_request(self, request: SdoFrame) -> bytes:
+        """Read or write an object, as an SDO request asks for, and return the data of the response."""
         address = (request.index, request.sub)
         try:
             if request.kind == UPLOAD_REQUEST:
-                return encode_read_answer(*address, self._read(address))
+                return encode_read_response(*address, self._read(address))
             if request.kind == DOWNLOAD_REQUEST:
                 self._write(address, request.data)
-                return encode_write_answer(*address)
+                return encode_write_response(*address)
             return encode_abort(*address, UNKNOWN_COMMAND)
         except SdoAbortError as error:
             return encode_abort(*address, error.code)
 
     def _find(self, address: Address) -> EdsObject:
-        described = self.eds.objects.get(address)
-        if described is not None:
-            return described
+        description = self.eds.objects.get(address)
+        if description is not None:
+            return description
         has_index = any(index == address[0] for index, _ in self.eds.objects)
         raise SdoAbortError(NO_SUBINDEX if has_index else NO_OBJECT)
 
     def _read(self, address: Address) -> bytes:
-        described = self._find(address)
-        if described.access not in READABLE:
+        description = self._find(address)
+        if description.access not in READABLE:
             raise SdoAbortError(NOT_READABLE)
-        if described.size is None:
+        if description.size is None:
             raise SdoAbortError(NOT_EXPEDITED)
-        return self.get(address).to_bytes(described.size, "little")
+        return self.get(address).to_bytes(description.size, "little")
 
     def _write(self, address: Address, data: bytes) -> None:
-        described = self._find(address)
-        if described.access not in WRITABLE:
+        description = self._find(address)
+        if description.access not in WRITABLE:
             raise SdoAbortError(NOT_WRITABLE)
-        if described.size != len(data):
+        if description.size != len(data):
             raise SdoAbortError(WRONG_LENGTH)
         value = int.from_bytes(data, "little")
-        self._check_mapping(address, value)
+        self._validate_mapping_write(address, value)
         self.values[address] = value
         self.on_write(address, value)
 
     # --- PDOs -------------------------------------------------------------------------------------------------
 
-    def find_received(self, cob_id: int, data: bytes) -> list[tuple[Address, int]] | None:
-        """Return what a receive PDO writes.
+    def unpack_received_pdo(self, cob_id: int, data: bytes) -> list[tuple[Address, int]] | None:
+        """Return the objects and values that a received PDO writes, without writing them.
 
         Args:
-            cob_id: The id of the frame.
-            data: Its data.
+            cob_id: Id of the frame.
+            data: Data bytes of the frame.
 
         Returns:
             The objects and their values; None if no active receive PDO has this id.
@@ -166,7 +168,7 @@ class Node:
                 return list(self._unpack(index + MAPPING_OFFSET, data))
         return None
 
-    def list_synchronous(self) -> Iterator[tuple[int, bytes]]:
+    def list_synchronous_pdos(self) -> Iterator[tuple[int, bytes]]:
         """Yield id and data of each PDO that the node sends after a SYNC."""
         if self.nmt_state != NmtState.OPERATIONAL:
             return
@@ -186,7 +188,7 @@ class Node:
         """Yield the objects in a PDO, in the order of its data, and their lengths in bytes.
 
         Args:
-            mapping_index: index of the mapping parameters of the PDO. Their subindex 0 is the number of mapped objects,
+            mapping_index: Index of the mapping parameters of the PDO. Their subindex 0 is the number of mapped objects,
                 and the subindices from 1 on are the entries; see `_parse_mapping_entry`.
         """
         object_count = self.values.get((mapping_index, 0), 0)
@@ -201,49 +203,49 @@ class Node:
             offset += size
 
     def _pack(self, mapping_index: int) -> bytes:
-        """Return the data of a PDO: the present values of its objects, one after another, little-endian."""
+        """Return the data of a PDO: the current values of its objects, one after another, little-endian."""
         return b"".join(
             self.get(address).to_bytes(size, "little") for address, size in self._list_mapped(mapping_index)
         )
 
-    def _check_mapping(self, address: Address, value: int) -> None:
+    def _validate_mapping_write(self, address: Address, value: int) -> None:
         """Check a value that a host writes into the mapping parameters of a PDO; other objects need no check.
 
         A mapping may be changed only while its PDO is off. Its entries may be changed only while subindex 0, the number
         of mapped objects, is 0. A host then sets subindex 0 to the number of entries, which activates the mapping.
 
         Args:
-            address: the object that is written.
-            value: its new value.
+            address: Index and subindex of the object that is written.
+            value: New value of the object.
 
         Raises:
-            SdoAbortError: the mapping is in use, an object cannot be mapped, or the objects are too long for a frame.
+            SdoAbortError: The mapping is in use, an object cannot be mapped, or the objects are too long for a frame.
         """
         index, sub = address
         if index not in RECEIVE_MAPPING and index not in TRANSMIT_MAPPING:
             return
         cob_id = self.values.get((index - MAPPING_OFFSET, COB_ID_SUB), PDO_OFF)
-        pdo_is_on = not cob_id & PDO_OFF
-        if pdo_is_on:
+        is_pdo_on = not cob_id & PDO_OFF
+        if is_pdo_on:
             raise SdoAbortError(WRONG_STATE)
         if sub == 0:
-            self._check_mapped_length(index, value)
+            self._validate_mapped_length(index, value)
             return
-        mapping_is_active = self.values.get((index, 0), 0) > 0
-        if mapping_is_active:
+        is_mapping_active = self.values.get((index, 0), 0) > 0
+        if is_mapping_active:
             raise SdoAbortError(WRONG_STATE)
-        self._check_mapping_entry(value)
+        self._validate_mapping_entry(value)
 
-    def _check_mapping_entry(self, entry: int) -> None:
+    def _validate_mapping_entry(self, entry: int) -> None:
         """Check that the object of an entry exists, may be in a PDO, and has that length. Raises SdoAbortError."""
         mapped_address, size = _parse_mapping_entry(entry)
-        described = self.eds.objects.get(mapped_address)
-        if described is None:
+        description = self.eds.objects.get(mapped_address)
+        if description is None:
             raise SdoAbortError(NO_OBJECT)
-        if not described.mappable or described.size != size:
+        if not description.mappable or description.size != size:
             raise SdoAbortError(NOT_MAPPABLE)
 
-    def _check_mapped_length(self, mapping_index: int, object_count: int) -> None:
+    def _validate_mapped_length(self, mapping_index: int, object_count: int) -> None:
         """Check that the first objects of a mapping fit into one frame. Raises SdoAbortError."""
         total_bytes = 0
         for sub in range(1, object_count + 1):

@@ -43,8 +43,8 @@ class Entry:
 
 # Communication, CiA 301.
 DEVICE_TYPE = Entry(0x1000, 0, "I", "device type")  # its low 16 bits are the number of the profile
-VENDOR = Entry(0x1018, 1, "I", "vendor")
-PRODUCT = Entry(0x1018, 2, "I", "product code")
+VENDOR_ID = Entry(0x1018, 1, "I", "vendor")
+PRODUCT_CODE = Entry(0x1018, 2, "I", "product code")
 REVISION = Entry(0x1018, 3, "I", "revision")  # major and minor number, 16 bits each
 SERIAL = Entry(0x1018, 4, "I", "serial number")
 CONSUMER_HEARTBEAT = Entry(0x1016, 1, "I", "consumer heartbeat time")  # node << 16 | ms
@@ -53,7 +53,7 @@ ERROR_BEHAVIOR = Entry(0x1029, 1, "B", "error behavior")  # 1: no change of the 
 ERROR_REGISTER = Entry(0x1001, 0, "B", "error register")
 
 # The state machine, CiA 402.
-ABORT_CONNECTION = Entry(0x6007, 0, "h", "abort connection option code")  # 1: fault
+ABORT_CONNECTION_OPTION_CODE = Entry(0x6007, 0, "h", "abort connection option code")  # 1: fault
 ERROR_CODE = Entry(0x603F, 0, "H", "error code")
 CONTROLWORD = Entry(0x6040, 0, "H", "controlword")
 STATUSWORD = Entry(0x6041, 0, "H", "statusword")

@@ -5,12 +5,12 @@ import struct
 import time
 from collections.abc import Iterable
 
-from snakesim_can_backend.bus.adapter import check_channel, open_wire
+from snakesim_can_backend.bus.adapter import open_wire, validate_channel
 from snakesim_can_backend.bus.bus import Wire, wait
 from snakesim_can_backend.cia402.frames import (
     FIRST_NODE,
     LAST_NODE,
-    UPLOAD_ANSWER,
+    UPLOAD_RESPONSE,
     Function,
     decode_sdo,
     encode_read,
@@ -20,12 +20,12 @@ from snakesim_can_backend.cia402.objects import (
     DEVICE_TYPE,
     DS402,
     ERROR_CODE,
-    PRODUCT,
+    PRODUCT_CODE,
     REVISION,
     SERIAL,
     STATUSWORD,
     SUPPORTED_MODES,
-    VENDOR,
+    VENDOR_ID,
     Entry,
 )
 from snakesim_can_backend.cia402.state_machine import OperationMode, decode_statusword
@@ -33,8 +33,8 @@ from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.terminal import align_columns, print_json, print_line
 
 OK, FAILED = 0, 1
-ANSWER_S = 0.1  # for all answers to one round of requests
-READ = (DEVICE_TYPE, VENDOR, PRODUCT, REVISION, SERIAL, SUPPORTED_MODES, STATUSWORD, ERROR_CODE)
+RESPONSE_TIMEOUT_S = 0.1  # for all answers to one round of requests
+SCANNED_ENTRIES = (DEVICE_TYPE, VENDOR_ID, PRODUCT_CODE, REVISION, SERIAL, SUPPORTED_MODES, STATUSWORD, ERROR_CODE)
 COLUMNS = ("channel", "node", "profile", "vendor", "product", "revision", "serial", "modes", "state", "error")
 UNKNOWN = "-"
 MODE_LABELS = {
@@ -47,17 +47,27 @@ Values = dict[Entry, set[int]]  # several values of one entry come from several 
 
 
 def scan_channels(arguments: argparse.Namespace) -> int:
-    """List the nodes that answer on some buses. Returns 1 if none answers; raises SnakesimError."""
+    """Run `snakesim drive scan cia402`: list the CANopen nodes that respond on some buses.
+
+    Args:
+        arguments: Parsed command line.
+
+    Returns:
+        Exit code 0; 1 if no node responds.
+
+    Raises:
+        SnakesimError: A channel does not exist, is down, or cannot be opened.
+    """
     for channel in arguments.channel:
-        check_channel(channel)
+        validate_channel(channel)
     rows: list[dict[str, str]] = []
     for channel in arguments.channel:
         wire = open_wire(channel, None, arguments.bit_rate)
         try:
-            found = read_nodes(wire)
+            values_by_node = read_nodes(wire)
         finally:
             wire.close()
-        rows += [describe_node(channel, node, values) for node, values in sorted(found.items())]
+        rows += [make_scan_row(channel, node, values) for node, values in sorted(values_by_node.items())]
     if arguments.json:
         print_json({"drives": rows})
         return OK if rows else FAILED
@@ -70,25 +80,36 @@ def scan_channels(arguments: argparse.Namespace) -> int:
 
 
 def read_nodes(wire: Wire) -> dict[int, Values]:
-    """Return what every node on a bus reports of itself. Nothing is written."""
-    found: dict[int, Values] = {}
+    """Read identity and state of all nodes on a bus, without writing anything.
+
+    Returns:
+        The values that each node has reported, by node id; nodes that do not respond are missing.
+    """
+    values_by_node: dict[int, Values] = {}
     nodes: Iterable[int] = range(FIRST_NODE, LAST_NODE + 1)
-    for entry in READ:
+    for entry in SCANNED_ENTRIES:
         for node in nodes:
             wire.send(Frame(Function.SDO_REQUEST | node, encode_read(entry)))
-        _collect(wire, entry, found)
-        nodes = list(found)  # only those that have the first entry are asked for the others
-    return found
+        _receive_values(wire, entry, values_by_node)
+        nodes = list(values_by_node)  # only those that have the first entry are asked for the others
+    return values_by_node
 
 
-def describe_node(channel: str, node: int, values: Values) -> dict[str, str]:
-    """Return the row of a node, by `COLUMNS`. Several serial numbers are several nodes with one id."""
+def make_scan_row(channel: str, node: int, values: Values) -> dict[str, str]:
+    """Return the row of the scan for one node, by the names in `COLUMNS`.
+
+    Args:
+        channel: Bus of the node.
+        node: Node id.
+        values: Values of each entry that responses with this id had. Several values of one entry come from several
+            nodes with the same id.
+    """
     row: dict[str, str] = {}
     row |= dict.fromkeys(COLUMNS, UNKNOWN)
     row |= {"channel": channel, "node": str(node)}
     for number in values.get(DEVICE_TYPE, ()):
         row["profile"] = str(number & 0xFFFF)
-    for entry, column in ((VENDOR, "vendor"), (PRODUCT, "product"), (SERIAL, "serial")):
+    for entry, column in ((VENDOR_ID, "vendor"), (PRODUCT_CODE, "product"), (SERIAL, "serial")):
         if entry in values:
             row[column] = " and ".join(f"{number:08X}" for number in sorted(values[entry]))
     for number in values.get(REVISION, ()):
@@ -105,20 +126,20 @@ def describe_node(channel: str, node: int, values: Values) -> dict[str, str]:
     return row
 
 
-def _collect(wire: Wire, entry: Entry, found: dict[int, Values]) -> None:
-    """Store the answers to requests for an entry."""
-    end_s = time.monotonic() + ANSWER_S
+def _receive_values(wire: Wire, entry: Entry, values_by_node: dict[int, Values]) -> None:
+    """Receive the responses to requests for an entry until a timeout, and store their values by node."""
+    deadline_s = time.monotonic() + RESPONSE_TIMEOUT_S
     while True:
-        left_s = end_s - time.monotonic()
-        if left_s <= 0 or not wait([wire], left_s):
+        remaining_s = deadline_s - time.monotonic()
+        if remaining_s <= 0 or not wait([wire], remaining_s):
             return
         for frame in wire.receive():
             function, node = split_id(frame)
-            if function != Function.SDO_ANSWER:
+            if function != Function.SDO_RESPONSE:
                 continue
             try:
-                answer = decode_sdo(frame.data)
-                if answer.kind == UPLOAD_ANSWER and (answer.index, answer.sub) == (entry.index, entry.sub):
-                    found.setdefault(node, {}).setdefault(entry, set()).add(entry.decode(answer.data))
+                response = decode_sdo(frame.data)
+                if response.kind == UPLOAD_RESPONSE and (response.index, response.sub) == (entry.index, entry.sub):
+                    values_by_node.setdefault(node, {}).setdefault(entry, set()).add(entry.decode(response.data))
             except (ValueError, struct.error):
                 continue

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from snakesim_can_backend.cia402.frames import (
     ABORT,
-    DOWNLOAD_ANSWER,
-    UPLOAD_ANSWER,
+    DOWNLOAD_RESPONSE,
+    UPLOAD_RESPONSE,
     NmtCommand,
     SdoFrame,
     describe_abort,
@@ -16,7 +16,7 @@ from snakesim_can_backend.cia402.frames import (
 )
 from snakesim_can_backend.cia402.objects import Entry
 
-REPEAT_NS = 100_000_000  # after which a request without an answer is sent again
+REPEAT_PERIOD_NS = 100_000_000  # after which a request without an answer is sent again
 ALL_BITS = 0xFFFF_FFFF
 
 
@@ -51,15 +51,18 @@ Step = Read | Write | Nmt
 
 @dataclass(frozen=True)
 class StepResult:
-    """The answer to a step that has been done."""
+    """The response of a drive to a step."""
 
     step: Read | Write
-    value: int | None = None  # that was read
-    abort: int = 0  # code with which the drive refused the step; 0: it did not
+    value: int | None = None  # value that was read; None after a write or an abort
+    abort: int = 0  # abort code with which the drive refused the step; 0: it did not
 
     @property
     def failure(self) -> str:
-        """Why the step failed, in words; empty if it did not."""
+        """A text that describes why the step failed; empty if it did not fail.
+
+        A step fails if the drive aborts it, unless it is optional, or if a value that was read is not the expected one.
+        """
         entry = self.step.entry
         if self.abort:
             if self.step.optional:
@@ -87,81 +90,86 @@ class SdoQueue:
         on_result: Callable[[StepResult], None],
         now_ns: Callable[[], int],
     ) -> None:
-        """Begin without steps.
+        """Create an empty queue of steps for one drive.
 
         Args:
-            send_request: Sends a request to the drive.
-            send_nmt: Sends an NMT command to the drive.
-            on_result: Gets the result of each read and write.
-            now_ns: The driver's time.
+            send_request: Function that sends the data of an SDO request to the drive.
+            send_nmt: Function that sends an NMT command to the drive.
+            on_result: Function that is called with the result of each read and write.
+            now_ns: Function that returns the driver's time in ns.
         """
         self._send_request = send_request
         self._send_nmt = send_nmt
         self._on_result = on_result
         self._now_ns = now_ns
         self._steps: deque[Step] = deque()
-        self._current: Read | Write | None = None
-        self._sent_ns = 0
+        self._current_step: Read | Write | None = None
+        self._last_sent_ns = 0
 
     @property
     def is_idle(self) -> bool:
         """Whether every step is done."""
-        return self._current is None and not self._steps
+        return self._current_step is None and not self._steps
 
     @property
-    def awaits_answer(self) -> bool:
+    def is_awaiting_response(self) -> bool:
         """Whether a request is without an answer, but not late."""
-        return self._current is not None and self._now_ns() - self._sent_ns < REPEAT_NS
+        return self._current_step is not None and self._now_ns() - self._last_sent_ns < REPEAT_PERIOD_NS
 
     def add(self, steps: Iterable[Step]) -> None:
-        """Add steps, and begin with the first one if no other step is in progress."""
+        """Add steps, and start the first one if no other step is in progress."""
         self._steps.extend(steps)
-        self._proceed()
+        self._start_next_step()
 
     def clear(self) -> None:
         """Drop all steps; an answer that still arrives is ignored."""
         self._steps.clear()
-        self._current = None
+        self._current_step = None
 
-    def repeat_if_late(self) -> None:
+    def repeat_late_request(self) -> None:
         """Send the request in progress again if its answer is late."""
-        if self._current is not None and self._now_ns() - self._sent_ns >= REPEAT_NS:
-            self._send(self._current)
+        if self._current_step is not None and self._now_ns() - self._last_sent_ns >= REPEAT_PERIOD_NS:
+            self._send(self._current_step)
 
-    def handle_answer(self, answer: SdoFrame) -> None:
-        """Finish the step in progress if this is its answer, and begin with the next one.
+    def handle_response(self, response: SdoFrame) -> None:
+        """Finish the step in progress if this is the response to it, report its result, and start the next step.
+
+        Other responses are ignored.
+
+        Args:
+            response: SDO response of the drive.
 
         Raises:
-            struct.error: the value has the wrong length.
+            struct.error: The value has the wrong length.
         """
-        step = self._current
-        if step is None or (answer.index, answer.sub) != (step.entry.index, step.entry.sub):
+        step = self._current_step
+        if step is None or (response.index, response.sub) != (step.entry.index, step.entry.sub):
             return
         match step:
-            case _ if answer.kind == ABORT:
-                result = StepResult(step, abort=answer.abort)
-            case Read() if answer.kind == UPLOAD_ANSWER:
-                result = StepResult(step, value=step.entry.decode(answer.data))
-            case Write() if answer.kind == DOWNLOAD_ANSWER:
+            case _ if response.kind == ABORT:
+                result = StepResult(step, abort=response.abort)
+            case Read() if response.kind == UPLOAD_RESPONSE:
+                result = StepResult(step, value=step.entry.decode(response.data))
+            case Write() if response.kind == DOWNLOAD_RESPONSE:
                 result = StepResult(step)
             case _:
                 return
-        self._current = None
+        self._current_step = None
         self._on_result(result)
-        self._proceed()
+        self._start_next_step()
 
-    def _proceed(self) -> None:
-        while self._current is None and self._steps:
+    def _start_next_step(self) -> None:
+        while self._current_step is None and self._steps:
             step = self._steps.popleft()
             match step:
                 case Nmt():
                     self._send_nmt(step.command)
                 case Read() | Write():
-                    self._current = step
+                    self._current_step = step
                     self._send(step)
 
     def _send(self, step: Read | Write) -> None:
-        self._sent_ns = self._now_ns()
+        self._last_sent_ns = self._now_ns()
         match step:
             case Read():
                 self._send_request(encode_read(step.entry))

@@ -13,7 +13,7 @@ from snakesim_can_backend.cia402.state_machine import (
     Control,
     OperationMode,
     PowerState,
-    next_control,
+    choose_next_controlword,
 )
 
 # unknown: bring-up has not written anything yet. booting: the driver has restarted its communication.
@@ -31,27 +31,27 @@ class Servo:
 
     queue: SdoQueue
     phase: Phase = "unknown"
-    phase_ns: int = 0  # when the phase began
+    phase_start_ns: int = 0  # when the phase began
     failure: str = ""  # why it cannot be identified or configured
     # What the drive reports in bring-up.
     values: dict[Entry, int] = field(default_factory=dict[Entry, int])
-    unread: set[Entry] = field(default_factory=set[Entry])  # entries that bring-up still waits for
+    unread_entries: set[Entry] = field(default_factory=set[Entry])  # entries that bring-up still waits for
     scaling: Scaling | None = None
     # What it reports later.
     state: PowerState = PowerState.UNKNOWN
     mode: int = 0  # of operation
     error_code: int = 0
     emergency: Emergency | None = None  # the last one, until the drive reports that the error is gone
-    heartbeat_ns: int = 0  # when the last one arrived
+    last_heartbeat_ns: int = 0  # when the last one arrived
     pre_operational_heartbeats: int = 0  # in a row
     position: int | None = None  # since the last SYNC
     velocity: int | None = None  # since the last SYNC
     health: dict[Entry, int] = field(default_factory=dict[Entry, int])
     # What the driver does with it.
-    is_stepping: bool = False  # towards Operation enabled
-    has_arrived: bool = False  # there, since it was switched off last: from then on it gets no further steps
-    resets_fault: bool = False  # with the next configuration
-    quick_stop_ns: int | None = None  # when it first reported the present quick stop
+    is_enabling: bool = False  # towards Operation enabled
+    was_enabled: bool = False  # there, since it was switched off last: from then on it gets no further steps
+    should_reset_fault: bool = False  # with the next configuration
+    quick_stop_start_ns: int | None = None  # when it first reported the present quick stop
 
     def describe_errors(self) -> str:
         """Return the errors of a drive in words; empty if it has none. Emergency messages without a fault are none."""
@@ -65,19 +65,21 @@ class Servo:
             return describe_error(self.error_code)
         return "a fault without an error code"
 
-    def choose_control(self, wanted_mode: OperationMode) -> Control:
-        """Return the command of a drive that follows. One that has left Operation enabled by itself stays off.
+    def choose_controlword(self, target_mode: OperationMode) -> Control:
+        """Return the controlword for a drive that should be enabled.
+
+        A drive that has left Operation enabled by itself stays off.
 
         Args:
-            wanted_mode: The mode of its setpoint: the drive is enabled only once it reports this mode.
+            target_mode: Operation mode of the setpoint. The drive is enabled only once it reports this mode.
         """
         if self.state == PowerState.ENABLED:
             return Control.ENABLE_OPERATION
-        if not self.is_stepping:
+        if not self.is_enabling:
             return Control.DISABLE_VOLTAGE
-        if self.state == PowerState.SWITCHED_ON and self.mode != wanted_mode:
+        if self.state == PowerState.SWITCHED_ON and self.mode != target_mode:
             return Control.SWITCH_ON
-        return next_control(self.state)
+        return choose_next_controlword(self.state)
 
 
 class Health(NamedTuple):

@@ -55,7 +55,11 @@ class OperationMode(IntEnum):
 
 
 def decode_statusword(word: int) -> PowerState:
-    """Return the state that a statusword reports. Bits that do not belong to the state are ignored."""
+    """Return the state that a statusword reports.
+
+    Bits 0 to 3 and 6 of the word, and in the last four states also bit 5, are compared with the patterns of CiA 402
+    (IEC 61800-7-201), object 6041h. All other bits are ignored.
+    """
     match word & 0x4F:
         case 0x00:
             return PowerState.NOT_READY
@@ -80,8 +84,8 @@ def decode_statusword(word: int) -> PowerState:
             return PowerState.UNKNOWN
 
 
-def next_control(state: PowerState) -> Control:
-    """Return the command that leads a drive one step towards Operation enabled."""
+def choose_next_controlword(state: PowerState) -> Control:
+    """Return the controlword command that leads a drive one step towards Operation enabled."""
     match state:
         case PowerState.SWITCH_ON_DISABLED:
             return Control.SHUTDOWN
@@ -93,13 +97,13 @@ def next_control(state: PowerState) -> Control:
             return Control.DISABLE_VOLTAGE
 
 
-def apply_control(state: PowerState, word: int, previous_word: int) -> PowerState:
-    """Return the state that a drive enters when it receives a controlword.
+def apply_controlword(state: PowerState, word: int, previous_word: int) -> PowerState:
+    """Return the state that a drive enters when it receives a controlword (object 6040h).
 
     Args:
-        state: Its present state.
-        word: The controlword.
-        previous_word: The controlword before it, by which a change of the bit for a fault reset is found.
+        state: Current state of the drive.
+        word: Received controlword.
+        previous_word: Last controlword before it: a fault is reset when the reset bit changes from 0 to 1.
     """
     if state == PowerState.FAULT:
         is_reset = bool(word & ~previous_word & Control.FAULT_RESET)
@@ -108,18 +112,18 @@ def apply_control(state: PowerState, word: int, previous_word: int) -> PowerStat
         return state
     if not word & 0x02:  # disable voltage
         return PowerState.SWITCH_ON_DISABLED
-    if not word & 0x04:
-        return _quick_stop(state)
+    if not word & 0x04:  # the quick stop bit is active low
+        return _apply_quick_stop(state)
     match word & 0x0F:
-        case 0x06 | 0x0E:
+        case 0x06 | 0x0E:  # shutdown
             return PowerState.READY
-        case 0x07:
-            return _switch_on(state)
-        case _:
-            return _enable_operation(state)
+        case 0x07:  # switch on
+            return _apply_switch_on(state)
+        case _:  # 0x0F, enable operation
+            return _apply_enable_operation(state)
 
 
-def _quick_stop(state: PowerState) -> PowerState:
+def _apply_quick_stop(state: PowerState) -> PowerState:
     match state:
         case PowerState.ENABLED | PowerState.QUICK_STOP:
             return PowerState.QUICK_STOP
@@ -127,7 +131,7 @@ def _quick_stop(state: PowerState) -> PowerState:
             return PowerState.SWITCH_ON_DISABLED
 
 
-def _switch_on(state: PowerState) -> PowerState:
+def _apply_switch_on(state: PowerState) -> PowerState:
     match state:
         case PowerState.READY | PowerState.SWITCHED_ON | PowerState.ENABLED:
             return PowerState.SWITCHED_ON
@@ -135,7 +139,7 @@ def _switch_on(state: PowerState) -> PowerState:
             return state
 
 
-def _enable_operation(state: PowerState) -> PowerState:
+def _apply_enable_operation(state: PowerState) -> PowerState:
     match state:
         case PowerState.READY:
             return PowerState.SWITCHED_ON
@@ -146,7 +150,13 @@ def _enable_operation(state: PowerState) -> PowerState:
 
 
 def encode_statusword(state: PowerState) -> int:
-    """Return the statusword of a state, as emulated drives send it."""
+    """Return the statusword (object 6041h) of a state, as emulated drives send it.
+
+    Only the bits that identify the state are set. An unknown state, which no emulated drive is in, is encoded as "not
+    ready to switch on".
+
+    Source: CiA 402 (IEC 61800-7-201), state bits of the statusword; see the table at the top of this file.
+    """
     match state:
         case PowerState.NOT_READY | PowerState.UNKNOWN:
             return 0x0000

@@ -1,20 +1,20 @@
 """The backend `can`: joint modules as a driver type of the driver kit, with contact sensors and IMUs."""
 
-from snakesim_can_backend.bus.adapter import check_channels
-from snakesim_can_backend.bus.load import check_load, plan_reports
+from snakesim_can_backend.bus.adapter import validate_channels
+from snakesim_can_backend.bus.load import plan_reports, validate_bus_load
 from snakesim_can_backend.driver.modules import JointModules
-from snakesim_can_backend.driver.own_emulators import check_emulators, check_faults
-from snakesim_can_backend.driver.parameters import check_drives, check_ratings, check_watchdog
+from snakesim_can_backend.driver.own_emulators import validate_emulator_settings, validate_fault_plan
+from snakesim_can_backend.driver.parameters import validate_joint_drives, validate_ratings, validate_watchdog
 from snakesim_can_backend.driver.sensors import SampleBuilder, describe_sensors
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.mounted import check_mounted
+from snakesim_drivers.emulation.mounted import validate_mounting_overrides
 from snakesim_drivers.kit.drive_backend import DriveBackend, DriveBackendParts, DriverClock
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_drivers.motion_capture.mocap import check_pose, make_receiver
+from snakesim_drivers.motion_capture.mocap import make_receiver, validate_pose_settings
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.motor import check_gains
+from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.wire.messages import ClockMode, LifecycleState, SensorDescription
 
 NAME = "can"
@@ -33,26 +33,27 @@ class CanBackend(DriveBackend):
         """Check that a run is possible with these settings, before a bus is opened.
 
         Args:
-            config: configuration of the run.
-            settings: settings of this backend.
+            config: Configuration of the run.
+            settings: Settings of this backend.
 
         Returns:
-            The supported clock modes: real time only on real modules, and lockstep too on emulators of this driver.
+            The supported clock modes: real modules support real time only, and emulators of this driver support
+            lockstep, too.
 
         Raises:
-            ConfigError: it is not possible; the message has the reason, and what to change.
+            ConfigError: The run is not possible; the message has the reason, and what to change.
         """
         has_emulators = settings.emulators_run != "none"
-        check_load(config, settings)
-        check_gains(config.robot)
-        check_drives(config.robot, settings)
-        check_mounted(config.robot, config.backend_section, settings.mounted, emulators=has_emulators)
-        check_ratings(config.robot)
-        check_watchdog(config, settings)
-        check_pose(config, settings.pose_listen)
-        check_emulators(config, settings)
-        check_faults(config, settings)
-        check_channels(settings.channels)
+        validate_bus_load(config, settings)
+        validate_position_gains(config.robot)
+        validate_joint_drives(config.robot, settings)
+        validate_mounting_overrides(config.robot, config.backend_section, settings.mounted, are_emulated=has_emulators)
+        validate_ratings(config.robot)
+        validate_watchdog(config, settings)
+        validate_pose_settings(config, settings.pose_listen)
+        validate_emulator_settings(config, settings)
+        validate_fault_plan(config, settings)
+        validate_channels(settings.channels)
         if has_emulators:
             return ("lockstep", "realtime")
         return ("realtime",)
@@ -61,25 +62,25 @@ class CanBackend(DriveBackend):
         """Open the buses and find every joint module; no module is enabled.
 
         Args:
-            config: configuration of the run.
-            settings: settings of this backend, with its channels.
+            config: Configuration of the run.
+            settings: Settings of this backend, with its channels.
 
         Raises:
-            ConfigError: the run is not possible with these settings.
-            BackendError: a bus cannot be opened, or a module is missing.
+            ConfigError: The run is not possible with these settings.
+            BackendError: A bus cannot be opened, or a module is missing.
         """
         self.check(config, settings)
         clock = DriverClock(config)
         has_emulators = settings.emulators_run != "none"
         mocap = make_receiver(
-            config, settings.pose_listen, emulators=has_emulators, clock=lambda _timestamp_ns: clock.now_ns()
+            config, settings.pose_listen, are_emulated=has_emulators, clock=lambda _timestamp_ns: clock.now_ns()
         )
         self._reports = plan_reports(config, settings)
 
         def open_modules(readings: DriveReadings) -> JointModules:
-            pose = mocap.address if mocap is not None else None
-            self.modules = JointModules(config, settings, clock, pose, readings)
-            self._sample_builder = SampleBuilder(config, self._reports, self.modules.reading, mocap)
+            pose_address = mocap.address if mocap is not None else None
+            self.modules = JointModules(config, settings, clock, pose_address, readings)
+            self._sample_builder = SampleBuilder(config, self._reports, self.modules.module_reports, mocap)
             return self.modules
 
         parts = DriveBackendParts(
@@ -88,12 +89,12 @@ class CanBackend(DriveBackend):
             clock=clock,
             mocap=mocap,
             open_drives=open_modules,
-            watchdogs_s=[settings.watchdog_s] * len(config.robot.joint_table),
+            watchdog_timeouts_s=[settings.watchdog_s] * len(config.robot.joint_table),
         )
         super().__init__(config, parts)
 
-    def _send_lifecycle(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
-        self.modules.announce(lifecycle, isolated)
+    def _send_lifecycle_state(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+        self.modules.send_lifecycle_commands(lifecycle, isolated)
 
     def _make_samples(self, tick: int, timestamp_ns: int) -> Samples:
         return self._sample_builder.make_samples(tick, timestamp_ns)

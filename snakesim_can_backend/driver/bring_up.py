@@ -25,8 +25,8 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_hal.base.errors import BackendError
 
-ASK_EVERY_S = 0.1  # until a request is repeated
-LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id may answer later
+REQUEST_PERIOD_S = 0.1  # until a request is repeated
+DUPLICATE_WAIT_S = 0.06  # after the last module is found: a second one with its id may answer later
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ class ModuleBus:
 
 
 def find_modules(
-    buses: Sequence[ModuleBus], limit_s: float, on_frame: Callable[[Frame], None] | None = None
+    buses: Sequence[ModuleBus], timeout_s: float, on_frame: Callable[[Frame], None] | None = None
 ) -> list[ModuleIdentity]:
-    """Request the identity of all modules until the expected ones have answered, or the time is over.
+    """Request the identity of all modules until the expected ones have responded, or until a timeout.
 
     Args:
-        buses: the buses, with the nodes that are expected there.
-        limit_s: how long to wait at most.
-        on_frame: gets all frames that are not answers to the request.
+        buses: The buses, with the nodes that are expected there.
+        timeout_s: Maximum duration to wait.
+        on_frame: Function that is called with all frames that are not responses to the request; None to ignore them.
 
     Returns:
         Every identity that was received, sorted by node. Two modules may have the same id.
@@ -69,16 +69,16 @@ def find_modules(
     identities: dict[tuple[str, int, int], ModuleIdentity] = {}  # by channel, node and serial number
     missing = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
-    end_s = time.monotonic() + limit_s
+    deadline_s = time.monotonic() + timeout_s
     next_request_s = 0.0
     is_complete = False
     now_s = time.monotonic()
-    while now_s < end_s:
+    while now_s < deadline_s:
         if now_s >= next_request_s:
             for wire in wires:
                 wire.send(commands.make_command(CommandAction.IDENTIFY))
-            next_request_s = now_s + ASK_EVERY_S
-        for wire, frame in receive_frames(wires, end_s - now_s):
+            next_request_s = now_s + REQUEST_PERIOD_S
+        for wire, frame in receive_frames(wires, deadline_s - now_s):
             identity = _parse_identity(wire.channel, frame)
             if identity is not None:
                 identities[identity.channel, identity.node, identity.serial] = identity
@@ -87,7 +87,9 @@ def find_modules(
                 on_frame(frame)
         if not is_complete and not missing:
             is_complete = True
-            end_s = min(end_s, time.monotonic() + LISTEN_ON_S)  # a second module with the same id may still answer
+            deadline_s = min(
+                deadline_s, time.monotonic() + DUPLICATE_WAIT_S
+            )  # a second module with the same id may still answer
         now_s = time.monotonic()
     return sorted(identities.values(), key=lambda identity: (identity.node, identity.channel, identity.serial))
 
@@ -112,39 +114,39 @@ def _make_identity(channel: str, node: int, values: Mapping[str, float]) -> Modu
     )
 
 
-def discovery_errors(
+def find_discovery_errors(
     buses: Sequence[ModuleBus], identities: Sequence[ModuleIdentity], joints: Sequence[str], *, lockstep: bool
 ) -> list[str]:
-    """Compare the modules that answered with the joints of the robot.
+    """Compare the modules that responded with the joints of the robot.
 
     Args:
-        buses: the buses, with the nodes that are expected there.
-        identities: the modules that answered.
-        joints: names of the joints, tail to head.
-        lockstep: whether the run is in lockstep, which only stepped emulators support.
+        buses: The buses, with the nodes that are expected there.
+        identities: Identities of the modules that responded.
+        joints: Names of the joints, from tail to head.
+        lockstep: Whether the run is in lockstep, which only stepped emulators support.
 
     Returns:
-        The errors as text; none if the robot is complete.
+        The errors as text; empty if the robot is complete.
     """
     errors: list[str] = []
-    channel_of_node = {node: bus.wire.channel for bus in buses for node in bus.nodes}
-    identities_of_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
+    channel_by_node = {node: bus.wire.channel for bus in buses for node in bus.nodes}
+    identities_by_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
     for identity in identities:
-        identities_of_node[identity.node].append(identity)
-    for node, channel in channel_of_node.items():
+        identities_by_node[identity.node].append(identity)
+    for node, channel in channel_by_node.items():
         subject = f"{joints[node - 1]} (node {node} on {channel})"
-        on_its_channel: list[ModuleIdentity] = []
-        on_other_channels: list[ModuleIdentity] = []
-        for identity in identities_of_node[node]:
+        identities_on_channel: list[ModuleIdentity] = []
+        identities_on_other_channels: list[ModuleIdentity] = []
+        for identity in identities_by_node[node]:
             if identity.channel == channel:
-                on_its_channel.append(identity)
+                identities_on_channel.append(identity)
             else:
-                on_other_channels.append(identity)
-        errors += _node_errors(subject, on_its_channel, on_other_channels)
-        for identity in on_its_channel:
-            errors += _identity_errors(subject, identity, lockstep=lockstep)
+                identities_on_other_channels.append(identity)
+        errors += _find_node_errors(subject, identities_on_channel, identities_on_other_channels)
+        for identity in identities_on_channel:
+            errors += _find_identity_errors(subject, identity, lockstep=lockstep)
     for identity in identities:
-        if identity.node not in channel_of_node:
+        if identity.node not in channel_by_node:
             errors.append(
                 f"node {identity.node} with serial {identity.serial:08X} on {identity.channel} is not a joint of this "
                 f"robot"
@@ -152,18 +154,26 @@ def discovery_errors(
     return errors
 
 
-def _node_errors(subject: str, here: Sequence[ModuleIdentity], elsewhere: Sequence[ModuleIdentity]) -> list[str]:
+def _find_node_errors(
+    subject: str,
+    identities_on_channel: Sequence[ModuleIdentity],
+    identities_on_other_channels: Sequence[ModuleIdentity],
+) -> list[str]:
     """Return errors of a joint whose module is missing, or is there more than once."""
-    if not here:
+    if not identities_on_channel:
         hint = ""
-        if elsewhere:
-            hint = f"; a node {elsewhere[0].node} answers on {elsewhere[0].channel}"
+        if identities_on_other_channels:
+            hint = (
+                f"; a node {identities_on_other_channels[0].node} answers on {identities_on_other_channels[0].channel}"
+            )
         return [f"{subject} does not answer{hint}"]
     errors: list[str] = []
-    if len(here) > 1:
-        serials = " and ".join(f"{identity.serial:08X}" for identity in here)
-        errors.append(f"{subject} answers {len(here)} times, serials {serials}: give each module its own node id")
-    for identity in elsewhere:
+    if len(identities_on_channel) > 1:
+        serials = " and ".join(f"{identity.serial:08X}" for identity in identities_on_channel)
+        errors.append(
+            f"{subject} answers {len(identities_on_channel)} times, serials {serials}: give each module its own node id"
+        )
+    for identity in identities_on_other_channels:
         errors.append(
             f"{subject} is duplicated on {identity.channel}, serial {identity.serial:08X}: give that one another node "
             f"id"
@@ -171,7 +181,7 @@ def _node_errors(subject: str, here: Sequence[ModuleIdentity], elsewhere: Sequen
     return errors
 
 
-def _identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: bool) -> list[str]:
+def _find_identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: bool) -> list[str]:
     """Return errors of a module whose protocol or clock does not match this driver's."""
     errors: list[str] = []
     if identity.protocol != PROTOCOL_VERSION:
@@ -189,7 +199,7 @@ def _identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: bool) 
 def configure_modules(
     buses: Sequence[ModuleBus],
     new_values: Mapping[int, Mapping[ModuleParameter, float]],
-    limit_s: float,
+    timeout_s: float,
     on_frame: Callable[[Frame], None] | None = None,
 ) -> dict[int, dict[ModuleParameter, float]]:
     """Write parameters to modules, and read all others.
@@ -197,54 +207,59 @@ def configure_modules(
     Every module gets one request at a time, so that each answer is known to be that of the newest request.
 
     Args:
-        buses: the buses, with the nodes on them.
-        new_values: parameters to write, by node.
-        limit_s: how long to wait at most.
-        on_frame: gets all frames that are no expected answers.
+        buses: The buses, with the nodes on them.
+        new_values: Parameters to write, by node.
+        timeout_s: Maximum duration to wait.
+        on_frame: Function that is called with all frames that are not expected responses; None to ignore them.
 
     Returns:
-        The present value of every parameter, by node.
+        The current value of every parameter, by node.
 
     Raises:
-        BackendError: a module did not answer in time, or refused a value.
+        BackendError: A module did not respond in time, or refused a value.
     """
-    wire_of = {node: bus.wire for bus in buses for node in bus.nodes}
+    wire_by_node = {node: bus.wire for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
-    answer_layout = load_layouts()[Opcode.PARAMETER_ANSWER]
-    due = {node: list(ModuleParameter) for node in new_values}  # not answered yet
-    requested_at_s: dict[int, float] = {}  # when the request that a node has not answered was sent
-    in_force: dict[int, dict[ModuleParameter, float]] = {node: {} for node in new_values}
-    end_s = time.monotonic() + limit_s
-    while due:
+    response_layout = load_layouts()[Opcode.PARAMETER_ANSWER]
+    remaining_parameters_by_node = {node: list(ModuleParameter) for node in new_values}  # not answered yet
+    request_time_by_node_s: dict[int, float] = {}  # when the request that a node has not answered was sent
+    current_values: dict[int, dict[ModuleParameter, float]] = {node: {} for node in new_values}
+    deadline_s = time.monotonic() + timeout_s
+    while remaining_parameters_by_node:
         now_s = time.monotonic()
-        if now_s > end_s:
+        if now_s > deadline_s:
             raise BackendError(
-                f"no answer about parameters from node {', '.join(map(str, due))} within {limit_s:g} s",
+                f"no answer about parameters from node {', '.join(map(str, remaining_parameters_by_node))} within "
+                f"{timeout_s:g} s",
                 code="drive/silent",
             )
-        for node, parameters in due.items():
-            if now_s - requested_at_s.get(node, -1.0) > ASK_EVERY_S:
+        for node, parameters in remaining_parameters_by_node.items():
+            if now_s - request_time_by_node_s.get(node, -1.0) > REQUEST_PERIOD_S:
                 parameter = parameters[0]
                 request = _make_request(node, parameter, new_values[node].get(parameter))
-                if wire_of[node].send(request):
-                    requested_at_s[node] = now_s
+                if wire_by_node[node].send(request):
+                    request_time_by_node_s[node] = now_s
         for _, frame in receive_frames(wires):
             node = parse_node(frame.id)
-            is_answer = parse_opcode(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_layout.length
-            if not is_answer or not due.get(node):
+            is_response = (
+                parse_opcode(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == response_layout.length
+            )
+            if not is_response or not remaining_parameters_by_node.get(node):
                 if on_frame is not None:
                     on_frame(frame)
                 continue
-            answer = answer_layout.decode(frame.data)
-            parameter = due[node][0]
-            if answer["index"] != parameter:
+            response = response_layout.decode(frame.data)
+            parameter = remaining_parameters_by_node[node][0]
+            if response["index"] != parameter:
                 continue
-            due[node].pop(0)
-            requested_at_s.pop(node, None)
-            _check_result(node, parameter, new_values[node].get(parameter), int(answer["result"]))
-            in_force[node][parameter] = answer["value"]
-        due = {node: parameters for node, parameters in due.items() if parameters}
-    return in_force
+            remaining_parameters_by_node[node].pop(0)
+            request_time_by_node_s.pop(node, None)
+            _raise_if_refused(node, parameter, new_values[node].get(parameter), int(response["result"]))
+            current_values[node][parameter] = response["value"]
+        remaining_parameters_by_node = {
+            node: parameters for node, parameters in remaining_parameters_by_node.items() if parameters
+        }
+    return current_values
 
 
 def _make_request(node: int, parameter: ModuleParameter, value: float | None) -> Frame:
@@ -255,7 +270,7 @@ def _make_request(node: int, parameter: ModuleParameter, value: float | None) ->
     return layout.encode(node, index=parameter, operation=ParameterOperation.WRITE, value=value)
 
 
-def _check_result(node: int, parameter: ModuleParameter, value: float | None, result: int) -> None:
+def _raise_if_refused(node: int, parameter: ModuleParameter, value: float | None, result: int) -> None:
     """Raise BackendError if a module refused a request."""
     if result == ParameterResult.DONE:
         return

@@ -12,14 +12,14 @@ from pathlib import Path
 
 from snakesim_can_backend.bus.adapter import open_wire
 from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, make_virtual_channel, wait
-from snakesim_can_backend.bus.load import joints_per_bus, plan_reports, worst_frame_bits
+from snakesim_can_backend.bus.load import compute_max_frame_bits, count_joints_per_bus, plan_reports
 from snakesim_can_backend.bus.log import LoggedWire, open_log
-from snakesim_can_backend.driver.bring_up import ModuleBus, configure_modules, discovery_errors, find_modules
-from snakesim_can_backend.driver.module_monitor import ARM_GRACE, ModuleMonitor
-from snakesim_can_backend.driver.own_emulators import EmulatorProcess, start_local_emulators, supports_fault
-from snakesim_can_backend.driver.parameters import check_ratings, plan_parameters
+from snakesim_can_backend.driver.bring_up import ModuleBus, configure_modules, find_discovery_errors, find_modules
+from snakesim_can_backend.driver.module_monitor import ARM_GRACE_SYNCS, ModuleMonitor
+from snakesim_can_backend.driver.own_emulators import EmulatorProcess, start_in_process_emulators, supports_fault
+from snakesim_can_backend.driver.parameters import plan_parameters, validate_ratings
 from snakesim_can_backend.driver.reports import ModuleReports, ModuleStatus
-from snakesim_can_backend.driver.sensors import contacts_due
+from snakesim_can_backend.driver.sensors import are_contacts_due
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
@@ -32,11 +32,11 @@ from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import LifecycleState
 
-ANSWER_MARGIN = 1.25  # on the bus time that all answers take
-ANSWER_SLACK_S = 0.002  # latency of the adapter and of this process
-MAX_OF_PERIOD = 0.75  # the rest of a period is for the controller
-CONFIGURE_LIMIT_S = 1.0  # while the robot is up; an emergency stop waits no longer than that, with motors off
-LOCKSTEP_ANSWER_S = 2.0  # to wait for slow emulators; dead ones are not waited for again
+RESPONSE_TIME_FACTOR = 1.25  # on the bus time that all answers take
+RESPONSE_LATENCY_S = 0.002  # latency of the adapter and of this process
+MAX_RESPONSE_PERIOD_FRACTION = 0.75  # the rest of a period is for the controller
+CONFIGURE_TIMEOUT_S = 1.0  # while the robot is up; an emergency stop waits no longer than that, with motors off
+LOCKSTEP_RESPONSE_TIMEOUT_S = 2.0  # to wait for slow emulators; dead ones are not waited for again
 FIRST_STATE_SYNCS = 20  # within which every module must send its first state
 FIRST_STATE_PAUSE_S = 0.02
 FAULTS_OF_KILLED_DRIVER = {"watchdog", "stream"}  # of a module whose driver ended without disarming it
@@ -57,20 +57,25 @@ class JointModules(Drives):
     """All joint modules of a robot. Joint i is node i + 1."""
 
     def __init__(
-        self, config: RunConfig, settings: CanSettings, clock: DriverClock, pose: str | None, readings: DriveReadings
+        self,
+        config: RunConfig,
+        settings: CanSettings,
+        clock: DriverClock,
+        pose_address: str | None,
+        readings: DriveReadings,
     ) -> None:
         """Open the buses. Nothing is requested from a module yet.
 
         Args:
-            config: the run, with the robot.
-            settings: settings of the backend.
-            clock: time of the driver.
-            pose: address, HOST:PORT, to which emulators of this driver send motion capture; None: nowhere.
-            readings: gets the serial number and the firmware version of every module.
+            config: Configuration of the run, with the robot.
+            settings: Settings of the backend.
+            clock: Clock of the driver.
+            pose_address: HOST:PORT to which emulators of this driver send motion capture; None if they do not send.
+            readings: Object that stores the serial number and the firmware version of every module.
 
         Raises:
-            ConfigError: the settings are impossible.
-            BackendError: a bus cannot be opened, or the emulators cannot be started.
+            ConfigError: The joints do not fit on the buses, or the log cannot be written.
+            BackendError: A bus cannot be opened, or the emulators cannot be started.
         """
         # Configuration.
         self._config = config
@@ -79,53 +84,57 @@ class JointModules(Drives):
         self._readings = readings
         self._lockstep = config.clock_mode == "lockstep"
         self._reports = plan_reports(config, settings)
-        self._names = [joint.name for joint in config.robot.joint_table]
+        self._joint_names = [joint.name for joint in config.robot.joint_table]
 
         # Modules.
-        self.reading = ModuleReports(len(self._names))
-        self._setpoints = commands.SetpointWriter(len(self._names))
-        self._unconfigured = set(range(len(self._names)))  # joints whose parameters may differ from the robot file
+        self.module_reports = ModuleReports(len(self._joint_names))
+        self._setpoints = commands.SetpointWriter(len(self._joint_names))
+        self._unconfigured_joints = set(
+            range(len(self._joint_names))
+        )  # joints whose parameters may differ from the robot file
         # Whether no other host uses the modules: before that is known, nothing that disturbs them is sent.
         self._is_only_host = False
 
         # Lifecycle.
         self._lifecycle: LifecycleState = "disarmed"
-        self._isolated: frozenset[int] = frozenset()  # isolated joints: motors off, and no setpoints
+        self._isolated_joints: frozenset[int] = frozenset()  # isolated joints: motors off, and no setpoints
         self._arm_session = ArmSession()
-        self._arm_is_due = False  # whether the lifecycle became armed in this cycle
-        self._all_cleared = False  # whether the lifecycle left a latched state in this cycle
+        self._is_arm_due = False  # whether the lifecycle became armed in this cycle
+        self._was_clear_broadcast = False  # whether the lifecycle left a latched state in this cycle
 
         # Buses.
         self.wires: list[Wire] = []
         self.local_emulators: VirtualPeer | None = None
-        self._emulators: EmulatorProcess | None = None
-        self._unsent: list[str] = []  # channels that rejected a frame in this cycle
-        self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else FIRST_STATE_PAUSE_S
+        self._emulator_process: EmulatorProcess | None = None
+        self._rejecting_channels: list[str] = []  # channels that rejected a frame in this cycle
+        self._response_timeout_s = LOCKSTEP_RESPONSE_TIMEOUT_S if self._lockstep else FIRST_STATE_PAUSE_S
         try:
-            self._buses = self._open_buses(joints_per_bus(config, settings), pose)
+            self._buses = self._open_buses(count_joints_per_bus(config, settings), pose_address)
         except BaseException:
             self.close()
             raise
-        self._wire_of = [bus.wire for bus in self._buses for _ in bus.nodes]  # by joint
-        channels = [wire.channel for wire in self._wire_of]
-        self.monitor = ModuleMonitor(self._names, channels, config.period_ns * 1e-9)
+        self._wire_by_joint = [bus.wire for bus in self._buses for _ in bus.nodes]  # by joint
+        channels = [wire.channel for wire in self._wire_by_joint]
+        self.monitor = ModuleMonitor(self._joint_names, channels, config.period_ns * 1e-9)
 
     # --- Drives -----------------------------------------------------------------------------------------------
 
     def bring_up(self) -> None:
-        """Find every module, check it, and write its parameters; nothing is enabled.
+        """Find every module, check it, write its parameters, and wait for its first joint state; nothing is enabled.
+
+        Faults that a killed driver has left are cleared.
 
         Raises:
-            BackendError: a module is missing or wrong, or another host commands the modules.
+            BackendError: A module is missing or wrong, or another host commands the modules.
         """
-        limit_s = self._settings.bring_up_limit_s
-        identities = find_modules(self._buses, limit_s, self.reading.process_frame)
-        if self.reading.from_other_host:
+        timeout_s = self._settings.bring_up_limit_s
+        identities = find_modules(self._buses, timeout_s, self.module_reports.process_frame)
+        if self.module_reports.other_host_frame_counts:
             raise BackendError(
                 "another program commands the modules on this bus; end it first. Nothing was sent",
                 code="bus/second-host",
             )
-        errors = discovery_errors(self._buses, identities, self._names, lockstep=self._lockstep)
+        errors = find_discovery_errors(self._buses, identities, self._joint_names, lockstep=self._lockstep)
         if errors:
             raise BackendError(
                 "the robot is not complete; nothing was enabled:",
@@ -138,137 +147,147 @@ class JointModules(Drives):
             joint = identity.node - 1
             self._readings.set_identity(joint, serial=f"{identity.serial:08X}", firmware=identity.firmware)
         self._broadcast(commands.make_command(CommandAction.DISARM))
-        self._configure(limit_s)
-        self._await_first_states()
+        self._configure_modules(timeout_s)
+        self._wait_for_first_states()
         self._clear_faults_of_killed_driver()
-        self._answer_limit_s = answer_limit_s(self._config, self._settings)
+        self._response_timeout_s = compute_response_timeout_s(self._config, self._settings)
 
     def read(self) -> None:
-        """Send a Sync, at which all modules sample their sensors, and collect their answers for a limited time.
+        """Send a Sync, at which all modules sample their sensors, and receive their responses until a timeout.
 
-        A module that does not answer in time keeps its last values.
+        A module that does not respond in time keeps its last values.
         """
-        reading = self.reading
-        queries = self._lockstep_queries()
+        module_reports = self.module_reports
+        queries = self._make_lockstep_queries()
         time_us = self._clock.now_ns() // 1000
         self._receive()
-        sync = reading.sync + 1
-        contacts = contacts_due(self._reports, sync)
-        reading.begin_sync(sync, contacts=contacts, tail=self._reports.tail, questions=len(queries))
+        sync = module_reports.sync + 1
+        contacts = are_contacts_due(self._reports, sync)
+        module_reports.start_sync(sync, contacts=contacts, tail=self._reports.tail, questions=len(queries))
         frame = commands.make_sync(sync, time_us)
-        self._unsent = [wire.channel for wire in self.wires if not wire.send(frame)]
+        self._rejecting_channels = [wire.channel for wire in self.wires if not wire.send(frame)]
         for wire, query in queries:
             wire.send(query)
-        if reading.complete:  # no answer is expected; but emulators in this process run only while this one waits
+        if module_reports.is_complete:  # no response is expected; but emulators in this process run only in `wait`
             wait(self.wires, 0.0)
-        deadline_s = time.monotonic() + self._answer_limit_s
-        while not reading.complete:
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0 or not wait(self.wires, left_s):
+        deadline_s = time.monotonic() + self._response_timeout_s
+        while not module_reports.is_complete:
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0 or not wait(self.wires, remaining_s):
                 break
             self._receive()
 
-    def announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
-        """Send the commands that follow from the robot's lifecycle, except Arm, which `send_setpoints` sends.
+    def send_lifecycle_commands(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+        """Send the commands that a change of the robot's lifecycle state requires, except Arm.
 
-        Call it before anything else in a cycle, because the rest may take a while. Modules that missed an earlier
-        command get it again.
+        `send_setpoints` sends Arm later in the same cycle. Call this method before anything else in a cycle, because
+        the rest may take a while. Modules that missed an earlier command get it again.
 
         Args:
-            lifecycle: state of the robot in this cycle.
-            isolated: joints whose modules are disarmed and get no setpoints.
+            lifecycle: Lifecycle state of the robot in this cycle.
+            isolated: Joints whose modules are disarmed and get no setpoints.
         """
-        before = self._lifecycle
+        previous_lifecycle = self._lifecycle
         self._lifecycle = lifecycle
-        if lifecycle == before:
+        if lifecycle == previous_lifecycle:
             self._repeat_missed_commands(lifecycle)
         elif lifecycle == "armed":
-            self._arm_session = ArmSession(self.reading.sync)
+            self._arm_session = ArmSession(self.module_reports.sync)
 
-        frames = commands.make_transition_frames(before, lifecycle)
-        self._arm_is_due = any(commands.is_arm_command(frame) for frame in frames)
-        self._all_cleared = before in commands.LATCHED
+        frames = commands.make_transition_frames(previous_lifecycle, lifecycle)
+        self._is_arm_due = any(commands.is_arm_command(frame) for frame in frames)
+        self._was_clear_broadcast = previous_lifecycle in commands.LATCHED
         for frame in frames:
             if not commands.is_arm_command(frame):
                 self._broadcast(frame)
 
-        newly_isolated = isolated - self._isolated
-        self._isolated = isolated
+        newly_isolated = isolated - self._isolated_joints
+        self._isolated_joints = isolated
         for joint in sorted(newly_isolated):
             self._send_command(CommandAction.DISARM, joint)
 
     def reset_faults(self, joints: frozenset[int]) -> None:
         """Clear the faults of some joints' modules, and configure modules whose parameters may have changed.
 
-        They are configured once, while motors are off. A module that does not accept its parameters then is reported
-        as a fault, and nothing is armed.
+        Modules are configured while motors are off. A module that does not accept its parameters is reported as a
+        fault, and nothing is armed.
+
+        Args:
+            joints: Indices of the joints whose faults the operator has reset.
         """
-        self.monitor.reset(self.reading.sync)
-        if not self._all_cleared:  # otherwise `announce` has sent a Clear to all modules
+        self.monitor.reset(self.module_reports.sync)
+        if not self._was_clear_broadcast:  # otherwise `send_lifecycle_commands` has sent a Clear to all modules
             for joint in sorted(joints):
                 self._send_command(CommandAction.CLEAR, joint)
-        if self._unconfigured:
+        if self._unconfigured_joints:
             try:
-                self._configure(CONFIGURE_LIMIT_S)
+                self._configure_modules(CONFIGURE_TIMEOUT_S)
             except BackendError as error:
                 _log.warning("after a clear: %s", error)
 
     def send_setpoints(self, command: BusCommand) -> None:
-        """Send the setpoints while the robot is armed. Otherwise send none, and the modules come to rest by themselves.
+        """Send Arm if it is due, and setpoints while the robot is armed.
+
+        Without setpoints the modules come to rest by themselves.
 
         Args:
-            command: setpoints of all joints, and which of them follow. `may_enable` and `emergency` are not used,
-                because `announce` arms, disarms and stops modules.
+            command: Setpoints of all joints, and which are enabled. `may_enable` and `emergency` are not used,
+                because `send_lifecycle_commands` arms, disarms and stops modules.
         """
-        must_not_arm = self._unconfigured - self._isolated
-        if self._arm_is_due and not must_not_arm:
-            self._arm()
-        self._arm_is_due = False
+        unconfigured_joints = self._unconfigured_joints - self._isolated_joints
+        if self._is_arm_due and not unconfigured_joints:
+            self._send_arm()
+        self._is_arm_due = False
         if self._lifecycle != "armed":
             return
         for joint, frame in enumerate(self._setpoints.encode(command.modes, command.targets, command.limits_nm)):
-            if joint not in command.following:
+            if joint not in command.enabled_drives:
                 continue
-            wire = self._wire_of[joint]
+            wire = self._wire_by_joint[joint]
             if wire.send(frame):
                 self._setpoints.confirm_sent(joint)
             else:  # the queue is full or the interface down: the next setpoint replaces this one
-                self._unsent.append(wire.channel)
+                self._rejecting_channels.append(wire.channel)
 
     def findings(self) -> list[Finding]:
         """Return the new faults that modules and buses report, or that the monitor detects."""
         errors = [error for wire in self.wires for error in wire.errors()]
         findings = self.monitor.find_faults(
-            self.reading, self._lifecycle, errors, self._unsent, self._unconfigured, self._isolated
+            self.module_reports,
+            self._lifecycle,
+            errors,
+            self._rejecting_channels,
+            self._unconfigured_joints,
+            self._isolated_joints,
         )
-        self._unconfigured |= self.monitor.take_changed()
+        self._unconfigured_joints |= self.monitor.pop_changed_joints()
         return findings
 
     def poll(self) -> None:
         """Process the frames that have arrived meanwhile.
 
         Raises:
-            BackendError: the emulators of this driver have ended.
+            BackendError: The emulators of this driver have ended.
         """
-        if self._emulators is not None:
-            ended = self._emulators.describe_exit()
+        if self._emulator_process is not None:
+            ended = self._emulator_process.describe_exit()
             if ended is not None:
                 raise BackendError(ended)
         self._receive()
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault of a bus or of an emulated module of this driver.
+        """Start or end an injected fault of a bus or of an emulated module of this driver.
 
         Returns:
-            False for a fault of something else.
+            True if the fault was started or ended; False for a fault of something else.
 
         Raises:
-            ConfigError: there is no such bus or joint.
+            ConfigError: There is no such bus or joint.
         """
         if inject_into(self.wires, injection, begins=begins):
             return True
-        emulators = self._emulators or self.local_emulators
-        if emulators is None or not supports_fault(injection, len(self._wire_of)):
+        emulators = self._emulator_process or self.local_emulators
+        if emulators is None or not supports_fault(injection, len(self._wire_by_joint)):
             return False
         emulators.inject(injection, begins=begins)
         return True
@@ -277,37 +296,41 @@ class JointModules(Drives):
         """Switch the motors off, close the buses, and end the emulators of this driver."""
         for wire in self.wires:
             self._close_wire(wire)
-        if self._emulators is not None:
-            self._emulators.stop()
+        if self._emulator_process is not None:
+            self._emulator_process.stop()
 
     # --- opening and closing ----------------------------------------------------------------------------------
 
-    def _open_buses(self, joints_of_buses: list[int], pose: str | None) -> list[ModuleBus]:
+    def _open_buses(self, joint_counts: list[int], pose_address: str | None) -> list[ModuleBus]:
         """Open every bus, and start the emulators if the settings ask for them.
 
+        The open buses are stored in `wires` at once, so that `close` closes them after an error, too.
+
         Args:
-            joints_of_buses: number of joints on each bus, tail to head.
-            pose: address, HOST:PORT, to which emulators send motion capture; None: nowhere.
+            joint_counts: Number of joints on each bus, from tail to head.
+            pose_address: HOST:PORT to which emulators send motion capture; None if they do not send.
 
         Returns:
             The buses, with the nodes that are expected on each of them.
         """
         settings = self._settings
         if settings.emulators_run == "process":
-            self._emulators = EmulatorProcess(self._config, settings, pose, stepped=self._lockstep)
+            self._emulator_process = EmulatorProcess(self._config, settings, pose_address, stepped=self._lockstep)
         if settings.channels:
             for channel in settings.channels:
                 self.wires.append(open_wire(channel, bit_rate=settings.bit_rate))
         else:
             channel = make_virtual_channel()
-            self.local_emulators = start_local_emulators(self._config, settings, channel, pose, stepped=self._lockstep)
+            self.local_emulators = start_in_process_emulators(
+                self._config, settings, channel, pose_address, stepped=self._lockstep
+            )
             self.wires.append(VirtualWire(channel, self.local_emulators))
         if settings.log:
             log = open_log(Path(settings.log))
             self.wires = [LoggedWire(wire, log) for wire in self.wires]
         buses: list[ModuleBus] = []
-        first_node = 1
-        for wire, joints in zip(self.wires, joints_of_buses, strict=True):
+        first_node = 1  # node ids count from 1, from tail to head over all buses
+        for wire, joints in zip(self.wires, joint_counts, strict=True):
             buses.append(ModuleBus(wire, range(first_node, first_node + joints)))
             first_node += joints
         return buses
@@ -325,25 +348,25 @@ class JointModules(Drives):
         except BackendError as error:
             _log.warning("closing: %s", error)
 
-    def _configure(self, limit_s: float) -> None:
+    def _configure_modules(self, timeout_s: float) -> None:
         """Write the parameters of every module that needs them. Raises BackendError."""
-        planned = plan_parameters(self._config.robot, self._settings, self._reports)
-        due = {joint + 1: planned[joint + 1] for joint in self._unconfigured}
+        parameters_by_node = plan_parameters(self._config.robot, self._settings, self._reports)
+        due = {joint + 1: parameters_by_node[joint + 1] for joint in self._unconfigured_joints}
         try:
-            in_force = configure_modules(self._buses, due, limit_s, self.reading.process_frame)
-            check_ratings(self._config.robot, in_force)
+            current_values = configure_modules(self._buses, due, timeout_s, self.module_reports.process_frame)
+            validate_ratings(self._config.robot, current_values)
         finally:
-            self.reading.reset_frame_counts()  # the frames arrived over more than one period
-        self._unconfigured.clear()
+            self.module_reports.reset_frame_counts()  # the frames arrived over more than one period
+        self._unconfigured_joints.clear()
 
-    def _await_first_states(self) -> None:
+    def _wait_for_first_states(self) -> None:
         """Send Syncs until every module has answered one. Raises BackendError."""
         for _ in range(FIRST_STATE_SYNCS):
             self.read()
-            if all(module.sync >= 0 for module in self.reading.modules):
-                self.reading.unknown_nodes.clear()
+            if all(module.sync >= 0 for module in self.module_reports.modules):
+                self.module_reports.unknown_node_frame_counts.clear()
                 return
-        modules = zip(self._names, self.reading.modules, strict=True)
+        modules = zip(self._joint_names, self.module_reports.modules, strict=True)
         silent = [name for name, module in modules if module.sync < 0]
         raise BackendError(
             f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled", code="drive/silent"
@@ -352,11 +375,11 @@ class JointModules(Drives):
     def _clear_faults_of_killed_driver(self) -> None:
         """Clear the faults that a killed driver has left; but not heat, leaks and emergencies."""
         for _ in range(FIRST_STATE_SYNCS):  # the reason of a fault comes in a later heartbeat
-            if all(module.faults or module.state != ModuleState.FAULT for module in self.reading.modules):
+            if all(module.faults or module.state != ModuleState.FAULT for module in self.module_reports.modules):
                 break
             time.sleep(FIRST_STATE_PAUSE_S)
             self.read()
-        for joint, module in enumerate(self.reading.modules):
+        for joint, module in enumerate(self.module_reports.modules):
             faults = module.fault_names()
             has_only_such_faults = bool(faults) and set(faults) <= FAULTS_OF_KILLED_DRIVER
             if module.state == ModuleState.FAULT and has_only_such_faults:
@@ -366,22 +389,22 @@ class JointModules(Drives):
     # --- receiving --------------------------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        process_frame = self.reading.process_frame
+        process_frame = self.module_reports.process_frame
         for wire in self.wires:
             for frame in wire.receive():
                 process_frame(frame)
 
-    def _lockstep_queries(self) -> list[tuple[Wire, Frame]]:
+    def _make_lockstep_queries(self) -> list[tuple[Wire, Frame]]:
         """Return one query for each bus of emulators in lockstep, to be sent after the next Sync.
 
         Some reports come only at some Syncs, so that a missing one might still be on its way. Once a query is answered,
         all earlier frames have arrived.
         """
-        if self._emulators is None or not self._lockstep:
+        if self._emulator_process is None or not self._lockstep:
             return []
         queries: dict[str, tuple[Wire, Frame]] = {}
-        for module, wire in zip(self.reading.modules, self._wire_of, strict=True):
-            answered_newest_sync = module.sync >= 0 and module.sync == self.reading.sync
+        for module, wire in zip(self.module_reports.modules, self._wire_by_joint, strict=True):
+            answered_newest_sync = module.sync >= 0 and module.sync == self.module_reports.sync
             if answered_newest_sync:
                 queries.setdefault(wire.channel, (wire, commands.make_query(module.node)))
         return list(queries.values())
@@ -389,7 +412,7 @@ class JointModules(Drives):
     # --- sending ----------------------------------------------------------------------------------------------
 
     def _send_command(self, action: CommandAction, joint: int) -> None:
-        self._wire_of[joint].send(commands.make_command(action, joint + 1))
+        self._wire_by_joint[joint].send(commands.make_command(action, joint + 1))
 
     def _broadcast(self, frame: Frame) -> None:
         """Send a frame to all buses; an error of one does not prevent sending on the others."""
@@ -402,52 +425,56 @@ class JointModules(Drives):
         if failure is not None:
             raise failure
 
-    def _arm(self) -> None:
+    def _send_arm(self) -> None:
         """Send Arm to all modules, except isolated ones."""
-        if not self._isolated:
+        if not self._isolated_joints:
             self._broadcast(commands.make_command(CommandAction.ARM))
             return
-        for joint in range(len(self._wire_of)):
-            if joint not in self._isolated:
+        for joint in range(len(self._wire_by_joint)):
+            if joint not in self._isolated_joints:
                 self._send_command(CommandAction.ARM, joint)
 
     def _repeat_missed_commands(self, lifecycle: LifecycleState) -> None:
         """Repeat a command to every module that is not in the state that the lifecycle demands."""
-        for joint, module in enumerate(self.reading.modules):
+        for joint, module in enumerate(self.module_reports.modules):
             if lifecycle == "armed":
-                self._repeat_while_armed(joint, module)
+                self._repeat_arm_or_disarm(joint, module)
             else:
-                self._send_reminder(lifecycle, joint, module)
+                self._repeat_command(lifecycle, joint, module)
 
-    def _repeat_while_armed(self, joint: int, module: ModuleStatus) -> None:
+    def _repeat_arm_or_disarm(self, joint: int, module: ModuleStatus) -> None:
         """Disarm an isolated module, and arm any other that missed the Arm of this session.
 
         A module that was armed in this session, and no longer is, has been stopped: it is not armed again.
         """
-        if joint in self._isolated:
+        if joint in self._isolated_joints:
             if module.state in (ModuleState.ARMED, ModuleState.STOPPING):
                 self._send_command(CommandAction.DISARM, joint)
             return
         session = self._arm_session
         if module.state == ModuleState.ARMED:
             session.armed_joints.add(joint)
-        in_time = self.reading.sync - session.sync <= ARM_GRACE
-        must_not_arm = self._unconfigured - self._isolated
-        if in_time and not must_not_arm and joint not in session.armed_joints:
-            self._send_reminder("armed", joint, module)
+        in_time = self.module_reports.sync - session.sync <= ARM_GRACE_SYNCS
+        unconfigured_joints = self._unconfigured_joints - self._isolated_joints
+        if in_time and not unconfigured_joints and joint not in session.armed_joints:
+            self._repeat_command("armed", joint, module)
 
-    def _send_reminder(self, lifecycle: LifecycleState, joint: int, module: ModuleStatus) -> None:
-        frame = commands.make_reminder(lifecycle, module.state, module.node)
+    def _repeat_command(self, lifecycle: LifecycleState, joint: int, module: ModuleStatus) -> None:
+        frame = commands.make_repeated_command(lifecycle, module.state, module.node)
         if frame is not None:
-            self._wire_of[joint].send(frame)
+            self._wire_by_joint[joint].send(frame)
 
 
-def answer_limit_s(config: RunConfig, settings: CanSettings) -> float:
-    """Return how long all answers to a Sync may take on the fullest bus; the rest of a period is for the controller."""
+def compute_response_timeout_s(config: RunConfig, settings: CanSettings) -> float:
+    """Return how long the driver waits for all responses to a Sync, in s.
+
+    This is the bus time of all responses on the bus with the most joints, with a margin. The rest of a control period
+    is for the controller. In lockstep the wait is long, because emulators may be slow.
+    """
     if config.clock_mode == "lockstep":
-        return LOCKSTEP_ANSWER_S
+        return LOCKSTEP_RESPONSE_TIMEOUT_S
     reports = plan_reports(config, settings)
     frames_per_joint = 1 + (reports.contact_every > 0)
-    frames = max(joints_per_bus(config, settings)) * frames_per_joint + reports.tail
-    bus_s = frames * worst_frame_bits(FRAME_BYTES) / reports.bit_rate
-    return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MAX_OF_PERIOD / reports.rate_hz)
+    frames = max(count_joints_per_bus(config, settings)) * frames_per_joint + reports.tail
+    bus_time_s = frames * compute_max_frame_bits(FRAME_BYTES) / reports.bit_rate
+    return min(RESPONSE_TIME_FACTOR * bus_time_s + RESPONSE_LATENCY_S, MAX_RESPONSE_PERIOD_FRACTION / reports.rate_hz)

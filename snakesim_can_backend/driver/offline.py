@@ -13,9 +13,9 @@ import can
 import numpy as np
 
 from snakesim_can_backend.bus.load import ReportSchedule
-from snakesim_can_backend.bus.unknown_frames import guess_origin, matches_protocol
+from snakesim_can_backend.bus.unknown_frames import guess_frame_origin, is_joint_module_frame
 from snakesim_can_backend.driver.reports import ModuleReports
-from snakesim_can_backend.driver.sensors import contacts_due, joint_values
+from snakesim_can_backend.driver.sensors import are_contacts_due, to_joint_values
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode, parse_opcode
 from snakesim_drivers.mounting import Mounting
@@ -25,7 +25,7 @@ from snakesim_hal.run_log.black_box import Layout
 SYNC_BYTES = load_layouts()[Opcode.SYNC].length
 SYNC_COUNT_MASK = 0xFF  # the first byte of a Sync is the lowest 8 bits of its number
 MAX_BRING_UP_SYNCS = 64  # before the first tick
-VALUES = ("angle_rad", "velocity_rad_s", "torque_nm")
+QUANTITIES = ("angle_rad", "velocity_rad_s", "torque_nm")
 
 
 class LogReplay:
@@ -35,16 +35,16 @@ class LogReplay:
         """Prepare to read the log of a bus as the driver would have read the bus.
 
         Args:
-            mounting: converts shaft angles and torques of the modules into those of the joints: sign, gear, zero.
-            schedule: which reports the modules send, and how often.
-            answer_limit_s: how long the driver waits for the answers to a Sync.
+            mounting: Sign, gear and zero of every joint, to convert values at the modules' shafts to the joints.
+            schedule: Which reports the modules send, and how often.
+            answer_limit_s: How long the driver waits for the answers to a Sync.
         """
         joints = len(mounting.sign)
         self._mounting = mounting
         self._schedule = schedule
-        self._answer_limit_s = answer_limit_s
+        self._response_timeout_s = answer_limit_s
         # Log time at which the wait for the answers to the newest Sync ends; None: its sample has been taken.
-        self._answer_deadline_s: float | None = None
+        self._response_deadline_s: float | None = None
         self.reports = ModuleReports(joints)
 
         # Results.
@@ -60,23 +60,23 @@ class LogReplay:
         taken.
         """
         for (time_s, _), messages in groupby(log, key=lambda message: (message.timestamp, message.channel)):
-            if self._answer_deadline_s is not None and time_s > self._answer_deadline_s:
+            if self._response_deadline_s is not None and time_s > self._response_deadline_s:
                 self._take_sample()
             for message in messages:
                 self._read_message(message, time_s)
-            if self._answer_deadline_s is not None and self.reports.complete:
+            if self._response_deadline_s is not None and self.reports.is_complete:
                 self._take_sample()
 
     def _read_message(self, message: can.Message, time_s: float) -> None:
         """Count a message of the log, and process it as the driver would when it arrives on the bus.
 
         Args:
-            message: the frame, or an error that the bus reported.
-            time_s: its time in the log.
+            message: Frame of the log, or an error that the bus reported.
+            time_s: Time of the message in the log.
         """
         self.frames += 1
-        if not matches_protocol(message):
-            self.other_protocol_frames[guess_origin(message)] += 1
+        if not is_joint_module_frame(message):
+            self.other_protocol_frames[guess_frame_origin(message)] += 1
         is_standard_data_frame = not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
         if not is_standard_data_frame:
             return
@@ -91,25 +91,25 @@ class LogReplay:
         """Begin the tick of a Sync, and end the one before. A Sync is on every bus, and counts once.
 
         Args:
-            frame: the Sync, whose first byte is the lowest 8 bits of its number.
-            time_s: its time in the log.
+            frame: The Sync, whose first byte is the lowest 8 bits of its number.
+            time_s: Its time in the log.
         """
         count = frame.data[0]
         if count == self.reports.sync & SYNC_COUNT_MASK:  # the same Sync, on another bus
             return
-        if self._answer_deadline_s is not None:
+        if self._response_deadline_s is not None:
             self._take_sample()
         sync = self.reports.sync + 1
-        self.reports.begin_sync(sync, contacts=contacts_due(self._schedule, sync), tail=self._schedule.tail)
-        self._answer_deadline_s = time_s + self._answer_limit_s
+        self.reports.start_sync(sync, contacts=are_contacts_due(self._schedule, sync), tail=self._schedule.tail)
+        self._response_deadline_s = time_s + self._response_timeout_s
 
     def _take_sample(self) -> None:
         """Store the joint states of the newest Sync, and count the joints that did not answer it."""
-        self.joints.append(joint_values(self.reports, self._mounting))
+        self.joints.append(to_joint_values(self.reports, self._mounting))
         for joint, module in enumerate(self.reports.modules):
             if module.sync != self.reports.sync:
                 self.unanswered_syncs[joint] += 1
-        self._answer_deadline_s = None
+        self._response_deadline_s = None
 
 
 @dataclass(frozen=True)
@@ -124,26 +124,27 @@ def compare_with_run_log(replay: LogReplay, layout: Layout, rows: dict[str, Floa
     """Compare the joint states that were replayed from a bus log with those of every tick in the run log.
 
     Args:
-        replay: the replay of the bus log.
-        layout: layout of the run log, with the names of the joints.
-        rows: columns of the run log: "tick", and VALUES with shape (n_ticks, n_joints).
+        replay: Replay of the bus log, which has been read.
+        layout: Layout of the run log, with the names of the joints.
+        rows: Columns of the run log by name: "tick" with shape (n_ticks,), and all QUANTITIES with shape
+            (n_ticks, n_joints).
 
     Returns:
-        The number of compared ticks, and the first difference as text; empty if there is none.
+        The number of compared ticks, and the first difference as text, which is empty if there is none.
     """
-    recorded = np.stack([rows[name] for name in VALUES], axis=1)  # (n_ticks, 3, n_joints)
+    recorded = np.stack([rows[name] for name in QUANTITIES], axis=1)  # (n_ticks, 3, n_joints)
     ticks = rows["tick"].astype(int)
     replayed = np.array(replay.joints).reshape(-1, *recorded.shape[1:])  # (n_syncs, 3, n_joints)
     bring_up_syncs, equal_ticks = _find_first_tick(replayed, recorded, ticks)
 
     syncs = ticks + bring_up_syncs
-    in_log = syncs < len(replayed)
-    compared = int(in_log.sum())
+    is_in_log = syncs < len(replayed)
+    compared = int(is_in_log.sum())
     if compared == 0:
         return ReplayComparison(0, "no tick of the record is in the log")
-    syncs = syncs[in_log]
-    ticks = ticks[in_log]
-    recorded = recorded[in_log]
+    syncs = syncs[is_in_log]
+    ticks = ticks[is_in_log]
+    recorded = recorded[is_in_log]
     differences = np.argwhere(replayed[syncs] != recorded)
     if not len(differences):
         return ReplayComparison(compared, "")
@@ -152,7 +153,7 @@ def compare_with_run_log(replay: LogReplay, layout: Layout, rows: dict[str, Floa
     replayed_value = replayed[syncs[row], value, joint]
     return ReplayComparison(
         compared,
-        f"tick {ticks[row]}, {layout.joints[joint]}, {VALUES[value]}: {recorded_value:.9g} in the record, "
+        f"tick {ticks[row]}, {layout.joints[joint]}, {QUANTITIES[value]}: {recorded_value:.9g} in the record, "
         f"{replayed_value:.9g} in the log; {compared - equal_ticks} of {compared} ticks differ",
     )
 
@@ -163,13 +164,13 @@ def _find_first_tick(replayed: Floats, recorded: Floats, ticks: np.ndarray) -> t
     Returns:
         The number of Syncs with which most ticks are equal to the bit, and the number of these ticks.
     """
-    max_equal = -1
+    max_equal_ticks = -1
     best_syncs = 0
     for bring_up_syncs in range(min(MAX_BRING_UP_SYNCS, len(replayed))):
-        in_log = ticks + bring_up_syncs < len(replayed)
-        is_equal = np.all(replayed[ticks[in_log] + bring_up_syncs] == recorded[in_log], axis=(1, 2))
-        equal = int(is_equal.sum())
-        if equal > max_equal:
-            max_equal = equal
+        is_in_log = ticks + bring_up_syncs < len(replayed)
+        is_equal = np.all(replayed[ticks[is_in_log] + bring_up_syncs] == recorded[is_in_log], axis=(1, 2))
+        equal_ticks = int(is_equal.sum())
+        if equal_ticks > max_equal_ticks:
+            max_equal_ticks = equal_ticks
             best_syncs = bring_up_syncs
-    return best_syncs, max_equal
+    return best_syncs, max_equal_ticks

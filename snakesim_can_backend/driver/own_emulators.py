@@ -13,61 +13,62 @@ import msgspec
 from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.base.terminal import print_stderr
-from snakesim_hal.model.fault_kinds import KINDS, Injection
-from snakesim_hal.model.fault_plan import check_backend_can
+from snakesim_hal.model.fault_kinds import FAULT_KINDS, Injection
+from snakesim_hal.model.fault_plan import validate_faults_for_backend
 from snakesim_hal.model.scenario import RunConfig, write_config
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 
-READY = "modules ready"  # a child prints it when its modules are on the bus
-STOP_LIMIT_S = 5.0  # after which a child that ignores SIGTERM is killed
-POLL_S = 0.02
+READY_TEXT = "modules ready"  # a child prints it when its modules are on the bus
+STOP_TIMEOUT_S = 5.0  # after which a child that ignores SIGTERM is killed
+POLL_PERIOD_S = 0.02
 
 
-def check_emulators(config: RunConfig, settings: CanSettings) -> None:
-    """Check that the settings of emulators fit the channels and the faults of a run.
+def validate_emulator_settings(config: RunConfig, settings: CanSettings) -> None:
+    """Check the settings of emulated joint modules: where they run, their channels, and their injected faults.
 
     Args:
-        config: the run, with the robot.
-        settings: settings of the backend.
+        config: Configuration of the run, with the robot.
+        settings: Settings of the backend.
 
     Raises:
-        ConfigError: emulators in the driver have real channels, emulators in a process have none, or a fault is
-            invalid.
+        ConfigError: One of these conditions is true: emulators run in the driver process ("here") although channels
+            are named; modules are elsewhere ("process" or "none") although no channel is named; faults are given
+            although there are no emulators ("none"); or a fault is invalid.
     """
     from snakesim_can_backend.emulator.faults import parse_fault
 
-    if settings.emulators_run == "here" and settings.channels:
+    emulator_location = settings.emulators_run
+    if emulator_location == "here" and settings.channels:
         raise ConfigError(
             f'`backends.can.emulators` = "here" is a virtual bus inside the driver, and `channels` = '
-            f"{settings.channels} "
-            f'names real ones: leave `channels` empty, or set emulators = "process"',
+            f"{settings.channels} names real ones: leave `channels` empty, or set emulators = "
+            f'"process"',
             code="bus/not-virtual",
         )
-    if settings.emulators_run != "here" and not settings.channels:
+    if emulator_location != "here" and not settings.channels:
         raise ConfigError(
-            f'`backends.can.emulators` = "{settings.emulators_run}" needs a bus: name it in '
-            "`backends.can.channels`, such as "
-            f'["vcan0"]',
+            f'`backends.can.emulators` = "{emulator_location}" needs a bus: '
+            'name it in `backends.can.channels`, such as ["vcan0"]',
             code="bus/not-virtual",
         )
-    if settings.faults and settings.emulators_run == "none":
+    if settings.faults and emulator_location == "none":
         raise ConfigError(
             "`backends.can.faults` are for emulators; give them to `snakesim drive emulate can --fault` instead",
             code="injection/not-supported",
         )
-    for text in settings.faults:
-        parse_fault(text, config.robot.chain.modules)
+    for fault_spec in settings.faults:
+        parse_fault(fault_spec, config.robot.chain.modules)
 
 
-def check_faults(config: RunConfig, settings: CanSettings) -> None:
+def validate_fault_plan(config: RunConfig, settings: CanSettings) -> None:
     """Check that the planned faults of joints and buses are possible. Raises ConfigError."""
     from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS
 
     has_emulators = settings.emulators_run != "none"
     has_virtual_bus = not settings.channels
-    supported = set(KINDS["bus"]) - {"slow"}
+    supported = set(FAULT_KINDS["bus"]) - {"slow"}
     reason = "its modules are not the driver's own emulators"
     if has_emulators:
         supported |= set(FAULT_DESCRIPTIONS)
@@ -75,95 +76,95 @@ def check_faults(config: RunConfig, settings: CanSettings) -> None:
     if not has_virtual_bus:
         supported -= {"full"}
         reason += "; and a program cannot fill the queue of a kernel interface"
-    check_backend_can(config, does=supported, buses=max(len(settings.channels), 1), because=reason)
+    validate_faults_for_backend(config, supported_kinds=supported, buses=max(len(settings.channels), 1), reason=reason)
 
 
 def supports_fault(injection: Injection, joints: int) -> bool:
     """Return whether emulated joint modules support a fault. Raises ConfigError for an unknown joint."""
-    from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS, check_fault
+    from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS, validate_fault
 
     if injection.target_type != "joint" or injection.kind not in FAULT_DESCRIPTIONS:
         return False
-    check_fault(injection, joints)
+    validate_fault(injection, joints)
     return True
 
 
-def start_local_emulators(
-    config: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
+def start_in_process_emulators(
+    config: RunConfig, settings: CanSettings, channel: str, pose_address: str | None, *, stepped: bool
 ) -> VirtualPeer:
     """Start emulators of all joint modules at the other end of a virtual bus, in this process.
 
     Args:
-        config: the run, with the robot.
-        settings: settings of the backend.
-        channel: name of the virtual bus.
-        pose: address, HOST:PORT, to which they send motion capture; None: nowhere.
-        stepped: whether their time advances only from Sync to Sync.
+        config: Configuration of the run, with the robot.
+        settings: Settings of the backend.
+        channel: Name of the virtual bus.
+        pose_address: HOST:PORT to which they send motion capture; None if they do not send.
+        stepped: Whether their time advances only from Sync to Sync.
 
     Returns:
-        A function that runs them.
+        The other end of the bus; calling it runs the emulators.
     """
-    from snakesim_can_backend.emulator.server import make_local_emulators
+    from snakesim_can_backend.emulator.server import make_in_process_emulators
 
-    return make_local_emulators(config, settings, channel, pose, stepped=stepped)
+    return make_in_process_emulators(config, settings, channel, pose_address, stepped=stepped)
 
 
 class EmulatorProcess:
     """`snakesim drive emulate can` as a child that dies with this process."""
 
-    def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
+    def __init__(self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool) -> None:
         """Start `snakesim drive emulate can` as a child process, and wait until its modules are on the bus.
 
         Args:
-            config: the run, with the robot.
-            settings: settings of the backend, which replace those in the configuration.
-            pose: address, HOST:PORT, to which the child sends motion capture; None: nowhere.
-            stepped: whether the emulators' time advances only from Sync to Sync.
+            config: Configuration of the run, with the robot.
+            settings: Settings of the backend, which replace those in the configuration.
+            pose_address: HOST:PORT to which the child sends motion capture; None if it does not send.
+            stepped: Whether the emulators' time advances only from Sync to Sync.
 
         Raises:
-            BackendError: the child cannot be started, or ended at once.
+            BackendError: The child cannot be started, ended at once, or was not ready in time.
         """
         backends = {**config.backends, "can": msgspec.to_builtins(settings)}
         child_config = msgspec.structs.replace(config, backends=backends)
-        arguments = ["--parent", str(os.getpid()), "--pose", pose or "none"]
+        arguments = ["--parent", str(os.getpid()), "--pose", pose_address or "none"]
         for channel in settings.channels:
             arguments += ["--channel", channel]
         if stepped:
             arguments.append("--stepped")
         try:
             self._folder = tempfile.TemporaryDirectory(prefix="snakesim-emulators-", ignore_cleanup_errors=True)
-            self._output = Path(self._folder.name, "modules.log")
+            self._output_path = Path(self._folder.name, "modules.log")
             self._process = self._start(child_config, arguments)
         except OSError as error:
             raise BackendError(
                 f"the emulated joint modules cannot be started: {error}", code="emulator/not-started"
             ) from error
-        self._await_ready()
+        self._wait_until_ready()
 
     def _start(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
         config_path = Path(self._folder.name, "config.json")
         write_config(config, config_path)
         module = "snakesim_can_backend.emulator.command"
-        with self._output.open("wb") as output:
+        with self._output_path.open("wb") as output:
             return subprocess.Popen(
-                python_command("-m", module, str(config_path), *arguments, "--interactive"),
+                make_python_command("-m", module, str(config_path), *arguments, "--interactive"),
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=child_environment({"PYTHONUNBUFFERED": "1"}),
+                env=make_child_environment({"PYTHONUNBUFFERED": "1"}),
                 start_new_session=True,
             )
 
-    def _await_ready(self) -> None:
+    def _wait_until_ready(self) -> None:
         """Wait until the child prints READY. Raises BackendError."""
-        end_s = time.monotonic() + SERVICE_START_LIMIT_S
-        while time.monotonic() < end_s:
+        deadline_s = time.monotonic() + SERVICE_START_LIMIT_S
+        while time.monotonic() < deadline_s:
             with contextlib.suppress(OSError):
-                if READY in self._output.read_text(encoding="utf-8", errors="replace"):
+                if READY_TEXT in self._output_path.read_text(encoding="utf-8", errors="replace"):
                     return
             if self._process.poll() is not None:
                 break
-            time.sleep(POLL_S)
+            time.sleep(POLL_PERIOD_S)
         self.stop()
         raise BackendError(
             "the emulated joint modules did not start; see their output above", code="emulator/not-started"
@@ -177,7 +178,7 @@ class EmulatorProcess:
         return f"the emulated joint modules have ended, with exit code {code}"
 
     def inject(self, fault: Injection, *, begins: bool) -> None:
-        """Begin or end a fault of a module. Raises BackendError if the child has ended."""
+        """Start or end a fault of a module. Raises BackendError if the child has ended."""
         from snakesim_can_backend.emulator.faults import format_typed_fault
 
         assert self._process.stdin is not None
@@ -195,7 +196,7 @@ class EmulatorProcess:
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
-                self._process.wait(STOP_LIMIT_S)
+                self._process.wait(STOP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
@@ -203,6 +204,6 @@ class EmulatorProcess:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
         with contextlib.suppress(OSError):  # an unreadable log does not prevent ending
-            for line in self._output.read_text(encoding="utf-8", errors="replace").splitlines():
+            for line in self._output_path.read_text(encoding="utf-8", errors="replace").splitlines():
                 print_stderr(line)
         self._folder.cleanup()

@@ -11,8 +11,8 @@ from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
-MIN_PERIODS = 2.2  # in a watchdog's time: one setpoint may be lost, and the next be a little late
-SPEED_ROOM = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
+MIN_WATCHDOG_PERIODS = 2.2  # in a watchdog's time: one setpoint may be lost, and the next be a little late
+SPEED_RANGE_FACTOR = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
 RATING_TOLERANCE = 0.999  # a rating has single precision on the bus
 
 
@@ -22,20 +22,20 @@ def plan_parameters(
     """Compute the parameters that each module gets in bring-up, converted from the joint to the module's shaft.
 
     Args:
-        robot: the robot file, with gains, limits and gears of the joints.
-        settings: settings of the backend.
-        reports: which reports the modules send, and how often.
+        robot: Robot file, with gains, limits and gears of the joints.
+        settings: Settings of the backend.
+        reports: Which reports the modules send, and how often.
 
     Returns:
-        The value of each parameter, by node.
+        The parameters of each module, by node id.
     """
     stop_mode = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
-    planned: dict[int, dict[ModuleParameter, float]] = {}
+    parameters_by_node: dict[int, dict[ModuleParameter, float]] = {}
     for node, joint in enumerate(robot.joint_table, start=1):
         motor = joint.motor
         gear = joint.drive.gear
         sends_tail_contact = node == 1 and reports.tail
-        planned[node] = {
+        parameters_by_node[node] = {
             ModuleParameter.STIFFNESS: motor.stiffness_nm_per_rad / gear**2,
             ModuleParameter.DAMPING: motor.damping_nm_s_per_rad / gear**2,
             ModuleParameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
@@ -48,7 +48,7 @@ def plan_parameters(
             ModuleParameter.IMU_EVERY: float(reports.imu_every),
             ModuleParameter.TAIL: float(sends_tail_contact),
         }
-    return planned
+    return parameters_by_node
 
 
 def _max_shaft_angle_rad(joint: Joint) -> float:
@@ -58,15 +58,15 @@ def _max_shaft_angle_rad(joint: Joint) -> float:
     return max(abs(drive.zero_rad + drive.sign * drive.gear * limit_rad) for limit_rad in joint_limits_rad)
 
 
-def check_drives(robot: RobotFile, settings: CanSettings) -> None:
+def validate_joint_drives(robot: RobotFile, settings: CanSettings) -> None:
     """Check that node ids, ports and turns in the robot file are those that joint modules support.
 
     Args:
-        robot: the robot file.
-        settings: settings of the backend, with its channels.
+        robot: Robot file.
+        settings: Settings of the backend, with its channels.
 
     Raises:
-        ConfigError: a joint has another id than its number, counts turns, or names a port that is no channel.
+        ConfigError: A joint has another id than its number, counts turns, or names a port that is no channel.
     """
     for number, joint in enumerate(robot.joint_table, start=1):
         if joint.id != number:
@@ -89,33 +89,36 @@ def check_drives(robot: RobotFile, settings: CanSettings) -> None:
             )
 
 
-def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[ModuleParameter, float]] | None = None) -> None:
+def validate_ratings(
+    robot: RobotFile, current_values: Mapping[int, Mapping[ModuleParameter, float]] | None = None
+) -> None:
     """Check that the robot file stays within the protocol's ranges and the modules' ratings.
 
     Args:
-        robot: the robot file.
-        in_force: present parameters of the modules, by node; None: they are not known yet.
+        robot: Robot file.
+        current_values: Current parameters of the modules, by node id; None if they are not known yet, so that ratings
+            are not checked.
 
     Raises:
-        ConfigError: the robot file exceeds a range of the protocol, or needs what no module supports.
-        BackendError: the robot file exceeds the rating of a module.
+        ConfigError: The robot file exceeds a range of the protocol, or needs what no module supports.
+        BackendError: The robot file exceeds the rating of a module.
     """
     for joint in robot.joint_table:
-        _check_ranges(robot, joint)
-    _check_contact_range(robot)
+        _validate_protocol_ranges(robot, joint)
+    _validate_contact_range(robot)
     if robot.safety.action == "hold":
         raise ConfigError(
             f'robot {robot.name!r}: `safety.action` = "hold" is not supported by joint modules: servos '
             f'that hold stiffly overheat. Use "damp" or "passive"',
             code="drive/unsupported-setting",
         )
-    for node, values in (in_force or {}).items():
-        _check_module(robot, node, values)
+    for node, values in (current_values or {}).items():
+        _validate_module_ratings(robot, node, values)
 
 
-def _check_ranges(robot: RobotFile, joint: Joint) -> None:
+def _validate_protocol_ranges(robot: RobotFile, joint: Joint) -> None:
     """Raise ConfigError if a limit of a joint exceeds the range of the bus protocol."""
-    for key, value, max_value, unit in _limits_at_shaft(joint):
+    for key, value, max_value, unit in _list_limits_at_shaft(joint):
         if value > max_value:
             has_default_drive = joint.drive == Drive()
             place = "" if has_default_drive else " at the module's shaft, by `gear` and `zero_rad`,"
@@ -126,7 +129,7 @@ def _check_ranges(robot: RobotFile, joint: Joint) -> None:
             )
 
 
-def _limits_at_shaft(joint: Joint) -> Iterator[tuple[str, float, float, str]]:
+def _list_limits_at_shaft(joint: Joint) -> Iterator[tuple[str, float, float, str]]:
     """Yield key, value, largest value on the bus and unit of every limit of a joint."""
     layouts = load_layouts()
     state = layouts[Opcode.JOINT_STATE].signals
@@ -134,12 +137,12 @@ def _limits_at_shaft(joint: Joint) -> Iterator[tuple[str, float, float, str]]:
     limits = joint.limits
     gear = joint.drive.gear
     yield "limits.angle_rad", _max_shaft_angle_rad(joint), state["angle"].high, "rad"
-    yield "limits.speed_rad_s", limits.speed_rad_s * gear, state["velocity"].high / SPEED_ROOM, "rad/s"
+    yield "limits.speed_rad_s", limits.speed_rad_s * gear, state["velocity"].high / SPEED_RANGE_FACTOR, "rad/s"
     yield "limits.torque_nm", limits.torque_nm / gear, state["torque"].high, "N·m"
     yield "limits.stop_at_c", limits.stop_at_c, max_winding_c, "°C"
 
 
-def _check_contact_range(robot: RobotFile) -> None:
+def _validate_contact_range(robot: RobotFile) -> None:
     """Raise ConfigError if a contact at the end of a link would be further away than the protocol can represent."""
     max_distance_m = max(robot.link_lengths_m) + robot.module.radius_m
     max_along_m = load_layouts()[Opcode.CONTACT].signals["along"].high
@@ -152,28 +155,28 @@ def _check_contact_range(robot: RobotFile) -> None:
         )
 
 
-def _check_module(robot: RobotFile, node: int, values: Mapping[ModuleParameter, float]) -> None:
+def _validate_module_ratings(robot: RobotFile, node: int, values: Mapping[ModuleParameter, float]) -> None:
     """Raise BackendError if the robot file needs more torque or speed than a module is rated for."""
     joint = robot.joint_table[node - 1]
     gear = joint.drive.gear
-    for parameter, needed, unit in (
+    for parameter, required_value, unit in (
         (ModuleParameter.RATED_TORQUE, joint.limits.torque_nm / gear, "N·m"),
         (ModuleParameter.RATED_SPEED, joint.limits.speed_rad_s * gear, "rad/s"),
     ):
-        is_sufficient = values[parameter] >= needed * RATING_TOLERANCE  # False for NaN, which the bus can carry
+        is_sufficient = values[parameter] >= required_value * RATING_TOLERANCE  # False for NaN, which the bus can carry
         if not is_sufficient:
             raise BackendError(
                 f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "
-                f"{needed:g}: lower the limit in the robot file",
+                f"{required_value:g}: lower the limit in the robot file",
                 code="drive/unsupported-setting",
             )
 
 
-def check_watchdog(config: RunConfig, settings: CanSettings) -> None:
+def validate_watchdog(config: RunConfig, settings: CanSettings) -> None:
     """Raise ConfigError if one lost setpoint would stop the modules."""
-    min_watchdog_s = MIN_PERIODS / config.rate_hz
+    min_watchdog_s = MIN_WATCHDOG_PERIODS / config.rate_hz
     if settings.watchdog_s < min_watchdog_s:
-        min_rate_hz = MIN_PERIODS / settings.watchdog_s
+        min_rate_hz = MIN_WATCHDOG_PERIODS / settings.watchdog_s
         raise ConfigError(
             f"`backends.can.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}: one lost "
             f"setpoint would stop the modules; give them {min_watchdog_s:.3g} s or more, or a rate from "

@@ -60,16 +60,16 @@ class ModuleStatus:
     sync: int = -1  # the Sync that the newest good state answers; -1: none yet
     state: ModuleState = ModuleState.BOOT
     last_count: int = -1  # 0 to 15, as in the frame
-    awaited: bool = True  # whether the module has answered recently
+    is_awaited: bool = True  # whether the module has answered recently
     stopped_syncs: int = 0  # consecutive states that were FAULT or EMERGENCY
 
     # Wrong frames.
-    repeats: int = 0  # consecutive states with the same count
-    wrong_counts: int = 0  # consecutive
-    corrupt: int = 0  # consecutive states with a wrong checksum
+    repeated_state_count: int = 0  # consecutive states with the same count
+    wrong_counter_count: int = 0  # consecutive
+    corrupt_state_count: int = 0  # consecutive states with a wrong checksum
     double_answers: int = 0  # consecutive Syncs that were answered more than once, up to `double_answer_sync`
     double_answer_sync: int = -1
-    frames: int = 0  # in this control cycle
+    frame_count: int = 0  # in this control cycle
 
     # Heartbeats and Health reports.
     uptime_ms: int = -1  # -1: no heartbeat yet
@@ -82,12 +82,12 @@ class ModuleStatus:
     health_sync: int = -1  # the Sync before the newest Health report
 
     @property
-    def needs_clearing(self) -> bool:
+    def is_clear_required(self) -> bool:
         """Return whether the state is latched and the module has had time to report the reason in a heartbeat."""
         reason_is_due = bool(self.faults) or self.stopped_syncs >= MAX_REPORT_DELAY_SYNCS
         return self.state in LATCHED_STATES and reason_is_due
 
-    def answered_twice(self, sync: int) -> int:
+    def count_double_answers(self, sync: int) -> int:
         """Return how many consecutive Syncs, up to this one, the module answered more than once."""
         if self.double_answer_sync < sync - 1:
             return 0
@@ -107,7 +107,7 @@ class ModuleReports:
         Functions that read each kind of frame are compiled here, because they run for every frame.
 
         Args:
-            joints: number of joints; joint i has node i + 1.
+            joints: Number of joints. Joint i has node i + 1.
         """
         self.modules = [ModuleStatus(node) for node in range(1, joints + 1)]
 
@@ -118,12 +118,12 @@ class ModuleReports:
         self.answers_missing = 0  # to parameter requests
 
         # Frames that no module of this robot should send.
-        self.unknown_nodes: Counter[int] = Counter()  # frames by node, since the last control cycle
-        self.from_other_host: Counter[Opcode] = Counter()
+        self.unknown_node_frame_counts: Counter[int] = Counter()  # frames by node, since the last control cycle
+        self.other_host_frame_counts: Counter[Opcode] = Counter()
         self.malformed = 0  # frames of known modules with a wrong length
 
         # Raw numbers of the newest reports, by joint or link; None: no report yet.
-        self._shafts = [(0,) * len(STATE_SIGNALS) for _ in range(joints)]
+        self._raw_shaft_values = [(0,) * len(STATE_SIGNALS) for _ in range(joints)]
         self._contacts: list[bytes | None] = [None] * (joints + 1)
         self._gyro: list[tuple[int, ...] | None] = [None] * joints
         self._acceleration: list[tuple[int, ...] | None] = [None] * joints
@@ -149,14 +149,14 @@ class ModuleReports:
 
         # Functions rather than bound methods, which would keep this object until the garbage collector runs.
         handlers = {
-            Opcode.JOINT_STATE: ModuleReports._on_joint_state,
-            Opcode.CONTACT: ModuleReports._on_contact,
-            Opcode.TAIL_CONTACT: ModuleReports._on_tail_contact,
-            Opcode.HEARTBEAT: ModuleReports._on_heartbeat,
-            Opcode.GYRO: ModuleReports._on_gyro,
-            Opcode.ACCELEROMETER: ModuleReports._on_acceleration,
-            Opcode.SHAFT_LOAD: ModuleReports._on_shaft_load,
-            Opcode.HEALTH: ModuleReports._on_health,
+            Opcode.JOINT_STATE: ModuleReports._handle_joint_state,
+            Opcode.CONTACT: ModuleReports._handle_contact,
+            Opcode.TAIL_CONTACT: ModuleReports._handle_tail_contact,
+            Opcode.HEARTBEAT: ModuleReports._handle_heartbeat,
+            Opcode.GYRO: ModuleReports._handle_gyro,
+            Opcode.ACCELEROMETER: ModuleReports._handle_acceleration,
+            Opcode.SHAFT_LOAD: ModuleReports._handle_shaft_load,
+            Opcode.HEALTH: ModuleReports._handle_health,
         }
         self._handlers = {
             frame_id(opcode, module.node): (handler, module, layouts[opcode].length)
@@ -166,41 +166,41 @@ class ModuleReports:
 
     # --- one Sync ---------------------------------------------------------------------------------------------
 
-    def begin_sync(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
-        """Start to count the answers to a Sync. Only modules that have answered recently are waited for.
+    def start_sync(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
+        """Start to count the responses to a Sync. Only modules that have responded recently are waited for.
 
         Args:
-            sync: number of this Sync.
-            contacts: whether the modules report contact forces at this Sync.
-            tail: whether the tail link sends its own contact report, too.
-            questions: number of parameter requests that are sent with this Sync.
+            sync: Number of this Sync.
+            contacts: Whether the modules report contact forces at this Sync.
+            tail: Whether the tail link sends a contact report of its own, too.
+            questions: Number of parameter requests that are sent with this Sync.
         """
         self.sync = sync
         for module in self.modules:
-            module.awaited = module.sync >= sync - 1 - MAX_LATE_SYNCS or module.sync < 0
-        self.states_missing = sum(module.awaited for module in self.modules)
+            module.is_awaited = module.sync >= sync - 1 - MAX_LATE_SYNCS or module.sync < 0
+        self.states_missing = sum(module.is_awaited for module in self.modules)
         self.contacts_missing = 0
         if contacts:
-            tail_is_awaited = tail and self.modules[0].awaited
-            self.contacts_missing = self.states_missing + tail_is_awaited
+            is_tail_awaited = tail and self.modules[0].is_awaited  # the first module also reports for the tail link
+            self.contacts_missing = self.states_missing + is_tail_awaited
             self._contacts = [None] * len(self._contacts)
         self.answers_missing = questions
         self.reset_frame_counts()
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Return whether all awaited modules have answered."""
         return self.states_missing <= 0 and self.contacts_missing <= 0 and self.answers_missing <= 0
 
     def reset_frame_counts(self) -> None:
         """Forget how many frames each module sent, because the counts cover more than one period."""
         for module in self.modules:
-            module.frames = 0
+            module.frame_count = 0
 
     def reset_sender_counts(self) -> None:
         """Forget the frames of unknown nodes and of other hosts, because the next control cycle counts its own."""
-        self.unknown_nodes.clear()
-        self.from_other_host.clear()
+        self.unknown_node_frame_counts.clear()
+        self.other_host_frame_counts.clear()
 
     def process_frame(self, frame: Frame) -> None:
         """Store the report in one received frame, or count the frame if it is none of this robot's."""
@@ -209,7 +209,7 @@ class ModuleReports:
             self._count_other_frame(frame)
             return
         handler, module, length = known
-        module.frames += 1
+        module.frame_count += 1
         if len(frame.data) == length:
             handler(self, module, frame)
         else:
@@ -220,11 +220,11 @@ class ModuleReports:
         node = parse_node(frame.id)
         if opcode in FROM_HOST:
             if not self._is_identify(frame):
-                self.from_other_host[Opcode(opcode)] += 1
+                self.other_host_frame_counts[Opcode(opcode)] += 1
         elif not 1 <= node <= len(self.modules):
-            self.unknown_nodes[node] += 1
+            self.unknown_node_frame_counts[node] += 1
         else:
-            self.modules[node - 1].frames += 1
+            self.modules[node - 1].frame_count += 1
             self.answers_missing -= opcode == Opcode.PARAMETER_ANSWER
 
     def _is_identify(self, frame: Frame) -> bool:
@@ -237,27 +237,31 @@ class ModuleReports:
 
     def shaft_values(self) -> Floats:
         """Return the angle in rad, velocity in rad/s and torque in N·m of every module's shaft, (3, n_joints)."""
-        return np.array(self._shafts).T[: len(SHAFT_SIGNALS)] * self._shaft_scale
+        return np.array(self._raw_shaft_values).T[: len(SHAFT_SIGNALS)] * self._shaft_scale
 
     def list_contacts(self) -> list[tuple[int, tuple[int, ...]]]:
         """Return every link that reported a contact at this Sync, with the raw numbers of CONTACT_SIGNALS."""
         return [(link, self._read_contact(data)) for link, data in enumerate(self._contacts) if data]
 
-    def take_imu_reports(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
-        """Return and forget the reports of every IMU that has reported since the last call.
+    def pop_imu_reports(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
+        """Remove and return the complete reports of all IMUs that have arrived since the last call.
+
+        A report is complete if gyro and accelerometer were sampled at the same Sync (the CAN message that starts a
+        sample). An incomplete one is kept until its other half arrives.
 
         Returns:
-            Link, raw angular rates (3,) and raw accelerations (3,), both sampled at the same Sync.
+            Link index, raw angular rates (3,) and raw accelerations (3,) of each complete report.
         """
-        reports = []
+        reports: list[tuple[int, Sequence[int], Sequence[int]]] = []
         for joint, (gyro, acceleration) in enumerate(zip(self._gyro, self._acceleration, strict=True)):
             if gyro is None or acceleration is None:
                 continue
-            gyro_count = gyro[-1]
-            acceleration_count = acceleration[-1]
-            if gyro_count != acceleration_count:
+            *rates, gyro_sync_counter = gyro
+            *accelerations, acceleration_sync_counter = acceleration
+            if gyro_sync_counter != acceleration_sync_counter:
                 continue
-            reports.append((joint + 1, gyro[:-1], acceleration[:-1]))
+            link = joint + 1  # a module carries its IMU in the link ahead of its joint; link 0 is the tail
+            reports.append((link, rates, accelerations))
             self._gyro[joint] = None
             self._acceleration[joint] = None
         return reports
@@ -268,47 +272,47 @@ class ModuleReports:
 
     # --- one kind of frame each -------------------------------------------------------------------------------
 
-    def _on_joint_state(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_joint_state(self, module: ModuleStatus, frame: Frame) -> None:
         """Store the joint state that a module has sent, if its checksum and its count are valid.
 
-        The count is the number of the Sync that it answers, modulo COUNTER_MODULUS. An answer to an older Sync counts
-        if it is at most MAX_LATE_SYNCS late.
+        The count is the number of the Sync to which the module responds, modulo COUNTER_MODULUS. A response to an older
+        Sync is accepted if it is at most MAX_LATE_SYNCS late.
 
         Args:
-            module: status of the module that sent the frame, which is updated.
-            frame: the frame.
+            module: Status of the module that sent the frame, which is updated.
+            frame: Received joint state.
         """
         identifier, data = frame
         if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:  # `has_valid_checksum`, without the cost of a call
-            module.corrupt += 1
+            module.corrupt_state_count += 1
             return
-        numbers = self._read_state(data)
-        count = numbers[COUNT_INDEX]
+        raw_values = self._read_state(data)
+        count = raw_values[COUNT_INDEX]
         if count == module.last_count:
-            module.repeats += 1
+            module.repeated_state_count += 1
         else:
-            module.repeats = 0
+            module.repeated_state_count = 0
         module.last_count = count
-        late_syncs = (self.sync - count) % COUNTER_MODULUS
-        if late_syncs > MAX_LATE_SYNCS:
-            module.wrong_counts += 1
+        lateness_syncs = (self.sync - count) % COUNTER_MODULUS
+        if lateness_syncs > MAX_LATE_SYNCS:
+            module.wrong_counter_count += 1
             return
-        sync = self.sync - late_syncs
+        sync = self.sync - lateness_syncs
         if sync <= module.sync:
-            if late_syncs == 0:
+            if lateness_syncs == 0:
                 self._count_double_answer(module)
             return
-        module.corrupt = 0
-        module.wrong_counts = 0
+        module.corrupt_state_count = 0
+        module.wrong_counter_count = 0
         module.sync = sync
-        module.state = STATES[numbers[STATE_INDEX]]
+        module.state = STATES[raw_values[STATE_INDEX]]
         if module.state in LATCHED_STATES:
             module.stopped_syncs += 1
         else:
             module.stopped_syncs = 0
-        self._shafts[module.node - 1] = numbers
-        if late_syncs == 0:
-            self.states_missing -= module.awaited
+        self._raw_shaft_values[module.node - 1] = raw_values
+        if lateness_syncs == 0:
+            self.states_missing -= module.is_awaited
 
     def _count_double_answer(self, module: ModuleStatus) -> None:
         """Count a Sync that a module answered more than once; a third answer to it is not counted again."""
@@ -320,10 +324,10 @@ class ModuleReports:
             module.double_answers = 1
         module.double_answer_sync = self.sync
 
-    def _on_contact(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_contact(self, module: ModuleStatus, frame: Frame) -> None:
         self._store_contact(module, module.node, frame.data)
 
-    def _on_tail_contact(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_tail_contact(self, module: ModuleStatus, frame: Frame) -> None:
         self._store_contact(module, module.node - 1, frame.data)
 
     def _store_contact(self, module: ModuleStatus, link: int, data: bytes) -> None:
@@ -332,9 +336,9 @@ class ModuleReports:
         answers_this_sync = (self.sync - count) % COUNTER_MODULUS == 0
         if answers_this_sync and self._contacts[link] is None:
             self._contacts[link] = data if touched else NO_CONTACT
-            self.contacts_missing -= module.awaited
+            self.contacts_missing -= module.is_awaited
 
-    def _on_heartbeat(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_heartbeat(self, module: ModuleStatus, frame: Frame) -> None:
         state, last_stop, uptime_ms, *fault_bits = self._read_heartbeat(frame.data)
         self._update_uptime(module, uptime_ms)
         module.heartbeat_sync = self.sync
@@ -351,17 +355,17 @@ class ModuleReports:
         module.previous_uptime_ms = module.uptime_ms
         module.uptime_ms = uptime_ms
 
-    def _on_gyro(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_gyro(self, module: ModuleStatus, frame: Frame) -> None:
         self._gyro[module.node - 1] = self._read_gyro(frame.data)
 
-    def _on_acceleration(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_acceleration(self, module: ModuleStatus, frame: Frame) -> None:
         self._acceleration[module.node - 1] = self._read_acceleration(frame.data)
 
-    def _on_shaft_load(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_shaft_load(self, module: ModuleStatus, frame: Frame) -> None:
         (torque,) = self._read_shaft_load(frame.data)
         self.shaft_raw[module.node - 1] = torque
 
-    def _on_health(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_health(self, module: ModuleStatus, frame: Frame) -> None:
         self._health[module.node - 1] = self._read_health(frame.data)
         module.health_sync = self.sync
 

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from math import inf
 
-from snakesim_can_backend.bus.load import BIT_RATE, worst_frame_bits
+from snakesim_can_backend.bus.load import BIT_RATE, compute_max_frame_bits
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 
 OPCODES = 32  # an opcode has five bits
 ID_BITS = 11
 MAX_DATA_BYTES = 8  # on classic CAN
 MAX_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could carry
-IN_ORDER = frozenset((Opcode.PARAMETER_ANSWER,))  # each answers another question: none replaces another
-MAX_ANSWERS = 64  # that wait at once
+UNREPLACEABLE_OPCODES = frozenset((Opcode.PARAMETER_ANSWER,))  # each answers another question: none replaces another
+MAX_WAITING_RESPONSES = 64  # that wait at once
 
 
 @dataclass(frozen=True)
@@ -43,76 +43,78 @@ class BusTime:
     """The timing of one bus. Times are microseconds, and must not go backward."""
 
     def __init__(self, bit_rate: int = BIT_RATE) -> None:
-        """Start with an idle bus, on which frames wait for arbitration and occupy the bus for their worst-case time.
+        """Create an idle bus, on which frames wait for arbitration and occupy the bus for their worst-case time.
 
         Args:
-            bit_rate: bit rate of the bus in bit/s.
+            bit_rate: Bit rate of the bus in bit/s.
         """
-        self.frame_us = [worst_frame_bits(length) * 1e6 / bit_rate for length in range(MAX_DATA_BYTES + 1)]
+        self.frame_us = [compute_max_frame_bits(length) * 1e6 / bit_rate for length in range(MAX_DATA_BYTES + 1)]
 
         # Frames that wait: sender -> mailbox -> frame, and since when it waits.
-        self._waiting: dict[int, dict[int, tuple[Frame, float]]] = {}
-        self._first: list[tuple[int, int, int]] = []  # heap: id, sender and mailbox of every sender's first frame
-        self._answers = 0  # frames IN_ORDER so far
-        self._babble: dict[int, Frame] = {}  # sender -> the frame that it repeats without a pause
+        self._waiting_frames: dict[int, dict[int, tuple[Frame, float]]] = {}
+        self._arbitration_heap: list[
+            tuple[int, int, int]
+        ] = []  # heap: id, sender and mailbox of every sender's first frame
+        self._response_count = 0  # frames IN_ORDER so far
+        self._babble_frame_by_sender: dict[int, Frame] = {}  # sender -> the frame that it repeats without a pause
 
         # The bus.
-        self._free_us = 0.0  # when the bus will be free
-        self._under_way: tuple[Frame, float] | None = None  # the frame on the bus, and its end
-        self._sent: list[Frame] = []
+        self._bus_free_us = 0.0  # when the bus will be free
+        self._transmission: tuple[Frame, float] | None = None  # the frame on the bus, and its end
+        self._sent_frames: list[Frame] = []
 
         # Statistics.
         self._frames = [0] * OPCODES
         self._busy_us = [0.0] * OPCODES
-        self._replaced = 0
-        self._late_us = 0.0
+        self._replaced_count = 0
+        self._max_wait_us = 0.0
 
     def record_host_frame(self, frame: Frame, now_us: float) -> None:
         """Account for a frame of the host that has arrived."""
-        self._advance(now_us)
+        self._advance_arbitration(now_us)
         duration_us = self.frame_us[len(frame.data)]
-        self._free_us = min(max(self._free_us, now_us) + duration_us, now_us + MAX_AHEAD_US)
+        self._bus_free_us = min(max(self._bus_free_us, now_us) + duration_us, now_us + MAX_AHEAD_US)
         self.count_frame(frame)
 
     def enqueue(self, sender: int, frame: Frame, now_us: float) -> None:
         """Add a frame that a module wants to send; it replaces one with the same id that still waits."""
-        self._advance(now_us)
-        mailboxes = self._waiting.setdefault(sender, {})
+        self._advance_arbitration(now_us)
+        mailboxes = self._waiting_frames.setdefault(sender, {})
         mailbox = self._choose_mailbox(frame)
         if mailbox in mailboxes:
             _, since_us = mailboxes[mailbox]
             mailboxes[mailbox] = (frame, since_us)
-            self._replaced += 1
+            self._replaced_count += 1
             return
         mailboxes[mailbox] = (frame, now_us)
         if len(mailboxes) == 1:
-            heappush(self._first, (frame.id, sender, mailbox))
+            heappush(self._arbitration_heap, (frame.id, sender, mailbox))
 
     def _choose_mailbox(self, frame: Frame) -> int:
         """Return the mailbox of a frame: one for each id, but another one for each frame that must not be replaced."""
-        if frame.id >> NODE_BITS not in IN_ORDER:
+        if frame.id >> NODE_BITS not in UNREPLACEABLE_OPCODES:
             return frame.id
-        self._answers += 1
-        number = self._answers % MAX_ANSWERS + 1
+        self._response_count += 1
+        number = self._response_count % MAX_WAITING_RESPONSES + 1
         return frame.id | number << ID_BITS
 
-    def take_sent_frames(self, now_us: float) -> list[Frame]:
+    def pop_sent_frames(self, now_us: float) -> list[Frame]:
         """Return the frames that are completely sent by now, in order, each once."""
-        self._advance(now_us)
-        sent = self._sent
-        self._sent = []
+        self._advance_arbitration(now_us)
+        sent = self._sent_frames
+        self._sent_frames = []
         return sent
 
     def next_us(self) -> float:
         """Return when the next frame will be completely sent; inf if none waits."""
-        if self._under_way is not None:
-            _, end_us = self._under_way
+        if self._transmission is not None:
+            _, end_us = self._transmission
             return end_us
-        if not self._first:
+        if not self._arbitration_heap:
             return inf
-        _, sender, mailbox = self._first[0]
-        frame, since_us = self._waiting[sender][mailbox]
-        return max(self._free_us, since_us) + self.frame_us[len(frame.data)]
+        _, sender, mailbox = self._arbitration_heap[0]
+        frame, since_us = self._waiting_frames[sender][mailbox]
+        return max(self._bus_free_us, since_us) + self.frame_us[len(frame.data)]
 
     def count_frame(self, frame: Frame) -> None:
         """Add a frame and its time to the traffic."""
@@ -122,56 +124,56 @@ class BusTime:
 
     def set_babbling(self, sender: int, frame: Frame | None, now_us: float) -> None:
         """Let a module repeat a frame as often as the bus allows, from now on; None ends that."""
-        self._advance(now_us)
+        self._advance_arbitration(now_us)
         if frame is None:
-            self._babble.pop(sender, None)
+            self._babble_frame_by_sender.pop(sender, None)
         else:
-            self._babble[sender] = frame
+            self._babble_frame_by_sender[sender] = frame
             self.enqueue(sender, frame, now_us)
 
     def traffic(self, now_us: float) -> Traffic:
         """Return the traffic of the bus until now."""
-        return Traffic(now_us, tuple(self._frames), tuple(self._busy_us), self._replaced, self._late_us)
+        return Traffic(now_us, tuple(self._frames), tuple(self._busy_us), self._replaced_count, self._max_wait_us)
 
-    def _advance(self, now_us: float) -> None:
-        """Send waiting frames in the order of arbitration, up to the present time.
+    def _advance_arbitration(self, now_us: float) -> None:
+        """Send waiting frames in the order of arbitration, up to the current time.
 
-        A frame that would begin exactly now does not begin yet, because others may still be enqueued now.
+        A frame that would start exactly now does not start yet, because others may still be enqueued now.
 
         Args:
-            now_us: present time.
+            now_us: Current time.
         """
         while True:
-            if self._under_way is not None:
-                frame, end_us = self._under_way
+            if self._transmission is not None:
+                frame, end_us = self._transmission
                 if end_us > now_us:
                     return
-                self._sent.append(frame)
-                self._under_way = None
-            if not self._first:
+                self._sent_frames.append(frame)
+                self._transmission = None
+            if not self._arbitration_heap:
                 return
-            _, sender, mailbox = self._first[0]
-            _, waiting_since_us = self._waiting[sender][mailbox]
-            start_us = max(self._free_us, waiting_since_us)
+            _, sender, mailbox = self._arbitration_heap[0]
+            _, waiting_since_us = self._waiting_frames[sender][mailbox]
+            start_us = max(self._bus_free_us, waiting_since_us)
             if start_us >= now_us:
                 return
-            heappop(self._first)
-            self._begin(sender, mailbox, start_us)
+            heappop(self._arbitration_heap)
+            self._start_transmission(sender, mailbox, start_us)
 
-    def _begin(self, sender: int, mailbox: int, start_us: float) -> None:
+    def _start_transmission(self, sender: int, mailbox: int, start_us: float) -> None:
         """Put the frame in a mailbox on the bus, and let the sender's next frame take part in arbitration."""
-        mailboxes = self._waiting[sender]
+        mailboxes = self._waiting_frames[sender]
         frame, since_us = mailboxes.pop(mailbox)
         end_us = start_us + self.frame_us[len(frame.data)]
-        repeated = self._babble.get(sender)
+        repeated = self._babble_frame_by_sender.get(sender)
         if repeated is not None and repeated.id == mailbox:
             mailboxes[mailbox] = (repeated, end_us)
         if mailboxes:
             next_mailbox, (next_frame, _) = next(iter(mailboxes.items()))
-            heappush(self._first, (next_frame.id, sender, next_mailbox))
-        self._free_us = end_us
-        self._under_way = (frame, end_us)
-        self._late_us = max(self._late_us, start_us - since_us)
+            heappush(self._arbitration_heap, (next_frame.id, sender, next_mailbox))
+        self._bus_free_us = end_us
+        self._transmission = (frame, end_us)
+        self._max_wait_us = max(self._max_wait_us, start_us - since_us)
         self.count_frame(frame)
 
 

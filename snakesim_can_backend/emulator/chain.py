@@ -14,7 +14,7 @@ from zlib import crc32
 
 import msgspec
 
-from snakesim_can_backend.bus.load import joints_per_bus
+from snakesim_can_backend.bus.load import count_joints_per_bus
 from snakesim_can_backend.emulator.bus_time import BusTime, Traffic
 from snakesim_can_backend.emulator.faults import parse_fault
 from snakesim_can_backend.emulator.firmware import BOOT_US, ModuleFirmware
@@ -32,10 +32,10 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.mounted import build_config, build_joints
+from snakesim_drivers.emulation.mounted import build_true_config, build_true_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_drivers.mounting import Mounting, to_joint_target
-from snakesim_hal.model.fault_kinds import Change, Injection, InjectionPlan
+from snakesim_hal.model.fault_kinds import FaultTransition, Injection, InjectionPlan
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.physics_model import PhysicsModel
@@ -43,10 +43,14 @@ from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Mode
 
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it
-HEAT_EVERY = 10  # physics steps; windings heat up slowly
+THERMAL_DECIMATION = 10  # physics steps; windings heat up slowly
 SYNC_TIME_RANGE_US = 1 << 32  # the time in a Sync has 32 bits and wraps around
-MAX_STEP_US = 60_000_000  # a Sync that is later by more is of another clock; no lockstep bus is cut for that long
-NEW_HOST_US = 1_000_000  # a Sync that is earlier by this much is of a restarted host, not a late one of another bus
+MAX_SYNC_INTERVAL_US = (
+    60_000_000  # a Sync that is later by more is of another clock; no lockstep bus is cut for that long
+)
+MIN_HOST_RESTART_US = (
+    1_000_000  # a Sync that is earlier by this much is of a restarted host, not a late one of another bus
+)
 DUPLICATE_SERIAL_MASK = 0x0D0B1E00  # makes the serial number of an injected duplicate
 HEARTBEAT_BYTES = 8
 
@@ -66,50 +70,51 @@ class ModuleChain:
         """Create all modules; they boot.
 
         Args:
-            config: the run, with the robot.
-            settings: settings of the backend: buses, faults, and how the modules are really mounted.
-            physics_model: what the motors move.
-            stepped: whether time advances only from Sync to Sync.
-            send_pose: gets a MocapSample as JSON after every Sync, before the joint states.
+            config: Configuration of the run, with the robot.
+            settings: Settings of the backend: buses, faults, and how the modules are really mounted.
+            physics_model: Physics model that the motors move.
+            stepped: Whether time advances only from Sync to Sync.
+            send_pose: Function that sends a MocapSample as JSON, after every Sync and before the joint states; None
+                without motion capture.
 
         Raises:
-            ConfigError: the modules do not fit on the buses, or a fault or a node id is impossible.
+            ConfigError: The modules do not fit on the buses, or a fault or a node id is impossible.
         """
         robot = config.robot
 
         # Modules and buses.
         self.stepped = stepped
         self.module_count = robot.chain.modules
-        self.modules_per_bus = joints_per_bus(config, settings)
+        self.modules_per_bus = count_joints_per_bus(config, settings)
         self.buses = [BusTime(settings.bit_rate) for _ in self.modules_per_bus]
         self.slots: list[ModuleSlot] = []  # tail to head; then injected duplicates
         self._node_ids = assign_node_ids(robot, settings)
         self._configured_joints = robot.joint_table  # as the robot file describes them
-        self._joints = build_joints(robot, settings.mounted)  # as they are really built
+        self._joints = build_true_joints(robot, settings.mounted)  # as they are really built
         unconnected = {name for name, mount in settings.mounted.items() if not mount.connected}
-        self._unconnected = {i for i, joint in enumerate(self._joints) if joint.name in unconnected}
+        self._unconnected_joints = {i for i, joint in enumerate(self._joints) if joint.name in unconnected}
 
         # The body.
         self.physics_model = physics_model
-        self.motors = Motors(build_config(config, settings.mounted).robot, physics_model.step_s)
+        self.motors = Motors(build_true_config(config, settings.mounted).robot, physics_model.step_s)
         self.thermal = Thermal(self._joints)
 
         # Time.
         self.now_us = 0.0  # module time, since the emulators were started
         self.skipped_us = 0.0  # time in which this process did not run
         self._step_us = physics_model.step_s * 1e6
-        self._steps = 0
-        self._due_us = 0.0  # when `_poll` is due
-        self._sync_time: int | None = None  # time in the newest Sync; None: none yet
+        self._step_count = 0
+        self._next_poll_us = 0.0  # when `_poll_modules` is due
+        self._last_sync_time: int | None = None  # time in the newest Sync; None: none yet
 
         # Frames.
         self.refused = 0  # frames that no host sends
         self._outgoing: list[list[Frame]] = [[] for _ in self.modules_per_bus]  # by bus, in stepped time
 
         # Injected faults.
-        self.fault_log: list[str] = []  # each begin and end
-        self._plan = InjectionPlan(parse_fault(text, self.module_count) for text in settings.faults)
-        self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
+        self.fault_log: list[str] = []  # each start and end of a fault
+        self._injection_plan = InjectionPlan(parse_fault(text, self.module_count) for text in settings.faults)
+        self._babble_start_us_by_slot: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
 
         # Motion capture.
         self._send_pose = send_pose
@@ -130,7 +135,7 @@ class ModuleChain:
                 self._add_module(joint, channel, serial, -BOOT_US if stepped else 0.0)
             mounting = Mounting(self._joints[first : first + count])
             self._sensors.append(ModuleSensors(robot, physics_model, mounting, first, (config.seed, channel)))
-        self._poll(0.0)
+        self._poll_modules(0.0)
 
     def _add_module(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
         """Put a module of a joint on a bus; drives: whether a motor of its own moves the joint."""
@@ -147,7 +152,7 @@ class ModuleChain:
             stepped=self.stepped,
             now_us=now_us,
         )
-        has_motor = drives and joint not in self._unconnected
+        has_motor = drives and joint not in self._unconnected_joints
         self.slots.append(ModuleSlot(len(self.slots), channel, joint, firmware, joint_model, drives=has_motor))
 
     # --- time ----------------------------------------------------------------------------------------------
@@ -161,13 +166,13 @@ class ModuleChain:
             now_us = self.now_us + MAX_AT_ONCE_US
         if now_us > self.now_us:
             due_steps = int(now_us / self._step_us)
-            self._run_physics(now_us, due_steps - self._steps)
+            self._run_physics(now_us, due_steps - self._step_count)
 
     def next_us(self) -> float:
         """Return the module time at which a frame is sent or a module is due; inf for a stepped chain."""
         if self.stepped:
             return inf
-        return min(self._due_us, *(bus.next_us() for bus in self.buses))
+        return min(self._next_poll_us, *(bus.next_us() for bus in self.buses))
 
     def _run_physics(self, until_us: float, steps: int) -> None:
         """Advance the physics model by some steps, and the modules to a time."""
@@ -175,60 +180,64 @@ class ModuleChain:
         motors = self.motors
         step_us = self._step_us
         for _ in range(steps):
-            physics_model.advance(motors.step(physics_model.angle_rad, physics_model.velocity_rad_s))
-            self._steps += 1
-            if self._steps % HEAT_EVERY == 0:
+            physics_model.advance(motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s))
+            self._step_count += 1
+            if self._step_count % THERMAL_DECIMATION == 0:
                 self._heat_motors()
-            time_us = self._steps * step_us
-            if time_us >= self._due_us:
+            time_us = self._step_count * step_us
+            if time_us >= self._next_poll_us:
                 self.now_us = max(min(time_us, until_us), self.now_us)
-                self._poll(self.now_us)
+                self._poll_modules(self.now_us)
         self.now_us = until_us
-        if until_us >= self._due_us:
-            self._poll(until_us)
+        if until_us >= self._next_poll_us:
+            self._poll_modules(until_us)
 
     def _heat_motors(self) -> None:
         """Update the temperatures of all motors, and poll the modules at once if one is too hot."""
-        self.thermal.pass_time(HEAT_EVERY * self.physics_model.step_s, self.motors.pop_mean_square_torque())
+        self.thermal.advance_temperatures(
+            THERMAL_DECIMATION * self.physics_model.step_s, self.motors.pop_mean_square_torque()
+        )
         self._derate_motors()
-        if (self.thermal.winding_c >= self.thermal.stop_at_c).any():
-            self._due_us = -inf
+        if (self.thermal.winding_temperature_c >= self.thermal.stop_at_c).any():
+            self._next_poll_us = -inf
 
     def _derate_motors(self) -> None:
-        remaining_fraction = self.thermal.remaining_fraction()
+        remaining_fraction = self.thermal.compute_remaining_fractions()
         if remaining_fraction is not None:
-            self.motors.derate(remaining_fraction)
+            self.motors.apply_derating(remaining_fraction)
 
-    def _poll(self, now_us: float) -> None:
+    def _poll_modules(self, now_us: float) -> None:
         """Run everything that depends on time, except physics: planned faults, firmware and babbling modules.
 
+        The time at which the next call is due is stored.
+
         Args:
-            now_us: present time.
+            now_us: Current module time.
         """
-        for change in self._plan.until(now_us / 1e6):
+        for change in self._injection_plan.pop_due_transitions(now_us / 1e6):
             self._apply_fault(change, now_us)
         speeds_rad_s = self.physics_model.velocity_rad_s.tolist()
-        windings_c = self.thermal.winding_c.tolist()
-        boards_c = self.thermal.board_c().tolist()
-        powers_w = self.thermal.power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s).tolist()
-        due_us = self._plan.next_s() * 1e6
+        windings_c = self.thermal.winding_temperature_c.tolist()
+        boards_c = self.thermal.compute_board_temperatures_c().tolist()
+        powers_w = self.thermal.compute_power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s).tolist()
+        due_us = self._injection_plan.next_transition_s() * 1e6
         for slot in self.slots:
             joint = slot.joint
             slot.update_health(speeds_rad_s[joint], powers_w[joint], windings_c[joint], boards_c[joint])
             due_us = min(due_us, slot.module.poll(now_us))
-            self._follow_module(slot)
-        if self._babblers:
+            self._apply_module_outputs(slot)
+        if self._babble_start_us_by_slot:
             self._send_babble(now_us)
             due_us = now_us
-        self._due_us = due_us
+        self._next_poll_us = due_us
 
     def _send_babble(self, now_us: float) -> None:
         """In stepped time, send as many heartbeats of babbling modules as the bus could have carried."""
-        for slot, since_us in self._babblers.items():
+        for slot, since_us in self._babble_start_us_by_slot.items():
             frame_us = self.buses[slot.channel].frame_us[HEARTBEAT_BYTES]
             frames = int((now_us - since_us) / frame_us)
             self._outgoing[slot.channel].extend([slot.module.heartbeat(now_us)] * frames)
-            self._babblers[slot] = since_us + frames * frame_us
+            self._babble_start_us_by_slot[slot] = since_us + frames * frame_us
 
     # --- frames from the bus -------------------------------------------------------------------------------
 
@@ -236,8 +245,8 @@ class ModuleChain:
         """Process a frame of the host that has arrived on a bus: pass it to the modules that it addresses.
 
         Args:
-            channel: index of the bus.
-            frame: the frame; one that no host sends, or of a wrong length, is only counted.
+            channel: Index of the bus.
+            frame: Received frame. A frame that no host sends, or of a wrong length, is only counted.
         """
         opcode = parse_opcode(frame.id)
         node = parse_node(frame.id)
@@ -254,24 +263,24 @@ class ModuleChain:
             case Opcode.SYNC:
                 self._receive_sync(channel, frame)
             case Opcode.SET_POINT:
-                for slot in self._slots_of_node(channel, node):
+                for slot in self._find_slots(channel, node):
                     slot.module.receive_setpoint(frame, self.now_us)
                     if slot.module.frames:
-                        self._follow_module(slot)
+                        self._apply_module_outputs(slot)
             case Opcode.PARAMETER_REQUEST:
-                self._deliver(self._slots_of_node(channel, node), frame)
+                self._deliver_to_slots(self._find_slots(channel, node), frame)
             case _:  # Emergency and Command
                 if node == BROADCAST:
                     slots = [slot for slot in self.slots if slot.channel == channel]
                 else:
-                    slots = self._slots_of_node(channel, node)
-                self._deliver(slots, frame)
-                self._poll(self.now_us)
+                    slots = self._find_slots(channel, node)
+                self._deliver_to_slots(slots, frame)
+                self._poll_modules(self.now_us)
 
-    def take_frames(self, channel: int) -> list[Frame]:
+    def pop_frames(self, channel: int) -> list[Frame]:
         """Return the frames that are on a bus by now, in the order of arbitration, each once."""
         if not self.stepped:
-            return self.buses[channel].take_sent_frames(self.now_us)
+            return self.buses[channel].pop_sent_frames(self.now_us)
         frames = self._outgoing[channel]
         self._outgoing[channel] = []
         for frame in frames:
@@ -282,12 +291,12 @@ class ModuleChain:
         """Return the traffic of each bus until now."""
         return [bus.traffic(self.now_us) for bus in self.buses]
 
-    def _deliver(self, slots: Sequence[ModuleSlot], frame: Frame) -> None:
+    def _deliver_to_slots(self, slots: Sequence[ModuleSlot], frame: Frame) -> None:
         for slot in slots:
             slot.module.receive(frame, self.now_us)
-            self._follow_module(slot)
+            self._apply_module_outputs(slot)
 
-    def _slots_of_node(self, channel: int, node: int) -> list[ModuleSlot]:
+    def _find_slots(self, channel: int, node: int) -> list[ModuleSlot]:
         """Return the modules with a node id on a bus: one, or several if there are duplicates."""
         slots: list[ModuleSlot] = []
         if 1 <= node <= self.module_count:
@@ -299,45 +308,45 @@ class ModuleChain:
     # --- a Sync --------------------------------------------------------------------------------------------
 
     def _receive_sync(self, channel: int, frame: Frame) -> None:
-        """Advance to a Sync, send the pose, and let every module of its bus answer and follow its setpoint.
+        """Advance to a Sync, send the pose, and let every module of the bus respond and follow its setpoint.
 
-        Answers are sent in the order of arbitration.
+        Responses are sent in the order of arbitration.
 
         Args:
-            channel: index of the bus on which the Sync arrived.
-            frame: the Sync.
+            channel: Index of the bus on which the Sync arrived.
+            frame: Received Sync, with its number and time.
         """
         count, time_us = read_sync(frame.data)
         outgoing = self._outgoing[channel]
         sent_before = len(outgoing)
         if self.stepped:
-            self._step_to(time_us)
+            self._advance_to_sync(time_us)
         self._send_pose_once(time_us)
 
         slots_on_bus = [slot for slot in self.slots if slot.channel == channel]  # tail to head, then duplicates
-        slots_of_joints = slots_on_bus[: self.modules_per_bus[channel]]
-        imu_due = [slot.module.imu_is_due() for slot in slots_of_joints]
-        readings = self._sensors[channel].read(self.motors.torque_nm, self.motors.derated(), imu_due)
+        joint_slots = slots_on_bus[: self.modules_per_bus[channel]]
+        is_imu_due = [slot.module.is_imu_due() for slot in joint_slots]
+        readings = self._sensors[channel].read(self.motors.torque_nm, self.motors.find_derated(), is_imu_due)
         first_joint = sum(self.modules_per_bus[:channel])
         for slot in slots_on_bus:
-            slot.module.sync(count, readings[slot.joint - first_joint])
-            self._follow_module(slot)
+            slot.module.handle_sync(count, readings[slot.joint - first_joint])
+            self._apply_module_outputs(slot)
 
         # Answers to the same Sync arrive in the order of arbitration: the lowest id first.
         outgoing[sent_before:] = sorted(outgoing[sent_before:], key=lambda answer: answer.id)
 
-    def _step_to(self, sync_time: int) -> None:
+    def _advance_to_sync(self, sync_time: int) -> None:
         """Advance by the time from the latest Sync to this one. The first sets zero, as does one of another clock."""
         later_us = 0
-        if self._sync_time is not None:
-            later_us = (sync_time - self._sync_time) % SYNC_TIME_RANGE_US
+        if self._last_sync_time is not None:
+            later_us = (sync_time - self._last_sync_time) % SYNC_TIME_RANGE_US
         earlier_us = SYNC_TIME_RANGE_US - later_us
-        if 0 < later_us <= MAX_STEP_US:
+        if 0 < later_us <= MAX_SYNC_INTERVAL_US:
             until_us = self.now_us + later_us
-            self._run_physics(until_us, round(until_us / self._step_us) - self._steps)
-        elif 0 < earlier_us < NEW_HOST_US:
+            self._run_physics(until_us, round(until_us / self._step_us) - self._step_count)
+        elif 0 < earlier_us < MIN_HOST_RESTART_US:
             return
-        self._sync_time = sync_time
+        self._last_sync_time = sync_time
 
     def _send_pose_once(self, sync_time: int) -> None:
         """Send the pose for a Sync; a Sync of the same time on another bus sends none."""
@@ -350,9 +359,9 @@ class ModuleChain:
 
     # --- frames and demands of the modules -----------------------------------------------------------------
 
-    def _follow_module(self, slot: ModuleSlot) -> None:
+    def _apply_module_outputs(self, slot: ModuleSlot) -> None:
         """Send a module's frames, and apply its demand to its motor."""
-        for frame in slot.take_frames():
+        for frame in slot.pop_frames():
             if self.stepped:
                 self._outgoing[slot.channel].append(frame)
             else:
@@ -364,7 +373,7 @@ class ModuleChain:
         """Apply a module's demand and gains to its motor, converted from the module's shaft to the joint.
 
         Args:
-            slot: the module, and the joint that it moves.
+            slot: Place of the module on the bus, with the joint that it moves; its `driven` demand is updated.
         """
         demand = slot.module.demand
         slot.driven = demand
@@ -390,19 +399,19 @@ class ModuleChain:
     # --- injected faults -----------------------------------------------------------------------------------
 
     def inject(self, fault: Injection, *, begins: bool = True) -> None:
-        """Begin or end a fault now."""
-        self._apply_fault(Change(self.now_us / 1e6, fault, begins), self.now_us)
-        self._poll(self.now_us)
+        """Start or end a fault now."""
+        self._apply_fault(FaultTransition(self.now_us / 1e6, fault, begins), self.now_us)
+        self._poll_modules(self.now_us)
 
-    def _apply_fault(self, change: Change, now_us: float) -> None:
+    def _apply_fault(self, change: FaultTransition, now_us: float) -> None:
         fault = change.injection
-        begins = change.begins
-        joint = fault.number
+        begins = change.is_start
+        joint = fault.target_index
         slot = self.slots[joint]
         self.fault_log.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if begins else 'ends'}")
         match fault.kind:
             case "overheat":
-                self.thermal.inject(joint, heat=begins, hold=begins and fault.end_s != inf)
+                self.thermal.inject_heat(joint, heat=begins, hold=begins and fault.end_s != inf)
                 self._derate_motors()
             case "duplicate":
                 self._set_duplicate(slot, begins, now_us)
@@ -423,9 +432,9 @@ class ModuleChain:
     def _set_babbling(self, slot: ModuleSlot, begins: bool, now_us: float) -> None:
         """Let a module send heartbeats without a pause, or end that."""
         if self.stepped:
-            self._babblers.pop(slot, None)
+            self._babble_start_us_by_slot.pop(slot, None)
             if begins:
-                self._babblers[slot] = now_us
+                self._babble_start_us_by_slot[slot] = now_us
             return
         frame = slot.module.heartbeat(now_us) if begins else None
         self.buses[slot.channel].set_babbling(slot.sender, frame, now_us)

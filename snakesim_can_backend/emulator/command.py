@@ -11,9 +11,9 @@ from contextlib import ExitStack, closing
 import msgspec
 
 from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation
-from snakesim_can_backend.bus.adapter import check_channels, is_emulated, open_wire
+from snakesim_can_backend.bus.adapter import is_emulated, open_wire, validate_channels
 from snakesim_can_backend.bus.bus import Wire, wait
-from snakesim_can_backend.bus.load import format_bit_rate, joints_per_bus
+from snakesim_can_backend.bus.load import count_joints_per_bus, format_bit_rate
 from snakesim_can_backend.emulator.bus_time import Traffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.faults import parse_fault, parse_typed_fault
@@ -23,14 +23,14 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import die_with_parent, on_stop_signal, tune_garbage_collector
+from snakesim_hal.base.process import call_on_stop_signals, set_parent_death_signal, tune_garbage_collector
 from snakesim_hal.base.terminal import print_line, run_tool
-from snakesim_hal.model.files import Table, decode
-from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
+from snakesim_hal.model.files import ConfigTable, decode_table
+from snakesim_hal.model.scenario import LoadedScenario, Override, load_scenario, parse_set_option
 
 TOOL = "snakesim drive emulate can"
 NO_POSE = "none"
-STATS_EVERY_S = 1.0
+STATS_PERIOD_S = 1.0
 MAX_PAUSE_S = 0.5  # until a stop signal is checked
 
 
@@ -50,33 +50,33 @@ def emulate(arguments: argparse.Namespace) -> int:
     """Run `snakesim drive emulate can`: check everything, open the buses, and serve the emulators until a stop signal.
 
     Args:
-        arguments: the parsed command line.
+        arguments: Parsed command line.
 
     Returns:
-        The exit code, 0.
+        Exit code 0.
     """
     if arguments.parent is not None:
-        die_with_parent(arguments.parent)
+        set_parent_death_signal(arguments.parent)
     loaded = _load_configuration(arguments)
     settings = _make_settings(arguments, loaded)
     module_count = loaded.config.robot.chain.modules
-    _check_names(settings.channels, on_real_bus=arguments.on_real_bus)
-    joints_per_bus(loaded.config, settings)
+    _validate_virtual_channels(settings.channels, on_real_bus=arguments.on_real_bus)
+    count_joints_per_bus(loaded.config, settings)
     for text in settings.faults:
         parse_fault(text, module_count)
-    with ExitStack() as opened:
+    with ExitStack() as exit_stack:
         send_pose = None
         if arguments.pose != NO_POSE:
-            send_pose = opened.enter_context(closing(PoseSender(arguments.pose)))
-        check_channels(settings.channels)
+            send_pose = exit_stack.enter_context(closing(PoseSender(arguments.pose)))
+        validate_channels(settings.channels)
         wires: list[Wire] = []
         for channel in settings.channels:
             wire = open_wire(channel, FROM_HOST, settings.bit_rate)
-            wires.append(opened.enter_context(closing(wire)))
+            wires.append(exit_stack.enter_context(closing(wire)))
         physics_model = make_physics_model(loaded.config, settings, "can")
         chain = ModuleChain(loaded.config, settings, physics_model, stepped=arguments.stepped, send_pose=send_pose)
         loop = Loop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
-        on_stop_signal(loop.stop)
+        call_on_stop_signals(loop.stop)
         tune_garbage_collector()
         print_line(f"modules ready: {module_count} on {', '.join(settings.channels)}")
         loop.run()
@@ -85,19 +85,19 @@ def emulate(arguments: argparse.Namespace) -> int:
         return 0
 
 
-def _load_configuration(arguments: argparse.Namespace) -> Loaded:
+def _load_configuration(arguments: argparse.Namespace) -> LoadedScenario:
     """Load the scenario for the backend `can`, whatever backend it runs on otherwise."""
     overrides = [Override("backend", "can", TOOL)]
-    overrides += [parse_set(text) for text in arguments.set]
+    overrides += [parse_set_option(text) for text in arguments.set]
     if arguments.seed is not None:
         overrides.append(Override("seed", arguments.seed, f"--seed {arguments.seed}"))
-    return load(arguments.scenario, overrides)
+    return load_scenario(arguments.scenario, overrides)
 
 
-def _make_settings(arguments: argparse.Namespace, loaded: Loaded) -> CanSettings:
+def _make_settings(arguments: argparse.Namespace, loaded: LoadedScenario) -> CanSettings:
     """Return the settings of the backend, with those that the command line replaces or adds."""
     section = loaded.config.backends.get("can", {})
-    settings: CanSettings = decode(Table(section, arguments.scenario), CanSettings, "backends.can")
+    settings: CanSettings = decode_table(ConfigTable(section, arguments.scenario), CanSettings, "backends.can")
     return msgspec.structs.replace(
         settings,
         channels=arguments.channel or settings.channels or [DEFAULT_CHANNEL],
@@ -106,7 +106,7 @@ def _make_settings(arguments: argparse.Namespace, loaded: Loaded) -> CanSettings
     )
 
 
-def _check_names(channels: Sequence[str], *, on_real_bus: bool) -> None:
+def _validate_virtual_channels(channels: Sequence[str], *, on_real_bus: bool) -> None:
     """Raise ConfigError for a bus that may have real modules, unless that is allowed."""
     for channel in channels:
         if not is_emulated(channel) and not on_real_bus:
@@ -124,19 +124,19 @@ class Loop:
         """Prepare to serve the emulators with the options of the command line.
 
         Args:
-            server: the modules, and their end of each bus.
-            arguments: the parsed command line.
-            bit_rate: bit rate of the buses in bit/s, for the load that is printed.
+            server: The modules, with their end of each bus.
+            arguments: Parsed command line.
+            bit_rate: Bit rate of the buses in bit/s, for the load that is printed.
         """
         self._server = server
         self._chain = server.chain
         self._bit_rate = bit_rate
-        self._running = True
+        self._should_run = True
 
         # Options.
         self._duration_s: float | None = arguments.duration
-        self._shows_stats: bool = arguments.stats
-        self._interactive: bool = arguments.interactive  # until the terminal is closed
+        self._should_print_stats: bool = arguments.stats
+        self._is_interactive: bool = arguments.interactive  # until the terminal is closed
 
         # Statistics.
         self._start_s = time.monotonic()
@@ -145,28 +145,28 @@ class Loop:
 
     def stop(self) -> None:
         """End after this cycle."""
-        self._running = False
+        self._should_run = False
 
     def run(self) -> None:
         """Serve the buses until the loop is stopped or its duration is over."""
-        end_s = math.inf if self._duration_s is None else self._start_s + self._duration_s
-        shown_traffic = self._start_traffic
-        shown_s = self._start_s
-        while self._running:
-            pause_s = self._server.run_due(time.monotonic_ns())
+        deadline_s = math.inf if self._duration_s is None else self._start_s + self._duration_s
+        last_printed_traffic = self._start_traffic
+        last_printed_s = self._start_s
+        while self._should_run:
+            idle_duration_s = self._server.run_due(time.monotonic_ns())
             now_s = time.monotonic()
-            if now_s >= end_s:
+            if now_s >= deadline_s:
                 return
-            if self._shows_stats and now_s - shown_s >= STATS_EVERY_S:
-                shown_traffic = self._show_loads(shown_traffic, now_s)
-                shown_s = now_s
-            if self._interactive:
-                self._read_terminal()
-            if pause_s is None:  # stepped: only a frame can make something due
+            if self._should_print_stats and now_s - last_printed_s >= STATS_PERIOD_S:
+                last_printed_traffic = self._print_loads(last_printed_traffic, now_s)
+                last_printed_s = now_s
+            if self._is_interactive:
+                self._inject_typed_faults()
+            if idle_duration_s is None:  # stepped: only a frame can make something due
                 wait(self._server.wires, MAX_PAUSE_S)
                 continue
-            wait(self._server.wires, pause_s)
-            lateness_s = time.monotonic() - now_s - pause_s
+            wait(self._server.wires, idle_duration_s)
+            lateness_s = time.monotonic() - now_s - idle_duration_s
             self._max_lateness_s = max(self._max_lateness_s, lateness_s)
 
     def summary(self) -> list[str]:
@@ -193,7 +193,7 @@ class Loop:
             lines.append(f"  {opcode.name.lower():<18}{count:8d} frames {fraction:7.2%}")
         return lines
 
-    def _show_loads(self, before: list[Traffic], now_s: float) -> list[Traffic]:
+    def _print_loads(self, before: list[Traffic], now_s: float) -> list[Traffic]:
         """Print the load of every bus since an earlier point; return the traffic until now."""
         after = self._chain.traffic()
         loads: list[str] = []
@@ -202,16 +202,16 @@ class Loop:
         print_line(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}")
         return after
 
-    def _read_terminal(self) -> None:
+    def _inject_typed_faults(self) -> None:
         """Inject the faults that a person has typed."""
-        while self._interactive and select.select([sys.stdin], [], [], 0)[0]:
+        while self._is_interactive and select.select([sys.stdin], [], [], 0)[0]:
             line = sys.stdin.readline()
             if not line:
-                self._interactive = False
+                self._is_interactive = False
             elif line.strip():
-                self._inject_typed(line)
+                self._inject_typed_fault(line)
 
-    def _inject_typed(self, line: str) -> None:
+    def _inject_typed_fault(self, line: str) -> None:
         now_s = self._chain.now_us * 1e-6
         try:
             fault, begins = parse_typed_fault(line, self._chain.module_count, now_s)

@@ -10,56 +10,61 @@ from collections.abc import Mapping
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model import fault_kinds as injection
-from snakesim_hal.model.fault_kinds import KINDS, Injection
+from snakesim_hal.model.fault_kinds import FAULT_KINDS, Injection
 
 # What each kind does to a module.
 FAULT_DESCRIPTIONS: Mapping[str, str] = {
-    name: kind.in_module or kind.description for name, kind in KINDS["joint"].items() if "module" in kind.by
+    name: kind.module_description or kind.description
+    for name, kind in FAULT_KINDS["joint"].items()
+    if "module" in kind.executors
 }
-FORM = "KIND:JOINT@START or KIND:JOINT@START-END, in seconds, such as mute:joint_3@2.0 or leak:joint_1@1-4"
-SHOWN_CHARACTERS = 40  # of a text that is too long
-_typed = re.compile(r"(?P<kind>[a-z_]+)[ :]+(?P<joint>joint_[0-9]+)(?: +(?P<off>off))?")
+FAULT_NOTATION = "KIND:JOINT@START or KIND:JOINT@START-END, in seconds, such as mute:joint_3@2.0 or leak:joint_1@1-4"
+MAX_SHOWN_CHARACTERS = 40  # of a text that is too long
+TYPED_FAULT_PATTERN = re.compile(r"(?P<kind>[a-z_]+)[ :]+(?P<joint>joint_[0-9]+)(?: +(?P<off>off))?")
 
 
 def parse_fault(text: str, joints: int) -> Injection:
     """Return the fault that a text describes in the notation of FORM.
 
     Args:
-        text: the description.
-        joints: number of joints of the robot.
+        text: The description.
+        joints: Number of joints of the robot.
 
     Raises:
-        ConfigError: the text has another form, or modules of this robot do not support the fault.
+        ConfigError: The text has another form, or modules of this robot do not support the fault.
     """
-    return check_fault(injection.parse_injection(text), joints)
+    return validate_fault(injection.parse_injection(text), joints)
 
 
 def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[Injection, bool]:
-    """Return the fault that a person typed in a terminal, such as `mute joint_3 off`, and whether it begins.
+    """Parse a fault that a person has typed in a terminal, such as `mute joint_3` or `mute joint_3 off`.
 
     Args:
-        text: the line.
-        joints: number of joints of the robot.
-        now_s: present time; a fault that is typed begins or ends now.
+        text: Typed line.
+        joints: Number of joints of the robot.
+        now_s: Current time, at which the fault starts or ends.
+
+    Returns:
+        The fault, and whether it starts (True) or ends (False).
 
     Raises:
-        ConfigError: the text has another form, or modules of this robot do not support the fault.
+        ConfigError: The text has another form, or modules of this robot do not support the fault.
     """
-    if len(text) > injection.LONGEST_TEXT:
+    if len(text) > injection.MAX_TEXT_LENGTH:
         raise ConfigError(
-            f"{text[:SHOWN_CHARACTERS]!r}...: {len(text)} characters, at most {injection.LONGEST_TEXT}",
+            f"{text[:MAX_SHOWN_CHARACTERS]!r}...: {len(text)} characters, at most {injection.MAX_TEXT_LENGTH}",
             code="injection/unknown-fault",
         )
-    match = _typed.fullmatch(text.strip())
+    match = TYPED_FAULT_PATTERN.fullmatch(text.strip())
     if match is None:
         kinds = ", ".join(FAULT_DESCRIPTIONS)
         raise ConfigError(
             f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {kinds}",
             code="injection/unknown-fault",
         )
-    fault = injection.check_injection(Injection(match["kind"], match["joint"], now_s), text.strip())
+    fault = injection.validate_and_complete_injection(Injection(match["kind"], match["joint"], now_s), text.strip())
     begins = match["off"] is None
-    return check_fault(fault, joints), begins
+    return validate_fault(fault, joints), begins
 
 
 def format_typed_fault(fault: Injection, *, begins: bool) -> str:
@@ -69,15 +74,15 @@ def format_typed_fault(fault: Injection, *, begins: bool) -> str:
     return f"{fault.kind} {fault.target} off"
 
 
-def check_fault(fault: Injection, joints: int) -> Injection:
+def validate_fault(fault: Injection, joints: int) -> Injection:
     """Return the same fault. Raises ConfigError if modules of a robot with this many joints do not support it."""
     if fault.target_type != "joint" or fault.kind not in FAULT_DESCRIPTIONS:
         raise ConfigError(
-            f"fault {str(fault)!r}: modules support {', '.join(FAULT_DESCRIPTIONS)}, as {FORM}; put other kinds into "
-            f"the scenario's `faults`",
+            f"fault {str(fault)!r}: modules support {', '.join(FAULT_DESCRIPTIONS)}, as {FAULT_NOTATION}; put other "
+            f"kinds into the scenario's `faults`",
             code="injection/unknown-fault",
         )
-    injection.check_targets([fault], services=(), joints=joints, buses=0)
+    injection.validate_injection_targets([fault], services=(), joints=joints, buses=0)
     return fault
 
 

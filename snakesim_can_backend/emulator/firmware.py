@@ -94,13 +94,13 @@ class ModuleFirmware:
         """Start to boot the firmware of one emulated module.
 
         Args:
-            node: id of the module on its bus.
-            serial: serial number, reported in Identity.
-            parameters: parameters of the module, and its flash.
-            heat: winding temperature that stops the module, and the one below which a clear is possible again.
-            min_voltage_v: supply voltage below which the module stops.
-            stepped: whether time advances only from Sync to Sync; reported in Identity.
-            now_us: present time.
+            node: Node id of the module on its bus.
+            serial: Serial number, reported in Identity.
+            parameters: Parameters of the module, and its flash.
+            heat: Winding temperature that stops the module, and the one below which a clear is possible again.
+            min_voltage_v: Supply voltage below which the module stops.
+            stepped: Whether time advances only from Sync to Sync; reported in Identity.
+            now_us: Current time.
         """
         # What the module is.
         self.node = node
@@ -113,8 +113,8 @@ class ModuleFirmware:
         # What the caller exchanges with it.
         self.frames: list[Frame] = []  # to send
         self.health = ModuleHealth()  # present internal measurements
-        self.hangs = False  # whether the main loop hangs, so that only the hardware still works
-        self.refused = 0  # frames with a wrong checksum, count or length
+        self.is_hanging = False  # whether the main loop hangs, so that only the hardware still works
+        self.rejected_frame_count = 0  # frames with a wrong checksum, count or length
 
         self._last_joint_state: Frame | None = None
         self._reset_state(now_us)
@@ -125,14 +125,14 @@ class ModuleFirmware:
     def receive(self, frame: Frame, now_us: float) -> None:
         """Process an Emergency, Command or ParameterRequest. The first two may be broadcasts.
 
-        A module that boots obeys only an Emergency; one that hangs obeys nothing.
+        A module that boots executes only an Emergency; one that hangs ignores all frames.
 
         Args:
-            frame: the frame.
-            now_us: present time.
+            frame: Received frame.
+            now_us: Current time.
         """
         opcode = parse_opcode(frame.id)
-        if self.hangs:
+        if self.is_hanging:
             return
         if opcode == Opcode.EMERGENCY:  # valid at any length, and while the module boots
             self._enter_emergency(now_us)
@@ -140,18 +140,18 @@ class ModuleFirmware:
         if self.state == ModuleState.BOOT:
             return
         if len(frame.data) != LENGTHS[opcode]:
-            self.refused += 1
+            self.rejected_frame_count += 1
         elif opcode == Opcode.PARAMETER_REQUEST:
             driven = self.state in DRIVEN_STATES
-            self.frames.append(self.parameters.answer_request(self.node, frame.data, driven))
+            self.frames.append(self.parameters.handle_request(self.node, frame.data, driven))
         elif opcode == Opcode.COMMAND and has_valid_checksum(frame):
             action, key = read_command(frame.data)
             if key == COMMAND_KEY:
-                self._execute(action, now_us)
+                self._execute_action(action, now_us)
         else:
-            self.refused += 1
+            self.rejected_frame_count += 1
 
-    def _execute(self, action: int, now_us: float) -> None:
+    def _execute_action(self, action: int, now_us: float) -> None:
         """Execute the action of a Command; an unknown one has no effect."""
         match action:
             case CommandAction.ARM:
@@ -172,38 +172,38 @@ class ModuleFirmware:
     def receive_setpoint(self, frame: Frame, now_us: float) -> None:
         """Check a setpoint for this node, and store it until the next Sync.
 
-        A setpoint with a wrong length, checksum, counter or mode is refused. MAX_WRONG_COUNTS wrong counters in a row
+        A setpoint with a wrong length, checksum, counter or mode is rejected. MAX_WRONG_COUNTS wrong counters in a row
         are a fault. The first valid setpoint after a Sync feeds the watchdog.
 
         Args:
-            frame: the setpoint.
-            now_us: present time.
+            frame: Received setpoint.
+            now_us: Current time.
         """
-        if self.state != ModuleState.ARMED or self.hangs:
+        if self.state != ModuleState.ARMED or self.is_hanging:
             return
         if len(frame.data) != LENGTHS[Opcode.SET_POINT] or not has_valid_checksum(frame):
-            self.refused += 1
+            self.rejected_frame_count += 1
             return
         mode, count, target_steps, limit_steps = read_setpoint(frame.data)
-        if not self._accept_count(count):
-            self.refused += 1
+        if not self._is_counter_valid(count):
+            self.rejected_frame_count += 1
             self._wrong_counts += 1
             if self._wrong_counts >= MAX_WRONG_COUNTS:
                 self._fail(ModuleFault.STREAM, now_us)
             return
         self._wrong_counts = 0
         if mode > Mode.TORQUE:
-            self.refused += 1
+            self.rejected_frame_count += 1
             return
-        if self._synced:  # otherwise a host without Syncs would keep an old demand active for ever
-            self._fed_us = now_us
-            self._synced = False
+        if self._has_sync_since_setpoint:  # otherwise a host without Syncs would keep an old demand active for ever
+            self._watchdog_fed_us = now_us
+            self._has_sync_since_setpoint = False
         target = target_steps * TARGET_STEPS[mode]  # position, velocity and torque share their bits
         if mode == Mode.POSITION:
             target = self._clamp_angle(target)
-        self._pending = Demand(MODES[mode], target, limit_steps * TORQUE_LIMIT_STEP_NM)
+        self._pending_demand = Demand(MODES[mode], target, limit_steps * TORQUE_LIMIT_STEP_NM)
 
-    def _accept_count(self, count: int) -> bool:
+    def _is_counter_valid(self, count: int) -> bool:
         """Return whether a setpoint's counter follows the one before; a few setpoints in between may be lost."""
         expected = self._expected_count
         self._expected_count = (count + 1) % COUNTER_MODULUS
@@ -216,33 +216,33 @@ class ModuleFirmware:
         limit_rad = self.parameters.values[ModuleParameter.ANGLE_LIMIT]
         return min(max(angle_rad, -limit_rad), limit_rad)
 
-    def sync(self, count: int, reading: ModuleReadings) -> None:
-        """Answer a Sync with the sensor readings of that moment, then follow the newest setpoint.
+    def handle_sync(self, count: int, reading: ModuleReadings) -> None:
+        """Respond to a Sync with the sensor readings of that moment, then follow the newest setpoint.
 
         Args:
-            count: number of the Sync, modulo 256.
-            reading: sensor readings at the Sync, in raw numbers.
+            count: Number of the Sync, modulo 256.
+            reading: Sensor readings at the Sync, in raw numbers.
         """
         if self.state == ModuleState.BOOT:
             return
-        if self.hangs:
+        if self.is_hanging:
             if self._last_joint_state is not None:  # a transmit mailbox that is no longer refilled
                 self.frames.append(self._last_joint_state)
             return
         self._report_joint_state(count, reading)
         self._report_contacts(count, reading)
-        if self.imu_is_due():
+        if self.is_imu_due():
             self._report_imu(count, reading)
-        self._syncs += 1
-        self._synced = True
-        if self._pending is not None:
-            self.demand = self._pending
-            self._pending = None
+        self._sync_count += 1
+        self._has_sync_since_setpoint = True
+        if self._pending_demand is not None:
+            self.demand = self._pending_demand
+            self._pending_demand = None
 
-    def imu_is_due(self) -> bool:
+    def is_imu_due(self) -> bool:
         """Return whether gyro, accelerometer and shaft load answer the next Sync; neighbors do so in turn."""
         every = int(self.parameters.values[ModuleParameter.IMU_EVERY])
-        return every > 0 and (self._syncs + self.node) % every == 0
+        return every > 0 and (self._sync_count + self.node) % every == 0
 
     # --- time ----------------------------------------------------------------------------------------------
 
@@ -250,33 +250,33 @@ class ModuleFirmware:
         """Do everything that is due now: watchdog, fault detection, heartbeat and Health.
 
         Args:
-            now_us: present time.
+            now_us: Current time in microseconds.
 
         Returns:
             The time at which the next call is due, in microseconds.
         """
-        if self.hangs:
+        if self.is_hanging:
             return self._poll_hanging(now_us)
         if self.state == ModuleState.BOOT:
-            if now_us < self._booted_us + BOOT_US:
-                return self._booted_us + BOOT_US
+            if now_us < self._boot_start_us + BOOT_US:
+                return self._boot_start_us + BOOT_US
             self._finish_boot(now_us)
-        self._detect_faults(now_us)
+        self._latch_new_faults(now_us)
         match self.state:
             case ModuleState.ARMED:
-                if now_us >= self._fed_us + self.watchdog_us:
+                if now_us >= self._watchdog_fed_us + self.watchdog_us:
                     self._fail(ModuleFault.WATCHDOG, now_us)
             case ModuleState.STOPPING:
                 at_rest = abs(self.health.speed_rad_s) < AT_REST_RAD_S
-                if at_rest or now_us >= self._stopping_us + self.watchdog_us:
-                    self._enter(ModuleState.DISARMED, now_us)
+                if at_rest or now_us >= self._stopping_start_us + self.watchdog_us:
+                    self._enter_state(ModuleState.DISARMED, now_us)
             case _:
                 pass
-        if now_us >= self._heartbeat_us:
-            self._heartbeat_us = max(self._heartbeat_us + HEARTBEAT_US, now_us)
+        if now_us >= self._next_heartbeat_us:
+            self._next_heartbeat_us = max(self._next_heartbeat_us + HEARTBEAT_US, now_us)
             self.frames.append(self.heartbeat(now_us))
-        if now_us >= self._health_us:
-            self._health_us = max(self._health_us + HEALTH_US, now_us)
+        if now_us >= self._next_health_us:
+            self._next_health_us = max(self._next_health_us + HEALTH_US, now_us)
             self.frames.append(write_health(self.node, encode_health(self.health)))
         return self._next_due_us(now_us)
 
@@ -293,15 +293,15 @@ class ModuleFirmware:
         self.last_stop = LastStop.REBOOT if driven else LastStop.NONE
 
     def _finish_boot(self, now_us: float) -> None:
-        self._heartbeat_us = now_us + HEARTBEAT_US
-        self._health_us = now_us + HEALTH_US * (1 + self.node % HEALTH_PHASES) / HEALTH_PHASES
-        self._enter(self._after_boot, now_us)
+        self._next_heartbeat_us = now_us + HEARTBEAT_US
+        self._next_health_us = now_us + HEALTH_US * (1 + self.node % HEALTH_PHASES) / HEALTH_PHASES
+        self._enter_state(self._state_after_boot, now_us)
 
     def _next_due_us(self, now_us: float) -> float:
-        report_us = min(self._heartbeat_us, self._health_us)
+        report_us = min(self._next_heartbeat_us, self._next_health_us)
         match self.state:
             case ModuleState.ARMED:
-                return min(report_us, self._fed_us + self.watchdog_us)
+                return min(report_us, self._watchdog_fed_us + self.watchdog_us)
             case ModuleState.STOPPING:
                 return now_us
             case _:
@@ -313,7 +313,7 @@ class ModuleFirmware:
         The main loop fed the hardware watchdog with every valid setpoint. When the watchdog expires it opens the
         motor's bridge.
         """
-        watchdog_end_us = self._fed_us + self.watchdog_us
+        watchdog_end_us = self._watchdog_fed_us + self.watchdog_us
         if self.demand.mode != Mode.PASSIVE and now_us >= watchdog_end_us:
             self.demand = PASSIVE
         if self.demand.mode == Mode.PASSIVE:
@@ -323,66 +323,67 @@ class ModuleFirmware:
     # --- states --------------------------------------------------------------------------------------------
 
     def _reset_state(self, now_us: float) -> None:
-        """Set state, setpoints and times to what they are when a module begins to boot.
+        """Set state, setpoints and times to what they are when a module starts to boot.
 
         Args:
-            now_us: present time.
+            now_us: Current time.
         """
         self.state = ModuleState.BOOT
-        self._after_boot = ModuleState.DISARMED
+        self._state_after_boot = ModuleState.DISARMED
         self.faults = 0  # bits of ModuleFault
 
         # Setpoints.
         self.demand = PASSIVE
-        self._pending: Demand | None = None  # followed from the next Sync on
+        self._pending_demand: Demand | None = None  # followed from the next Sync on
         self._expected_count: int | None = None  # counter of the next setpoint; None: any
         self._wrong_counts = 0  # in a row
-        self._syncs = 0
-        self._synced = True  # whether a Sync has come since the setpoint that last fed the watchdog
+        self._sync_count = 0
+        self._has_sync_since_setpoint = True  # whether a Sync has come since the setpoint that last fed the watchdog
 
         # Times.
-        self._booted_us = now_us
-        self._fed_us = now_us  # when a setpoint last fed the watchdog
-        self._stopping_us = now_us  # when STOPPING began
-        self._heartbeat_us = now_us  # when the next heartbeat is due
-        self._health_us = now_us  # when the next Health is due
+        self._boot_start_us = now_us
+        self._watchdog_fed_us = now_us  # when a setpoint last fed the watchdog
+        self._stopping_start_us = now_us  # when STOPPING began
+        self._next_heartbeat_us = now_us  # when the next heartbeat is due
+        self._next_health_us = now_us  # when the next Health is due
 
-    def _enter(
+    def _enter_state(
         self, state: ModuleState, now_us: float, reason: LastStop | None = None, demand: Demand = PASSIVE
     ) -> None:
         """Change the state of the module, drop all setpoints, and send a heartbeat.
 
         Args:
-            state: the new state.
-            now_us: present time.
-            reason: why a module that was ARMED leaves this state; reported in heartbeats from now on.
-            demand: what the motor does in the new state.
+            state: New state.
+            now_us: Current time.
+            reason: Reason why a module leaves the state ARMED, reported in heartbeats from now on; None, or if it was
+                not ARMED, for no new reason.
+            demand: Demand of the motor in the new state.
         """
         if self.state == ModuleState.ARMED and reason is not None:
             self.last_stop = reason
         self.state = state
         self.demand = demand
-        self._pending = None
+        self._pending_demand = None
         self._expected_count = None
         self._wrong_counts = 0
         self.frames.append(self.heartbeat(now_us))
 
     def _arm(self, now_us: float) -> None:
-        if self.state == ModuleState.DISARMED and not self._present_faults():
-            self._fed_us = now_us
-            self._synced = True
-            self._enter(ModuleState.ARMED, now_us)
+        if self.state == ModuleState.DISARMED and not self._detect_present_faults():
+            self._watchdog_fed_us = now_us
+            self._has_sync_since_setpoint = True
+            self._enter_state(ModuleState.ARMED, now_us)
 
     def _disarm(self, now_us: float) -> None:
         if self.state in DRIVEN_STATES:
-            self._enter(ModuleState.DISARMED, now_us, LastStop.DISARM)
+            self._enter_state(ModuleState.DISARMED, now_us, LastStop.DISARM)
 
     def _stop(self, now_us: float) -> None:
         if self.state == ModuleState.ARMED:
-            self._stopping_us = now_us
-            self._enter(ModuleState.STOPPING, now_us, LastStop.STOP, self._stopping_demand())
+            self._stopping_start_us = now_us
+            self._enter_state(ModuleState.STOPPING, now_us, LastStop.STOP, self._make_stopping_demand())
 
-    def _stopping_demand(self) -> Demand:
+    def _make_stopping_demand(self) -> Demand:
         """Return the demand while the module comes to rest in its stop mode."""
         values = self.parameters.values
         if values[ModuleParameter.STOP_MODE] == SafeMotion.DAMP:
@@ -390,15 +391,15 @@ class ModuleFirmware:
         return PASSIVE
 
     def _clear(self, now_us: float) -> None:
-        if self.state in LATCHED_STATES and not self._present_faults():
+        if self.state in LATCHED_STATES and not self._detect_present_faults():
             self.faults = 0
-            self._enter(ModuleState.DISARMED, now_us)
+            self._enter_state(ModuleState.DISARMED, now_us)
 
     def _enter_emergency(self, now_us: float) -> None:
         if self.state == ModuleState.BOOT:
-            self._after_boot = ModuleState.EMERGENCY
+            self._state_after_boot = ModuleState.EMERGENCY
         elif self.state != ModuleState.EMERGENCY:
-            self._enter(ModuleState.EMERGENCY, now_us, LastStop.EMERGENCY)
+            self._enter_state(ModuleState.EMERGENCY, now_us, LastStop.EMERGENCY)
 
     def _fail(self, fault: ModuleFault, now_us: float) -> None:
         """Latch a fault; an emergency is latched more strongly, and stays."""
@@ -406,9 +407,9 @@ class ModuleFirmware:
         if self.state == ModuleState.EMERGENCY:
             self.frames.append(self.heartbeat(now_us))
         else:
-            self._enter(ModuleState.FAULT, now_us, STOP_OF_FAULT[fault])
+            self._enter_state(ModuleState.FAULT, now_us, STOP_OF_FAULT[fault])
 
-    def _present_faults(self) -> int:
+    def _detect_present_faults(self) -> int:
         """Return the bits of the faults whose cause is present. A winding that overheated must first cool down."""
         health = self.health
         overheated = self.faults >> ModuleFault.OVERHEAT & 1
@@ -419,8 +420,8 @@ class ModuleFirmware:
             | (health.voltage_v < self._min_voltage_v) << ModuleFault.VOLTAGE
         )
 
-    def _detect_faults(self, now_us: float) -> None:
-        new_faults = self._present_faults() & ~self.faults
+    def _latch_new_faults(self, now_us: float) -> None:
+        new_faults = self._detect_present_faults() & ~self.faults
         if not new_faults:
             return
         for fault in ModuleFault:
@@ -431,7 +432,7 @@ class ModuleFirmware:
 
     def heartbeat(self, now_us: float) -> Frame:
         """Return the present heartbeat."""
-        uptime_ms = min(round(now_us - self._booted_us) // 1000, MAX_UPTIME_MS)
+        uptime_ms = min(round(now_us - self._boot_start_us) // 1000, MAX_UPTIME_MS)
         fault_bits = [self.faults >> fault & 1 for fault in ModuleFault]
         return write_heartbeat(self.node, (self.state, self.demand.mode, self.last_stop, *fault_bits, uptime_ms))
 
@@ -440,8 +441,8 @@ class ModuleFirmware:
         self.frames.append(write_identity(self.node, identity))
 
     def _report_joint_state(self, count: int, reading: ModuleReadings) -> None:
-        numbers = (reading.angle, reading.velocity, reading.torque, count, self.state, reading.derated)
-        self._last_joint_state = write_joint_state(self.node, numbers)
+        raw_values = (reading.angle, reading.velocity, reading.torque, count, self.state, reading.derated)
+        self._last_joint_state = write_joint_state(self.node, raw_values)
         self.frames.append(self._last_joint_state)
 
     def _report_contacts(self, count: int, reading: ModuleReadings) -> None:

@@ -31,61 +31,62 @@ class ModuleSensors:
     """Sensors of neighboring modules on one bus, with a noise generator of their own."""
 
     def __init__(
-        self, robot: RobotFile, physics_model: PhysicsModel, mounting: Mounting, first: int, seed: Sequence[int]
+        self, robot: RobotFile, physics_model: PhysicsModel, mounting: Mounting, first_joint: int, seed: Sequence[int]
     ) -> None:
         """Create the emulated sensors of the modules on one bus, with a noise generator of their own.
 
         Args:
-            robot: the robot file, with noise and thresholds.
-            physics_model: the body whose motion and contacts they measure.
-            mounting: how the shafts of these modules move their joints.
-            first: index of the first joint on this bus, 0 at the tail.
-            seed: seed of the noise.
+            robot: Robot file, with noise and thresholds.
+            physics_model: Physics model whose motion and contacts are measured.
+            mounting: Sign, gear and zero from each joint to the shaft of its module.
+            first_joint: Index in the robot of the first joint on this bus, 0 at the tail.
+            seed: Entropy for `numpy.random.default_rng`, from which the noise is drawn.
         """
         # The joints of this bus.
         self._physics_model = physics_model
         self._mounting = mounting
-        self._first = first
-        self._count = len(mounting.sign)
-        self._joints = slice(first, first + self._count)
+        self._first_joint = first_joint
+        self._joint_count = len(mounting.sign)
+        self._joints = slice(first_joint, first_joint + self._joint_count)
 
         # Sensors and their noise.
-        self._noise = np.random.default_rng(seed).standard_normal
+        self._draw_standard_normal = np.random.default_rng(seed).standard_normal
         self._contact_sensor = robot.sensors.contacts
         self._imu_sensor = robot.sensors.imu
         joints = robot.sensors.joints
+        # One row each for angle in rad, velocity in rad/s and torque in N·m; one column for each joint.
         sigmas = [joints.angle_noise_rad, joints.velocity_noise_rad_s, joints.torque_noise_nm]
-        self._joint_sigma = np.repeat(sigmas, self._count).reshape(3, self._count)
+        self._joint_sigma = np.repeat(sigmas, self._joint_count).reshape(3, self._joint_count)
         self._has_joint_noise = any(sigmas)
         self._torque_sigma_nm = joints.torque_noise_nm
 
-    def read(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[ModuleReadings]:
-        """Return the present readings of every module on this bus.
+    def read(self, torque_nm: Floats, derated: NDArray[np.bool_], is_imu_due: Sequence[bool]) -> list[ModuleReadings]:
+        """Return the current readings of every module on this bus.
 
         Args:
-            torque_nm: torques of all motors of the chain.
-            derated: whether each motor of the chain is derated.
-            imu_due: whether each module on this bus reports its IMU and shaft load.
+            torque_nm: Torques of all motors of the chain, (n_joints,).
+            derated: Whether each motor of the chain is derated, (n_joints,).
+            is_imu_due: Whether each module on this bus reports its IMU and shaft load.
         """
         readings = self._read_joints(torque_nm, derated)
         self._add_contacts(readings)
-        if any(imu_due):
-            self._add_imus(readings, imu_due)
+        if any(is_imu_due):
+            self._add_imus(readings, is_imu_due)
         return readings
 
     def _read_joints(self, torque_nm: Floats, derated: NDArray[np.bool_]) -> list[ModuleReadings]:
         """Return readings with angle, velocity and torque of the modules' shafts."""
         model = self._physics_model
-        here = self._joints
-        joints = np.stack((model.angle_rad[here], model.velocity_rad_s[here], torque_nm[here]))
+        joint_slice = self._joints
+        joints = np.stack((model.angle_rad[joint_slice], model.velocity_rad_s[joint_slice], torque_nm[joint_slice]))
         if self._has_joint_noise:
-            joints += self._joint_sigma * self._noise((3, self._count))
+            joints += self._joint_sigma * self._draw_standard_normal((3, self._joint_count))
         angle_rad, velocity_rad_s, joint_torque_nm = joints
         rows = zip(
             ANGLE.to_raw_array(self._mounting.to_drive_angle_rad(angle_rad)),
             VELOCITY.to_raw_array(self._mounting.to_drive_velocity_rad_s(velocity_rad_s)),
             TORQUE.to_raw_array(self._mounting.to_drive_torque_nm(joint_torque_nm)),
-            derated[here],
+            derated[joint_slice],
             strict=True,
         )
         return [ModuleReadings(angle, velocity, torque, bool(hot)) for angle, velocity, torque, hot in rows]
@@ -102,7 +103,7 @@ class ModuleSensors:
         if not contacts:
             return
         for i, reading in enumerate(readings):
-            tail_link = self._first + i
+            tail_link = self._first_joint + i
             reading.tail_contact = contacts.get(tail_link, NO_CONTACT)
             reading.contact = contacts.get(tail_link + 1, NO_CONTACT)
 
@@ -110,7 +111,7 @@ class ModuleSensors:
         sensor = self._contact_sensor
         if sensor is None or not (sensor.position_noise_m or sensor.force_noise_n):
             return load
-        noise = self._noise(6).tolist()
+        noise = self._draw_standard_normal(6).tolist()
         x, y, z = load.position_l
         force_x, force_y, force_z = load.force_l
         sigma_m = sensor.position_noise_m
@@ -122,7 +123,7 @@ class ModuleSensors:
     def _add_imus(self, readings: list[ModuleReadings], due: Sequence[bool]) -> None:
         """Add shaft load, gyro and accelerometer to the readings of the modules that report them."""
         shaft_torque_nm = self._physics_model.shaft_torque_nm()[self._joints]
-        noise_nm = self._torque_sigma_nm * self._noise(self._count)
+        noise_nm = self._torque_sigma_nm * self._draw_standard_normal(self._joint_count)
         shaft_loads = SHAFT_LOAD.to_raw_array(self._mounting.to_drive_torque_nm(shaft_torque_nm + noise_nm))
         imu = self._physics_model.imu() if self._imu_sensor is not None else None
         for i, reading in enumerate(readings):
@@ -130,7 +131,7 @@ class ModuleSensors:
                 continue
             reading.shaft_load = shaft_loads[i]
             if imu is not None:
-                self._add_imu(reading, imu, link=self._first + i + 1)
+                self._add_imu(reading, imu, link=self._first_joint + i + 1)
 
     def _add_imu(self, reading: ModuleReadings, imu: Imu, link: int) -> None:
         """Add the IMU of a link, if it has one."""
@@ -140,7 +141,9 @@ class ModuleSensors:
         index = imu.link.index(link)
         rate_rad_s = np.array(imu.angular_velocity_rad_s[index])
         acceleration_m_s2 = np.array(imu.acceleration_m_s2[index])
-        reading.gyro = RATE.to_raw_array(rate_rad_s + sensor.angular_velocity_noise_rad_s * self._noise(3))
+        reading.gyro = RATE.to_raw_array(
+            rate_rad_s + sensor.angular_velocity_noise_rad_s * self._draw_standard_normal(3)
+        )
         reading.acceleration = ACCELERATION.to_raw_array(
-            acceleration_m_s2 + sensor.acceleration_noise_m_s2 * self._noise(3)
+            acceleration_m_s2 + sensor.acceleration_noise_m_s2 * self._draw_standard_normal(3)
         )

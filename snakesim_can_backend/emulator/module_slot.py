@@ -33,7 +33,7 @@ class ModuleSlot:
 
     # Injected faults.
     mute: bool = False
-    wrong_count: bool = False
+    has_wrong_counter: bool = False
     wrong_checksum: bool = False
 
     def __post_init__(self) -> None:
@@ -41,21 +41,21 @@ class ModuleSlot:
         self.module.health.voltage_v = self.joint_model.supply.voltage_v
 
     def set_fault(self, kind: str, active: bool, now_us: float) -> None:
-        """Begin or end a fault of this module; a kind that is no fault of a single module has no effect.
+        """Start or end an injected fault of this module; a kind that is no fault of a single module has no effect.
 
         Args:
-            kind: kind of the fault, such as "mute" or "leak".
-            active: True to begin it, False to end it.
-            now_us: present time.
+            kind: Kind of the fault, such as "mute" or "leak".
+            active: True to start the fault, False to end it.
+            now_us: Current time.
         """
         health = self.module.health
         match kind:
             case "mute":
                 self.mute = active
             case "freeze":
-                self.module.hangs = active
+                self.module.is_hanging = active
             case "counter":
-                self.wrong_count = active
+                self.has_wrong_counter = active
             case "checksum":
                 self.wrong_checksum = active
             case "leak":
@@ -77,7 +77,7 @@ class ModuleSlot:
         health.board_c = board_c
         health.current_a = self.joint_model.supply.idle_a + power_w / health.voltage_v
 
-    def take_frames(self) -> list[Frame]:
+    def pop_frames(self) -> list[Frame]:
         """Return the frames that the module sends, with injected faults applied; each frame once."""
         frames = self.module.frames
         if not frames:
@@ -85,7 +85,7 @@ class ModuleSlot:
         self.module.frames = []
         if self.mute:
             return []
-        if self.wrong_count or self.wrong_checksum:
+        if self.has_wrong_counter or self.wrong_checksum:
             return [self._corrupt(frame) for frame in frames]
         return frames
 
@@ -94,10 +94,10 @@ class ModuleSlot:
         if parse_opcode(frame.id) != Opcode.JOINT_STATE:
             return frame
         data = bytearray(frame.data)
-        if self.wrong_count:
+        if self.has_wrong_counter:
             count_byte = data[COUNT_BYTE]
-            wrong_count = (count_byte + WRONG_COUNT_OFFSET) & COUNT_MASK
-            data[COUNT_BYTE] = (count_byte & ~COUNT_MASK) | wrong_count
+            has_wrong_counter = (count_byte + WRONG_COUNT_OFFSET) & COUNT_MASK
+            data[COUNT_BYTE] = (count_byte & ~COUNT_MASK) | has_wrong_counter
             data[CHECKSUM_BYTE] = checksum(frame.id, bytes(data[:CHECKSUM_BYTE]))
         if self.wrong_checksum:
             data[CHECKSUM_BYTE] ^= WRONG_CHECKSUM_MASK
@@ -110,11 +110,11 @@ def assign_node_ids(robot: RobotFile, settings: CanSettings) -> list[int]:
     A module has the number of its joint, unless the settings give it another id.
 
     Args:
-        robot: the robot file.
-        settings: settings of the backend, which may mount modules otherwise.
+        robot: Robot file, with the names of the joints.
+        settings: Settings of the backend, which may give modules other ids in `mounted`.
 
     Raises:
-        ConfigError: an id occurs more than once, or not at all.
+        ConfigError: A node id from 1 to the number of joints occurs more than once, or not at all.
     """
     names = [joint.name for joint in robot.joint_table]
     expected_ids = list(range(1, len(names) + 1))

@@ -1,4 +1,4 @@
-"""A module's parameters: present values, and those in its flash, which survive a restart."""
+"""A module's parameters: current values, and those in its flash, which survive a restart."""
 
 import math
 from struct import Struct
@@ -23,7 +23,7 @@ FACTORY_CONTACT_EVERY = 1.0  # Syncs
 RANGE_TOLERANCE = 1e-6  # of a range's largest bound; bounds have single precision on the bus
 FLOAT_BYTES = 4
 FLOAT_MASK = 0xFFFFFFFF
-_single = Struct("<f")
+SINGLE_FLOAT = Struct("<f")
 
 
 def make_factory_defaults(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[ModuleParameter, float]:
@@ -53,28 +53,28 @@ class ParameterStore:
         """Load the saved values."""
         self.values = dict(self._flash)
 
-    def answer_request(self, node: int, data: bytes, armed: bool) -> Frame:
-        """Read, write or save a parameter as a ParameterRequest demands, and return the answer.
+    def handle_request(self, node: int, data: bytes, armed: bool) -> Frame:
+        """Read, write or save a parameter as a ParameterRequest demands, and return the response.
 
         Args:
-            node: id of the module.
-            data: data of the request.
-            armed: whether the module drives its motor; then nothing can be changed.
+            node: Node id of the module.
+            data: Data bytes of the request.
+            armed: Whether the module drives its motor; if so, no parameter can be changed.
 
         Returns:
-            The ParameterAnswer, with the value that is present afterwards.
+            The ParameterAnswer frame, with the value of the parameter afterwards.
         """
         index, operation, raw = _read_request(data)
         result = ParameterResult.UNKNOWN_INDEX
         value = 0.0
         if index in PARAMETERS:
             parameter = ModuleParameter(index)
-            result = self._execute(parameter, operation, raw, armed)
+            result = self._execute_operation(parameter, operation, raw, armed)
             value = self.values[parameter]
-        value_raw = int.from_bytes(_single.pack(value), "little")
+        value_raw = int.from_bytes(SINGLE_FLOAT.pack(value), "little")
         return _write_answer(node, (index, operation, result, value_raw))
 
-    def _execute(self, parameter: ModuleParameter, operation: int, raw: int, armed: bool) -> ParameterResult:
+    def _execute_operation(self, parameter: ModuleParameter, operation: int, raw: int, armed: bool) -> ParameterResult:
         match operation:
             case ParameterOperation.READ:
                 return ParameterResult.DONE
@@ -89,11 +89,11 @@ class ParameterStore:
         if operation == ParameterOperation.SAVE:
             self._flash[parameter] = self.values[parameter]
             return ParameterResult.DONE
-        return self._write(parameter, raw)
+        return self._write_value(parameter, raw)
 
-    def _write(self, parameter: ModuleParameter, raw: int) -> ParameterResult:
-        """Set the present value of a parameter to the float with these bits, if it is allowed."""
-        (requested,) = _single.unpack((raw & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
+    def _write_value(self, parameter: ModuleParameter, raw: int) -> ParameterResult:
+        """Set the current value of a parameter to the float with these bits, if it is allowed."""
+        (requested,) = SINGLE_FLOAT.unpack((raw & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
         value = clamp_to_range(PARAMETERS[parameter], requested)
         if value is None:
             return ParameterResult.OUT_OF_RANGE

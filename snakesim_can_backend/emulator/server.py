@@ -38,10 +38,10 @@ class EmulatorServer:
         self._start_ns: int | None = None
 
     def run_due(self, now_ns: int) -> float | None:
-        """Process received frames, advance the modules to the present time, and send the frames that are due.
+        """Process received frames, advance the modules to the current time, and send the frames that are due.
 
         Args:
-            now_ns: present time, on a steady clock. Not used by a stepped chain.
+            now_ns: Current time of a steady clock; not used by a stepped chain.
 
         Returns:
             Seconds until the next run is due; None for a stepped chain, which only reacts to frames.
@@ -56,23 +56,23 @@ class EmulatorServer:
         if self._start_ns is None:
             self._start_ns = now_ns
         clock_us = (now_ns - self._start_ns) / 1000
-        self._receive_in_time(received, clock_us)
+        self._receive_at_arrival_times(received, clock_us)
         self.chain.advance_to(clock_us)
         self._send()
         pause_us = min(self.chain.next_us() - self.chain.now_us, MAX_LAG_US)
         return max(pause_us, MIN_PAUSE_US) * 1e-6
 
-    def _receive_in_time(self, received: Sequence[Sequence[Frame]], clock_us: float) -> None:
+    def _receive_at_arrival_times(self, received: Sequence[Sequence[Frame]], clock_us: float) -> None:
         """Process received frames at their estimated times of arrival.
 
         After a delay of this process several periods are in the queue. They are spread over the time since the last
-        run, so that a delay here does not look like a delay of the host.
+        run, so that a delay of this process does not look like a delay of the host.
 
         Args:
-            received: the frames of every bus.
-            clock_us: present time since the start.
+            received: Received frames of every bus, in order.
+            clock_us: Current time since the start.
         """
-        before_us = self.chain.now_us + self.chain.skipped_us
+        last_run_us = self.chain.now_us + self.chain.skipped_us
         for channel, frames in enumerate(received):
             if not frames:
                 continue
@@ -83,12 +83,12 @@ class EmulatorServer:
             for frame in frames:
                 if _is_sync(frame):
                     syncs_so_far += 1
-                    self.chain.advance_to(before_us + (clock_us - before_us) * syncs_so_far / syncs)
+                    self.chain.advance_to(last_run_us + (clock_us - last_run_us) * syncs_so_far / syncs)
                 self.chain.receive(channel, frame)
 
     def _send(self) -> None:
         for channel, wire in enumerate(self.wires):
-            for frame in self.chain.take_frames(channel):
+            for frame in self.chain.pop_frames(channel):
                 if not wire.send(frame):
                     self.unsent += 1
 
@@ -100,9 +100,9 @@ def _is_sync(frame: Frame) -> bool:
 class InProcessEmulators:
     """Emulators in this process, at the other end of a virtual bus: a call runs them."""
 
-    def __init__(self, server: EmulatorServer, send_pose: PoseSender | None, clock_ns: Callable[[], int]) -> None:
+    def __init__(self, server: EmulatorServer, pose_sender: PoseSender | None, clock_ns: Callable[[], int]) -> None:
         self.server = server
-        self._send_pose = send_pose
+        self._send_pose = pose_sender
         self._clock_ns = clock_ns
 
     def __call__(self) -> float | None:
@@ -110,7 +110,7 @@ class InProcessEmulators:
         return self.server.run_due(self._clock_ns())
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Begin or end a fault of a module."""
+        """Start or end a fault of a module."""
         self.server.chain.inject(injection, begins=begins)
 
     def close(self) -> None:
@@ -121,28 +121,29 @@ class InProcessEmulators:
             self._send_pose.close()
 
 
-def make_local_emulators(
+def make_in_process_emulators(
     config: RunConfig,
     settings: CanSettings,
     channel: str,
-    pose: str | None = None,
+    pose_address: str | None = None,
     *,
     stepped: bool,
 ) -> InProcessEmulators:
-    """Create the emulators of a run on one virtual bus, in this process.
+    """Create the emulators of all joint modules on one virtual bus, in this process.
 
     Args:
-        config: the run, with the robot.
-        settings: settings of the backend.
-        channel: name of the virtual bus.
-        pose: address, HOST:PORT, to which they send motion capture; None: nowhere.
-        stepped: whether time advances only from Sync to Sync.
+        config: Configuration of the run, with the robot.
+        settings: Settings of the backend.
+        channel: Name of the virtual bus, which the driver opens, too.
+        pose_address: HOST:PORT to which they send motion capture; None if they do not send.
+        stepped: Whether time advances only from Sync to Sync (for lockstep).
 
     Raises:
-        ConfigError: the settings are impossible.
+        ConfigError: The physics model is unknown, the address is malformed, or the settings name several buses, or
+            an invalid fault or node id.
     """
-    send_pose = None if pose is None else PoseSender(pose)
+    pose_sender = None if pose_address is None else PoseSender(pose_address)
     physics_model = make_physics_model(config, settings, "can")
-    chain = ModuleChain(config, settings, physics_model, stepped=stepped, send_pose=send_pose)
+    chain = ModuleChain(config, settings, physics_model, stepped=stepped, send_pose=pose_sender)
     server = EmulatorServer([VirtualWire(channel)], chain)
-    return InProcessEmulators(server, send_pose, time.monotonic_ns)
+    return InProcessEmulators(server, pose_sender, time.monotonic_ns)

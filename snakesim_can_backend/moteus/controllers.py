@@ -14,12 +14,12 @@ from snakesim_can_backend.can_drives.drives import HOST, CanDrives, CanDrivesCon
 from snakesim_can_backend.moteus.protocol import (
     FAULTS,
     FLOAT,
+    HOME_STATE_RELATIVE,
     HOST_ID,
     INT8,
     INT32,
     READ,
     REGISTER_MAP,
-    RELATIVE,
     REPLY,
     WRITE,
     MoteusMode,
@@ -43,15 +43,15 @@ SERIAL_WORDS = 3  # registers of a serial number
 MIN_DIVISOR_V = 1.0  # for power / voltage, when the supply is off
 
 # Subframes of requests.
-IDENTITY = (
+IDENTITY_REQUESTS = (
     encode_subframe(READ, INT32, Register.MAP_VERSION, count=1),
     encode_subframe(READ, INT8, Register.HOME_STATE, count=1),
 )
-MOTION = (
+MOTION_REQUESTS = (
     encode_subframe(READ, FLOAT, Register.MODE, count=4),  # mode, position, velocity, torque
     encode_subframe(READ, INT8, Register.FAULT, count=1),
 )
-HEALTH = (
+HEALTH_REQUESTS = (
     encode_subframe(READ, FLOAT, Register.POWER, count=1),
     encode_subframe(READ, FLOAT, Register.MOTOR_TEMPERATURE, count=1),
     encode_subframe(READ, FLOAT, Register.VOLTAGE, count=2),  # voltage, board temperature
@@ -72,17 +72,17 @@ class ShaftGains(NamedTuple):
 class Controllers(CanDrives):
     """All controllers of a bus."""
 
-    missing_identity_reason = (
+    missing_identity_text = (
         "does not report its register map: it is off, has another id, or the bus another bit rate or sample point"
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
         """Compute the gains that setpoints carry."""
         super().__init__(context)
-        kp_nm_per_turn, kd_nm_s_per_turn = configured_gains(context.all_joints, context.settings)
+        kp_nm_per_turn, kd_nm_s_per_turn = get_configured_gains(context.all_joints, context.settings)
         self._gain_fractions: list[ShaftGains] = []
         for joint in context.joints:
-            gains = shaft_gains(joint)
+            gains = compute_shaft_gains(joint)
             self._gain_fractions.append(
                 ShaftGains(
                     stiffness=gains.stiffness / kp_nm_per_turn,
@@ -91,21 +91,24 @@ class Controllers(CanDrives):
                 )
             )
         self._watchdog_s: float = context.settings.watchdog_s
-        self._mode = [MODE_UNKNOWN] * len(context.joints)
-        self._home_state = [RELATIVE] * len(context.joints)
+        self._modes = [MODE_UNKNOWN] * len(context.joints)
+        self._home_states = [HOME_STATE_RELATIVE] * len(context.joints)
 
     # --- frames that arrive -----------------------------------------------------------------------------------
 
     def find_sender(self, frame: Frame) -> int | None:
-        """Return the sender. Another host has the same id as this one; it matters only if it writes."""
+        """Return the id of the sender, or None for frames to other nodes.
+
+        Another host has the same id as this one. Its frames are ignored (None) unless they write (`HOST`).
+        """
         source, destination = split_addresses(frame)
         if source == HOST_ID:
             first_subframe_writes = frame.data[:1] < bytes([READ])
             return HOST if first_subframe_writes else None
         return source if destination == HOST_ID else None
 
-    def handle_answer(self, i: int, frame: Frame) -> None:
-        """Store the registers of an answer. Each request reads other registers, by which its answer is known."""
+    def handle_response(self, i: int, frame: Frame) -> None:
+        """Store the registers of a response. Each request reads other registers, so they identify the response."""
         registers: dict[int, float] = {}
         for subframe in decode_subframes(frame.data):
             if subframe.kind == REPLY:
@@ -117,21 +120,21 @@ class Controllers(CanDrives):
             self._store_health(i, registers)
         if Register.MAP_VERSION in registers:
             self.firmware[i] = (int(registers[Register.MAP_VERSION]),)
-            self._home_state[i] = int(registers[Register.HOME_STATE])
+            self._home_states[i] = int(registers[Register.HOME_STATE])
         if Register.SERIAL in registers:
             words = [int(registers[Register.SERIAL + k]) & 0xFFFF_FFFF for k in range(SERIAL_WORDS)]
-            self.note_serial(i, "".join(f"{word:08X}" for word in reversed(words)))
+            self.record_serial(i, "".join(f"{word:08X}" for word in reversed(words)))
 
     def _store_motion(self, i: int, registers: Mapping[int, float]) -> None:
         mode = int(registers[Register.MODE])
         fault = int(registers[Register.FAULT])
-        self._mode[i] = mode
+        self._modes[i] = mode
         self.readings.mark_checked(i)
         self.readings.set_motion(
             i, registers[Register.POSITION] * REVOLUTION_RAD, registers[Register.VELOCITY] * REVOLUTION_RAD
         )
         self.readings.set_torque(i, registers[Register.TORQUE])
-        self.states.note_report(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
+        self.states.record_report(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
         self.states.drives[i].errors = describe_fault(mode, fault)
 
     def _store_health(self, i: int, registers: Mapping[int, float]) -> None:
@@ -144,21 +147,21 @@ class Controllers(CanDrives):
 
     def request_identity(self, i: int) -> None:
         """Request the version of the registers, the reference of the position, serial number and mode."""
-        self._send(i, *IDENTITY, reply=True)
+        self._send(i, *IDENTITY_REQUESTS, reply=True)
         self._send(i, SERIAL, reply=True)
         self.request_motion(i)
 
-    def find_mismatch(self, i: int) -> str:
+    def validate_drive(self, i: int) -> str:
         """Return why the register map or the encoder of a controller cannot be used; empty if both can."""
         if self.firmware[i] != (REGISTER_MAP,):
             return f"has register map {self.firmware[i][0]}; this driver knows {REGISTER_MAP}: update its firmware"
-        if self._home_state[i] == RELATIVE:
+        if self._home_states[i] == HOME_STATE_RELATIVE:
             return "does not know where it is: its position has no reference (home state 0); configure its encoders"
         return ""
 
     def clear_leftover_errors(self, i: int) -> None:
         """Clear an expired watchdog."""
-        if self._mode[i] == MoteusMode.TIMEOUT:
+        if self._modes[i] == MoteusMode.TIMEOUT:
             _log.warning("%s: clearing an expired watchdog of an earlier run", self.states.drives[i].label)
             self._send_stop(i)
 
@@ -176,11 +179,11 @@ class Controllers(CanDrives):
 
     def request_motion(self, i: int) -> bool:
         """Request mode, position, velocity, torque and fault."""
-        return self._send(i, *MOTION, reply=True)
+        return self._send(i, *MOTION_REQUESTS, reply=True)
 
     def request_health(self, i: int) -> None:
         """Request power, temperatures and voltage; and the serial number, to notice a second drive with this id."""
-        self._send(i, *HEALTH, reply=True)
+        self._send(i, *HEALTH_REQUESTS, reply=True)
         self._send(i, SERIAL, reply=True)
 
     def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
@@ -189,16 +192,16 @@ class Controllers(CanDrives):
         The controller adds position, velocity and torque control; what a mode does not use gets a gain of 0.
 
         Args:
-            i: index of the controller on the bus.
-            mode: control mode.
-            target: target at the shaft in rad, rad/s or N·m, by the mode.
-            limit_nm: torque limit.
+            i: Index of the controller on the bus.
+            mode: Control mode of the setpoint.
+            target: Target at the shaft in rad, rad/s or N·m, by the mode; 0 for a passive controller.
+            limit_nm: Torque limit at the shaft.
         """
-        was_restarted = self.states.drives[i].has_followed and self._mode[i] != MoteusMode.POSITION
-        if was_restarted or self.readings.unanswered_requests(i):
+        was_restarted = self.states.drives[i].was_enabled and self._modes[i] != MoteusMode.POSITION
+        if was_restarted or self.readings.count_unanswered_requests(i):
             return
         gains = self._gain_fractions[i]
-        position = math.nan  # the present one
+        position = math.nan  # stands for the current position of the controller
         velocity = 0.0
         torque = 0.0
         kp = 0.0
@@ -225,7 +228,7 @@ class Controllers(CanDrives):
 
         A controller that has stopped by itself gets no stop, which would clear the reason: that is for the operator.
         """
-        if self._mode[i] in LATCHED_MODES:
+        if self._modes[i] in LATCHED_MODES:
             return
         match command:
             case "follow":
@@ -255,7 +258,7 @@ def describe_fault(mode: int, fault: int) -> str:
             return ""
 
 
-def shaft_gains(joint: Joint) -> ShaftGains:
+def compute_shaft_gains(joint: Joint) -> ShaftGains:
     """Return the gains of a joint at the shaft of its controller."""
     motor = joint.motor
     joint_to_shaft = REVOLUTION_RAD / joint.drive.gear**2
@@ -266,23 +269,24 @@ def shaft_gains(joint: Joint) -> ShaftGains:
     )
 
 
-def needed_gains(joints: Sequence[Joint]) -> tuple[float, float]:
-    """Return the least `servo.pid_position.kp` and `kd` that all joints can be fractions of.
+def compute_required_gains(joints: Sequence[Joint]) -> tuple[float, float]:
+    """Return the lowest `servo.pid_position.kp` and `kd` with which the controllers can drive all joints.
 
-    A fraction above 1 is not possible, so these are the maxima over all joints, in N·m/turn and N·m/(turn/s).
+    Setpoints carry gains as fractions of these, and a fraction above 1 is not possible. So they are the maxima over all
+    joints, in N·m/turn and N·m/(turn/s).
     """
-    gains = [shaft_gains(joint) for joint in joints]
+    gains = [compute_shaft_gains(joint) for joint in joints]
     kp = max(joint_gains.stiffness for joint_gains in gains)
     kd = max(max(joint_gains.damping, joint_gains.velocity) for joint_gains in gains)
     return kp, kd
 
 
-def configured_gains(joints: Sequence[Joint], settings: MoteusSettings) -> tuple[float, float]:
+def get_configured_gains(joints: Sequence[Joint], settings: MoteusSettings) -> tuple[float, float]:
     """Return the `servo.pid_position.kp` and `kd` that the controllers have.
 
     Args:
         joints: All joints of the driver type.
         settings: The settings of the driver type; gains that they leave out are what the joints need.
     """
-    kp, kd = needed_gains(joints)
+    kp, kd = compute_required_gains(joints)
     return settings.kp_nm_per_turn or kp or 1.0, settings.kd_nm_s_per_turn or kd or 1.0

@@ -8,14 +8,14 @@ import math
 from dataclasses import dataclass, field
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
-from snakesim_can_backend.moteus.controllers import REVOLUTION_RAD, SERIAL_WORDS, configured_gains
+from snakesim_can_backend.moteus.controllers import REVOLUTION_RAD, SERIAL_WORDS, get_configured_gains
 from snakesim_can_backend.moteus.protocol import (
     BROADCAST_ID,
     FLOAT,
     REGISTER_MAP,
     REPLY,
-    REPLY_REQUESTED,
-    TYPES,
+    REPLY_REQUESTED_BIT,
+    VALUE_FORMATS,
     WRITE,
     MoteusMode,
     Register,
@@ -31,7 +31,7 @@ from snakesim_hal.wire.messages import Mode
 OVER_TEMPERATURE = 38  # fault number
 UPPER_SERIAL_WORDS = (0x65115510, 0x30333636)  # the same for all controllers
 DUPLICATE_SERIAL_BITS = 0x01_0000  # in which the serial number of a second controller with the same id differs
-ROTOR = 1  # home state: the position has a reference within a turn of the rotor
+HOME_STATE_ROTOR = 1  # home state: the position has a reference within a turn of the rotor
 FIRST_COMMAND_REGISTER = int(Register.COMMAND)
 # Values of the registers that a command does not write.
 COMMAND_DEFAULTS = {
@@ -43,7 +43,7 @@ COMMAND_DEFAULTS = {
     0x25: math.nan,  # maximum torque: the configured one
     0x27: 0.0,  # watchdog: the configured one
 }
-STEPS = {  # the unit of integers of 8, 16 and 32 bits; 1 for all other registers
+INTEGER_RESOLUTIONS = {  # the unit of integers of 8, 16 and 32 bits; 1 for all other registers
     Register.POSITION: (0.01, 0.0001, 0.00001),
     Register.VELOCITY: (0.1, 0.00025, 0.00001),
     Register.TORQUE: (0.5, 0.01, 0.001),
@@ -62,7 +62,7 @@ class EmulatedController:
     mode: int = MoteusMode.STOPPED
     fault: int = 0
     command: dict[int, float] = field(default_factory=lambda: dict(COMMAND_DEFAULTS))
-    command_us: float = 0.0  # when the watchdog was fed
+    watchdog_fed_us: float = 0.0  # when the watchdog was fed
 
 
 class EmulatedMoteus(CanEmulator):
@@ -71,25 +71,25 @@ class EmulatedMoteus(CanEmulator):
     broadcast_id = BROADCAST_ID
 
     def __init__(self, context: CanEmulatorContext) -> None:
-        """Start all controllers."""
+        """Create one emulated, stopped controller for each joint."""
         super().__init__(context)
         self.controllers = [EmulatedController(joint.id) for joint in context.body.joints]
-        self._kp_nm_per_turn, self._kd_nm_s_per_turn = configured_gains(context.joints, context.settings)
+        self._kp_nm_per_turn, self._kd_nm_s_per_turn = get_configured_gains(context.joints, context.settings)
 
-    def find_addressee(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: Frame) -> int:
         """Return the destination of a frame."""
         _, destination = split_addresses(frame)
         return destination
 
     def duplicate_frame(self, frame: Frame) -> Frame:
         """Return the frame of a second controller: it has another serial number."""
-        answers: list[bytes] = []
+        response_subframes: list[bytes] = []
         for subframe in decode_subframes(frame.data):
             values = list(subframe.values)
             if subframe.register == Register.SERIAL:
                 values[0] = int(values[0]) ^ DUPLICATE_SERIAL_BITS
-            answers.append(encode_subframe(subframe.kind, subframe.type, subframe.register, *values))
-        return make_frame(*split_addresses(frame), *answers)
+            response_subframes.append(encode_subframe(subframe.kind, subframe.type, subframe.register, *values))
+        return make_frame(*split_addresses(frame), *response_subframes)
 
     def restart(self, i: int) -> None:
         """Restart a controller. It is stopped, and has no command."""
@@ -97,27 +97,29 @@ class EmulatedMoteus(CanEmulator):
         self._drive_motor(i)
 
     def handle_frame(self, i: int, frame: Frame) -> None:
-        """Apply all values that a frame writes together; then answer what it reads, if it wants a reply."""
+        """Apply all values that a frame writes together; then send what it reads, if it requests a reply."""
         subframes = list(decode_subframes(frame.data))
-        written: dict[int, float] = {}
+        written_values: dict[int, float] = {}
         for subframe in subframes:
             if subframe.kind == WRITE:
                 for offset, value in enumerate(subframe.values):
-                    written[subframe.register + offset] = value
-        if Register.MODE in written:
-            mode = int(written.pop(Register.MODE))
-            self._obey(i, mode, written)
-        if frame.id & REPLY_REQUESTED:
-            answers = [self._answer(i, subframe) for subframe in subframes if subframe.kind not in (WRITE, REPLY)]
+                    written_values[subframe.register + offset] = value
+        if Register.MODE in written_values:
+            mode = int(written_values.pop(Register.MODE))
+            self._change_mode(i, mode, written_values)
+        if frame.id & REPLY_REQUESTED_BIT:
+            response_subframes = [
+                self._read_registers(i, subframe) for subframe in subframes if subframe.kind not in (WRITE, REPLY)
+            ]
             source, _ = split_addresses(frame)
-            self.send_frame(i, make_frame(self.controllers[i].id, source, *answers))
+            self.send_frame(i, make_frame(self.controllers[i].id, source, *response_subframes))
 
     def on_step(self, now_us: float) -> None:
         """Stop controllers whose watchdog has expired, and those that are too hot."""
         for i, controller in enumerate(self.controllers):
             if controller.mode == MoteusMode.POSITION:
-                limit_us = controller.command[Register.WATCHDOG] * 1e6 or self.watchdog_us
-                if now_us - controller.command_us > limit_us:  # never true if the limit is NaN
+                watchdog_timeout_us = controller.command[Register.WATCHDOG] * 1e6 or self.watchdog_us
+                if now_us - controller.watchdog_fed_us > watchdog_timeout_us:  # never true if the limit is NaN
                     controller.mode = MoteusMode.TIMEOUT
                     self._drive_motor(i)
             if self.body.is_too_hot(i) and controller.mode != MoteusMode.FAULT:
@@ -127,8 +129,14 @@ class EmulatedMoteus(CanEmulator):
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _obey(self, i: int, mode: int, written: dict[int, float]) -> None:
-        """Change the mode. A controller that has stopped by itself obeys a stop only."""
+    def _change_mode(self, i: int, mode: int, written_values: dict[int, float]) -> None:
+        """Change the mode of a controller. A controller that has stopped by itself accepts only a stop.
+
+        Args:
+            i: Index of the controller.
+            mode: Requested mode; modes other than STOPPED and POSITION are ignored.
+            written_values: Values of the other registers that the frame writes, by register.
+        """
         controller = self.controllers[i]
         can_start = controller.mode in (MoteusMode.STOPPED, MoteusMode.POSITION)
         match mode:
@@ -137,21 +145,23 @@ class EmulatedMoteus(CanEmulator):
                 controller.fault = 0
             case MoteusMode.POSITION if can_start:
                 controller.mode = MoteusMode.POSITION
-                controller.command_us = self.body.now_us
-                controller.command = COMMAND_DEFAULTS | written
+                controller.watchdog_fed_us = self.body.now_us
+                controller.command = COMMAND_DEFAULTS | written_values
             case _:
                 pass
         self._drive_motor(i)
 
-    def _answer(self, i: int, request: Subframe) -> bytes:
-        """Return the values of registers in the type that the request wants, clipped to its range."""
+    def _read_registers(self, i: int, request: Subframe) -> bytes:
+        """Return a reply subframe with the requested registers in the requested type, clipped to its range."""
         values: list[float] = []
         for register in range(request.register, request.register + request.length):
             value = self._read_register(i, register)
             if request.type != FLOAT:
-                step = STEPS[Register(register)][request.type] if register in STEPS else 1.0
-                max_integer = (1 << 8 * TYPES[request.type].size - 1) - 1
-                value = min(max(round(value / step), -max_integer), max_integer)
+                resolution = (
+                    INTEGER_RESOLUTIONS[Register(register)][request.type] if register in INTEGER_RESOLUTIONS else 1.0
+                )
+                max_integer = (1 << 8 * VALUE_FORMATS[request.type].size - 1) - 1
+                value = min(max(round(value / resolution), -max_integer), max_integer)
             values.append(value)
         return encode_subframe(REPLY, request.type, request.register, *values)
 
@@ -159,8 +169,8 @@ class EmulatedMoteus(CanEmulator):
         """Return the value that an emulated controller has in a register, in the units of moteus.
 
         Args:
-            i: index of the controller.
-            register: number of the register.
+            i: Index of the controller.
+            register: Number of the register.
         """
         serial_word = register - Register.SERIAL
         if serial_word in range(SERIAL_WORDS):
@@ -185,7 +195,7 @@ class EmulatedMoteus(CanEmulator):
             case Register.COMMAND | Register.WATCHDOG:
                 return 0
             case _:  # the home state; registers that are not emulated have the same value
-                return ROTOR
+                return HOME_STATE_ROTOR
 
     def _read_health_register(self, i: int, register: int) -> float:
         voltage_v, current_a = self.body.read_supply(i)
@@ -203,11 +213,11 @@ class EmulatedMoteus(CanEmulator):
     def _drive_motor(self, i: int) -> None:
         """Apply the command of a controller to its motor.
 
-        With a proportional gain this is position control, with a derivative gain alone velocity control, and without
-        gains torque control.
+        A command with a proportional gain is position control, one with only a derivative gain is velocity control, and
+        one without gains is torque control. The motor is passive unless the controller is in position mode.
 
         Args:
-            i: index of the controller.
+            i: Index of the controller.
         """
         controller = self.controllers[i]
         joint = self.body.joints[i]

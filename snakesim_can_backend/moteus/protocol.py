@@ -15,20 +15,20 @@ from snakesim_can_backend.protocol.definitions import Frame
 HOST_ID = 0
 LAST_ID = 126
 BROADCAST_ID = 127  # every controller receives its frames
-REPLY_REQUESTED = 0x8000
+REPLY_REQUESTED_BIT = 0x8000
 REGISTER_MAP = 5  # the version of the register map that this file describes
 # Kinds of subframes: the high bits of their first byte.
 WRITE = 0x00
 READ = 0x10
 REPLY = 0x20
-NOTHING = 0x50  # padding
+PADDING = 0x50  # padding
 # Types of values: the next two bits.
 INT8 = 0
 INT16 = 1
 INT32 = 2
 FLOAT = 3
-TYPES = (Struct("<b"), Struct("<h"), Struct("<i"), Struct("<f"))
-LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # possible data lengths of CAN FD, bytes
+VALUE_FORMATS = (Struct("<b"), Struct("<h"), Struct("<i"), Struct("<f"))
+CAN_FD_DATA_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # possible data lengths of CAN FD, bytes
 
 
 class Register(IntEnum):
@@ -59,7 +59,7 @@ class MoteusMode(IntEnum):
     TIMEOUT = 11
 
 
-RELATIVE = 0  # home state: the position has no reference
+HOME_STATE_RELATIVE = 0  # home state: the position has no reference
 FAULTS = {
     32: "calibration",
     33: "motor driver",
@@ -89,63 +89,63 @@ def encode_subframe(kind: int, type_: int, register: int, *values: float, count:
 
     Args:
         kind: WRITE, READ or REPLY.
-        type_: INT8, INT16, INT32 or FLOAT.
-        register: The first register.
-        values: The values that it writes or answers.
-        count: How many registers a READ reads.
+        type_: Type of all values: INT8, INT16, INT32 or FLOAT.
+        register: Number of the first register.
+        values: Values of a WRITE or REPLY, for consecutive registers.
+        count: Number of consecutive registers that a READ requests.
     """
     count = count or len(values)
-    head = bytes([kind | type_ << 2 | count])
+    header = bytes([kind | type_ << 2 | count])
     if count > 3:  # it does not fit into the two low bits, and follows
-        head = bytes([kind | type_ << 2]) + _encode_varuint(count)
-    data = b"".join(TYPES[type_].pack(value) for value in values)
-    return head + _encode_varuint(register) + data
+        header = bytes([kind | type_ << 2]) + _encode_varuint(count)
+    data = b"".join(VALUE_FORMATS[type_].pack(value) for value in values)
+    return header + _encode_varuint(register) + data
 
 
 def decode_subframes(data: bytes) -> Iterator[Subframe]:
     """Yield the subframes of a CAN frame, each a read, write or reply of consecutive registers.
 
     Args:
-        data: data of the frame.
+        data: Data bytes of the frame.
 
     Raises:
-        ValueError, LookupError, struct.error: a subframe is malformed or of a kind that is not used here.
+        ValueError, LookupError, struct.error: A subframe is malformed or of a kind that is not used here.
     """
     offset = 0
     while offset < len(data):
-        head = data[offset]
+        header = data[offset]
         offset += 1
-        if head == NOTHING:
+        if header == PADDING:
             continue
-        kind = head & 0xF0
-        type_ = head >> 2 & 3
-        count = head & 3
+        kind = header & 0xF0
+        type_ = header >> 2 & 3
+        count = header & 3  # 0 means that the number follows as a varuint
         if kind not in (WRITE, READ, REPLY):
-            raise ValueError(f"a part 0x{head:02X}")
+            raise ValueError(f"a part 0x{header:02X}")
         if count == 0:
             count, offset = _decode_varuint(data, offset)
         register, offset = _decode_varuint(data, offset)
         values: list[float] = []
         value_count = 0 if kind == READ else count
         for _ in range(value_count):
-            values += TYPES[type_].unpack_from(data, offset)
-            offset += TYPES[type_].size
+            values += VALUE_FORMATS[type_].unpack_from(data, offset)
+            offset += VALUE_FORMATS[type_].size
         yield Subframe(kind, type_, register, count, tuple(values))
 
 
 def make_frame(source: int, destination: int, *subframes: bytes, reply: bool = False) -> Frame:
-    """Return a frame with these subframes, padded to a length that CAN FD has.
+    """Return a frame with these subframes, padded to a data length that CAN FD has.
 
     Args:
-        source: The id of the sender.
-        destination: The id of the receiver.
-        subframes: The subframes.
-        reply: Whether the receiver sends an answer.
+        source: Id of the sender.
+        destination: Id of the receiver.
+        subframes: Encoded subframes.
+        reply: Whether the receiver has to send a reply.
     """
     data = b"".join(subframes)
-    length = next(length for length in LENGTHS if length >= len(data))
-    padded = data.ljust(length, bytes([NOTHING]))
-    reply_bit = REPLY_REQUESTED if reply else 0
+    length = next(length for length in CAN_FD_DATA_LENGTHS if length >= len(data))
+    padded = data.ljust(length, bytes([PADDING]))
+    reply_bit = REPLY_REQUESTED_BIT if reply else 0
     return Frame(reply_bit | source << 8 | destination, padded)
 
 
@@ -162,7 +162,7 @@ def _encode_varuint(value: int) -> bytes:
 
 
 def _decode_varuint(data: bytes, offset: int) -> tuple[int, int]:
-    """Return the integer that begins at an offset, and the offset after it."""
+    """Return the unsigned integer that starts at an offset of the data, and the offset after it."""
     value = 0
     shift = 0
     while True:

@@ -10,7 +10,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from snakesim_can_backend.can_drives.drives import HOST, CanDrives, CanDrivesContext
-from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, Endpoints, read_all_endpoints
+from snakesim_can_backend.odrive.endpoints import (
+    EMULATED,
+    SETTING_TYPES,
+    VALUE_FORMATS,
+    AxisSetting,
+    Endpoints,
+    read_all_endpoints,
+)
 from snakesim_can_backend.odrive.protocol import (
     FIRMWARE,
     FROM_HOST,
@@ -37,7 +44,7 @@ REVOLUTION_RAD = 2 * math.pi  # rad
 EMULATED_CONSTANT_NM_PER_A = 1.0  # torque constant of emulated axes whose robot file names none
 UNKNOWN_MAX_CURRENT_A = 1.0  # used if an axis' own limit cannot be read: even a small motor withstands it
 NO_LIMIT_SENT = -1.0
-ROUNDING = 1e-3  # relative: settings are single precision, and people round them
+RELATIVE_TOLERANCE = 1e-3  # relative: settings are single precision, and people round them
 LEFTOVER_ERRORS = AxisError.WATCHDOG_TIMER_EXPIRED  # of a driver that was killed
 CONTROL_MODES = {
     Mode.PASSIVE: ControlMode.TORQUE,
@@ -72,7 +79,7 @@ class Axis:
 class Axes(CanDrives):
     """All axes of a bus."""
 
-    missing_identity_reason = (
+    missing_identity_text = (
         "does not report its version: it is off, has another id or bit rate, or firmware 0.5, which does not report it"
     )
 
@@ -83,53 +90,56 @@ class Axes(CanDrives):
         driver allows only a low current.
 
         Args:
-            context: the bus, its joints, and the settings of the driver type.
+            context: The open bus, its joints, and the settings of the driver type.
 
         Raises:
-            ConfigError: a file cannot be read.
+            ConfigError: An endpoint file cannot be read.
         """
         super().__init__(context)
         settings = context.settings
-        self._allowed_a: float = settings.max_current_a or math.inf
+        self._max_allowed_current_a: float = settings.max_current_a or math.inf
         self._watchdog_s: float = settings.watchdog_s
         self._endpoint_files = read_all_endpoints(settings.endpoints)
         if self.emulated and not self._endpoint_files:
             self._endpoint_files = [EMULATED]
-        self._hardware = [""] * len(context.joints)
-        unknown_limit_a = settings.max_current_a or UNKNOWN_MAX_CURRENT_A
+        self._hardware_versions = [""] * len(context.joints)
+        fallback_max_current_a = settings.max_current_a or UNKNOWN_MAX_CURRENT_A
         if not self._endpoint_files:
             _log.warning(
                 "%s: watchdog, current and speed limits of these axes are unknown: the driver sets no more than %g A. "
                 "Name the flat_endpoints.json of their firmware in `backends.odrive.endpoints`, and it reads them",
                 self.wire.channel,
-                unknown_limit_a,
+                fallback_max_current_a,
             )
-        self.axes = [make_axis(joint, unknown_limit_a) for joint in context.joints]
+        self.axes = [make_axis(joint, fallback_max_current_a) for joint in context.joints]
 
     # --- frames that arrive -----------------------------------------------------------------------------------
 
     def find_sender(self, frame: Frame) -> int | None:
-        """Return the sender. A request has no data; requests of other programs disturb nothing."""
-        node, message = split_id(frame)
-        if not frame.data and message not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
-            return None
-        if message == MessageId.RX_SDO:
-            return HOST if frame.data[0] == WRITE_SETTING else None
-        return HOST if message in FROM_HOST else node
+        """Return the node id of the sender, `HOST` for commands of another host, or None for requests.
 
-    def handle_answer(self, i: int, frame: Frame) -> None:
+        A request has no data. Requests of other programs are ignored, because they only read.
+        """
+        node, message_id = split_id(frame)
+        if not frame.data and message_id not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
+            return None
+        if message_id == MessageId.RX_SDO:
+            return HOST if frame.data[0] == WRITE_SETTING else None
+        return HOST if message_id in FROM_HOST else node
+
+    def handle_response(self, i: int, frame: Frame) -> None:
         """Store the measurements, errors, version or setting that an axis reports in a frame.
 
         Args:
-            i: index of the axis on the bus.
-            frame: an answer or a heartbeat.
+            i: Index of the axis on the bus.
+            frame: A response or a heartbeat.
         """
-        message = MessageId(split_id(frame)[1])
-        if message == MessageId.TX_SDO:
+        message_id = MessageId(split_id(frame)[1])
+        if message_id == MessageId.TX_SDO:
             self._store_setting(i, frame.data)
             return
-        values = PAYLOADS[message].unpack(frame.data)
-        match message:
+        values = PAYLOADS[message_id].unpack(frame.data)
+        match message_id:
             case MessageId.MOTION:
                 self.readings.set_motion(i, values[0] * REVOLUTION_RAD, values[1] * REVOLUTION_RAD)
             case MessageId.CURRENT:
@@ -146,14 +156,14 @@ class Axes(CanDrives):
                 self._store_version(i, hardware=values[1:4], firmware=values[4:7])
             case MessageId.ADDRESS:
                 serial = int.from_bytes(values[1], "little")
-                self.note_serial(i, f"{serial:012X}")
+                self.record_serial(i, f"{serial:012X}")
             case _:
                 pass
 
     def _handle_heartbeat(self, i: int, errors: int, state: int) -> None:
-        self.states.note_report(i, enabled=state == AxisState.CLOSED_LOOP, state=f"in state {state}")
+        self.states.record_report(i, enabled=state == AxisState.CLOSED_LOOP, state=f"in state {state}")
         self._store_errors(i, errors)
-        if state == AxisState.IDLE and not self.states.drives[i].should_follow:
+        if state == AxisState.IDLE and not self.states.drives[i].should_be_enabled:
             # A driver that is killed while its motors are off then leaves no lowered limits behind.
             self.restore_settings(i)
 
@@ -161,14 +171,14 @@ class Axes(CanDrives):
         self.readings.mark_checked(i)
         self.axes[i].errors = errors
         drive = self.states.drives[i]
-        if drive.emergency_stopped:  # this driver has requested it, so it is no fault of the drive
+        if drive.is_emergency_stopped:  # this driver has requested it, so it is no fault of the drive
             errors &= ~AxisError.ESTOP_REQUESTED
         drive.errors = describe_errors(errors)
 
     def _store_version(self, i: int, hardware: tuple[int, ...], firmware: tuple[int, ...]) -> None:
         self.firmware[i] = firmware
         self.readings.set_identity(i, firmware=_join_version(firmware))
-        self._hardware[i] = _join_version(hardware)
+        self._hardware_versions[i] = _join_version(hardware)
         if firmware[:2] == FIRMWARE:  # firmware 0.5 would take the request for the address as a new node id
             self._request(i, MessageId.ADDRESS)
             self._request_next_setting(i)
@@ -176,7 +186,7 @@ class Axes(CanDrives):
     # --- what an axis is configured for -----------------------------------------------------------------------
 
     def request_identity(self, i: int) -> None:
-        """Request version and errors; then one setting after the other."""
+        """Request version and errors of an axis; once the version is known, request one missing setting."""
         if self.firmware[i]:
             self._request_next_setting(i)
         else:
@@ -186,21 +196,22 @@ class Axes(CanDrives):
         """Return whether an axis has sent its firmware version, and its settings where these can be read."""
         if not self.firmware[i]:
             return False
-        return self._find_endpoints(i) is None or not self._missing_settings(i)
+        return self._find_endpoints(i) is None or not self._list_missing_settings(i)
 
     def forget_identities(self) -> None:
-        """Forget also what the axes are configured for."""
+        """Forget also the settings that the axes have reported."""
         super().forget_identities()
         for axis in self.axes:
             axis.configured.clear()
 
-    def find_mismatch(self, i: int) -> str:
-        """Return why the firmware or the configuration of an axis does not suit its joint; empty if both do.
-
-        If both do, the axis' own current limit becomes the maximum that the driver sends.
+    def validate_drive(self, i: int) -> str:
+        """Check the firmware and the configuration of an axis, and limit the driver to the axis' own current limit.
 
         Args:
-            i: index of the axis on the bus, whose version and settings have been read.
+            i: Index of the axis on the bus, whose version and settings have been read.
+
+        Returns:
+            The reasons why the axis does not suit its joint, as one text; an empty string if it does.
         """
         firmware = _join_version(self.firmware[i])
         if self.firmware[i][:2] != FIRMWARE:
@@ -210,41 +221,41 @@ class Axes(CanDrives):
         if self._find_endpoints(i) is None:
             files = ", ".join(f"{file.firmware} on {file.hardware}" for file in self._endpoint_files)
             return (
-                f"has firmware {firmware} on hardware {self._hardware[i]}, and `backends.odrive.endpoints` names files "
-                f"of {files}: add the flat_endpoints.json of its firmware"
+                f"has firmware {firmware} on hardware {self._hardware_versions[i]}, and `backends.odrive.endpoints` "
+                f"names files of {files}: add the flat_endpoints.json of its firmware"
             )
-        missing = self._missing_settings(i)
+        missing = self._list_missing_settings(i)
         if missing:
             return f"does not report `{missing[0]}`: is `backends.odrive.endpoints` of its firmware?"
         axis = self.axes[i]
-        axis.max_current_a = min(axis.configured[AxisSetting.CURRENT], self._allowed_a)
-        return "; ".join(find_objections(axis, self._watchdog_s))
+        axis.max_current_a = min(axis.configured[AxisSetting.CURRENT], self._max_allowed_current_a)
+        return "; ".join(find_configuration_problems(axis, self._watchdog_s))
 
     def _find_endpoints(self, i: int) -> Endpoints | None:
         """Return the endpoint ids of an axis' settings, or None if no file is of its firmware and hardware."""
         firmware = _join_version(self.firmware[i])
         for file in self._endpoint_files:
-            if file.firmware == firmware and file.hardware == self._hardware[i]:
+            if file.firmware == firmware and file.hardware == self._hardware_versions[i]:
                 return file
         return None
 
-    def _missing_settings(self, i: int) -> list[AxisSetting]:
+    def _list_missing_settings(self, i: int) -> list[AxisSetting]:
         return [setting for setting in AxisSetting if setting not in self.axes[i].configured]
 
     def _request_next_setting(self, i: int) -> None:
         """Request the next setting that is not known yet; one at a time, so that queues do not fill."""
         endpoints = self._find_endpoints(i)
-        missing = self._missing_settings(i)
+        missing = self._list_missing_settings(i)
         if endpoints is not None and missing:
             self.wire.send(encode_setting_request(self.nodes[i], endpoints.ids[missing[0]]))
 
     def _store_setting(self, i: int, data: bytes) -> None:
         endpoints = self._find_endpoints(i)
         endpoint, value = decode_setting_answer(data)
-        setting = None if endpoints is None else endpoints.setting_at(endpoint)
-        if setting is None or setting not in self._missing_settings(i):
+        setting = None if endpoints is None else endpoints.find_setting(endpoint)
+        if setting is None or setting not in self._list_missing_settings(i):
             return  # only the first answer counts: later the driver has lowered limits
-        (self.axes[i].configured[setting],) = FORMATS[TYPES[setting]].unpack(value)
+        (self.axes[i].configured[setting],) = VALUE_FORMATS[SETTING_TYPES[setting]].unpack(value)
         self._request_next_setting(i)
 
     # --- settings and errors ----------------------------------------------------------------------------------
@@ -259,7 +270,7 @@ class Axes(CanDrives):
     def restore_settings(self, i: int) -> None:
         """Write back the limits that an axis is configured for, if this driver has lowered them."""
         axis = self.axes[i]
-        if axis.limit_nm < 0 or self._missing_settings(i):
+        if axis.limit_nm < 0 or self._list_missing_settings(i):
             return
         speed = axis.configured[AxisSetting.SPEED]
         current_a = axis.configured[AxisSetting.CURRENT]
@@ -290,7 +301,7 @@ class Axes(CanDrives):
         self._request(i, MessageId.SUPPLY, MessageId.TEMPERATURE, MessageId.ERROR, MessageId.ADDRESS)
 
     def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
-        """Send an input; before it the limits, and after it gains and mode, if they change."""
+        """Send the setpoint of an axis; before it the limits, and after it gains and mode, if they have changed."""
         axis = self.axes[i]
         if limit_nm != axis.limit_nm:
             self._send_limits(i, limit_nm)
@@ -305,7 +316,7 @@ class Axes(CanDrives):
             self._send_mode(i, mode)
 
     def send_command(self, i: int, command: DriveCommand) -> None:
-        """Change the state of an axis. An emergency stop is an error that the axis keeps."""
+        """Change the state of an axis. An emergency stop is an error that the axis latches."""
         match command:
             case "follow":
                 self._send(i, MessageId.SET_STATE, AxisState.CLOSED_LOOP)
@@ -332,17 +343,22 @@ class Axes(CanDrives):
         if gain_sent and mode_sent:
             axis.mode = mode
 
-    def _send(self, i: int, message: MessageId, *values: float) -> bool:
-        return self.wire.send(encode_message(self.nodes[i], message, *values))
+    def _send(self, i: int, message_id: MessageId, *values: float) -> bool:
+        return self.wire.send(encode_message(self.nodes[i], message_id, *values))
 
     def _request(self, i: int, *messages: MessageId) -> bool:
         """Send a request for each of these messages. Returns whether the bus accepted all of them."""
-        accepted = [self.wire.send(encode_request(self.nodes[i], message)) for message in messages]
+        accepted = [self.wire.send(encode_request(self.nodes[i], message_id)) for message_id in messages]
         return all(accepted)
 
 
 def make_axis(joint: Joint, max_current_a: float) -> Axis:
-    """Return an axis with the gains and limits of its joint, at its shaft."""
+    """Create the state of an axis, with the gains and limits of its joint converted to the shaft.
+
+    Args:
+        joint: Joint that the axis moves.
+        max_current_a: Highest current limit that the driver may send until the axis' own limit is known.
+    """
     motor = joint.motor
     gear = joint.drive.gear
     return Axis(
@@ -356,37 +372,40 @@ def make_axis(joint: Joint, max_current_a: float) -> Axis:
     )
 
 
-def needed_current_a(joint: Joint) -> float:
-    """Return the current that a joint's torque limit needs."""
-    constant = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
-    return joint.limits.torque_nm / joint.drive.gear / constant
+def compute_required_current_a(joint: Joint) -> float:
+    """Return the motor current in A that a joint's torque limit requires."""
+    torque_constant_nm_per_a = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
+    return joint.limits.torque_nm / joint.drive.gear / torque_constant_nm_per_a
 
 
-def find_objections(axis: Axis, watchdog_s: float) -> Iterator[str]:
-    """Yield each setting of an axis that does not suit its joint, with its fix. NaN suits no joint.
+def find_configuration_problems(axis: Axis, watchdog_s: float) -> Iterator[str]:
+    """Yield a text for each setting of an axis that does not suit its joint, with what to do about it.
+
+    Each text is a predicate, such as "has its watchdog off: ...", to be put after the name of the axis. A setting that
+    is NaN never suits.
 
     Args:
-        axis: the axis, with the settings that it has reported.
-        watchdog_s: watchdog time of the driver.
+        axis: The axis, with the settings that it has reported.
+        watchdog_s: Watchdog timeout of the driver's settings.
     """
     configured = axis.configured
     timeout_s = configured[AxisSetting.WATCHDOG_TIMEOUT]
     if not configured[AxisSetting.WATCHDOG_ENABLED]:
         yield f"has its watchdog off: set `enable_watchdog` = True and `watchdog_timeout` = {watchdog_s:g}, and save"
-    elif not abs(timeout_s - watchdog_s) <= ROUNDING * watchdog_s:
+    elif not abs(timeout_s - watchdog_s) <= RELATIVE_TOLERANCE * watchdog_s:
         yield (
             f"has a watchdog of {timeout_s:g} s, but `backends.odrive.watchdog_s` = {watchdog_s:g}: correct "
             f"`watchdog_timeout` and save, or correct the scenario"
         )
     current_a = configured[AxisSetting.CURRENT]
-    if not axis.torque_nm / axis.torque_constant <= current_a * (1 + ROUNDING):
+    if not axis.torque_nm / axis.torque_constant <= current_a * (1 + RELATIVE_TOLERANCE):
         yield (
             f"has a current limit (`current_soft_max`) of {current_a:.4g} A, which is "
             f"{current_a * axis.torque_constant:.3g} N·m, and its joint may command {axis.torque_nm:.3g} N·m: raise "
             f"the one, or lower `torque_nm`. If a driver was killed, it may have left a lower limit: restart the axis"
         )
     speed = configured[AxisSetting.SPEED]
-    if not axis.speed_limit <= speed * (1 + ROUNDING):
+    if not axis.speed_limit <= speed * (1 + RELATIVE_TOLERANCE):
         yield (
             f"has a speed limit (`vel_limit`) of {speed:.4g} turns/s, and its joint may turn at "
             f"{axis.speed_limit:.4g}: raise the one, or lower `speed_rad_s`"

@@ -7,16 +7,16 @@ from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.odrive.axes import (
     EMULATED_CONSTANT_NM_PER_A,
-    ROUNDING,
+    RELATIVE_TOLERANCE,
     UNKNOWN_MAX_CURRENT_A,
     Axes,
-    needed_current_a,
+    compute_required_current_a,
 )
 from snakesim_can_backend.odrive.emulator import HEARTBEAT_US, EmulatedOdrive
 from snakesim_can_backend.odrive.endpoints import read_all_endpoints
 from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_can_backend.odrive.settings import OdriveSettings
-from snakesim_drivers.kit.drive_settings import joint_label
+from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -34,66 +34,67 @@ class OdriveBackend(CanDriveBackend):
     reserved_ids = "63 is the broadcast address"
     report_period_s = HEARTBEAT_US * 1e-6
     traffic = CycleTraffic(
-        each_drive=(0, 0, 8, 8, 8),  # two requests, two answers and an input
-        one_drive=(0, 0, 0, 0, 8, 8, 8, 8),  # four requests and their answers
+        bytes_per_drive=(0, 0, 8, 8, 8),  # two requests, two answers and an input
+        bytes_per_cycle=(0, 0, 0, 0, 8, 8, 8, 8),  # four requests and their answers
         heartbeats_hz=1e6 / HEARTBEAT_US,
     )
 
     @classmethod
-    def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
+    def validate_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
         """Check that an ODrive axis can drive a joint as the robot file describes it.
 
         Args:
-            config: configuration of the run, for messages.
-            settings: settings of the driver type.
-            joint: the joint.
+            config: Configuration of the run, used in error messages.
+            settings: Settings of the driver type.
+            joint: Joint of the robot file.
 
         Raises:
-            ConfigError: it has no damping or torque constant, or needs too much current.
+            ConfigError: The joint has no damping or torque constant, or its torque limit needs too much current.
         """
-        where = joint_label(config, joint)
+        context = make_joint_label(config, joint)
         if joint.motor.damping_nm_s_per_rad <= 0:
             raise ConfigError(
-                f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it",
+                f"{context}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it",
                 code="drive/unsupported-setting",
             )
         if joint.motor.torque_constant_nm_per_a is None and cls.has_real_bus(settings):
             raise ConfigError(
-                f"{where}: `torque_constant_nm_per_a` is missing, and ODrives measure and limit amperes: take it "
+                f"{context}: `torque_constant_nm_per_a` is missing, and ODrives measure and limit amperes: take it "
                 f"from the motor's data sheet (8.27 / KV), as `axis0.config.motor.torque_constant` has it",
                 code="drive/unsupported-setting",
             )
-        cls.check_current(config, settings, joint)
+        cls.validate_current_limit(config, settings, joint)
 
     @classmethod
-    def check_current(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
+    def validate_current_limit(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
         """Check that the torque limit of a joint needs no more current than the driver may set.
 
         Args:
-            config: configuration of the run, for messages.
-            settings: settings of the driver type, with the maximum current and the endpoint files.
-            joint: the joint, with its torque limit and torque constant.
+            config: Configuration of the run, used in error messages.
+            settings: Settings of the driver type, with the maximum current and the endpoint files.
+            joint: Joint with its torque limit and torque constant.
 
         Raises:
-            ConfigError: it needs more.
+            ConfigError: The torque limit needs a higher current than the driver may set.
         """
-        limits_are_read = bool(settings.endpoints) or not cls.has_real_bus(settings)
+        are_limits_known = bool(settings.endpoints) or not cls.has_real_bus(settings)
         max_current_a = settings.max_current_a
         if max_current_a is None:
-            max_current_a = math.inf if limits_are_read else UNKNOWN_MAX_CURRENT_A
-        needed_a = needed_current_a(joint)
-        if needed_a <= max_current_a * (1 + ROUNDING):
+            max_current_a = math.inf if are_limits_known else UNKNOWN_MAX_CURRENT_A
+        required_current_a = compute_required_current_a(joint)
+        if required_current_a <= max_current_a * (1 + RELATIVE_TOLERANCE):
             return
-        constant = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
-        fix = "raise `backends.odrive.max_current_a`, if the axis is configured for more"
+        torque_constant_nm_per_a = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
+        suggestion = "raise `backends.odrive.max_current_a`, if the axis is configured for more"
         if settings.max_current_a is None:
-            fix = (
+            suggestion = (
                 "name the flat_endpoints.json of the axes' firmware in `backends.odrive.endpoints`, so that the driver "
                 "reads what each axis is configured for; or set it in `backends.odrive.max_current_a`"
             )
         raise ConfigError(
-            f"{joint_label(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs {needed_a:.4g} A "
-            f"at {constant:g} N·m/A, and the driver sets no more than {max_current_a:g} A: {fix}; or lower `torque_nm`",
+            f"{make_joint_label(config, joint)}: its `torque_nm` of {joint.limits.torque_nm:g} N·m needs "
+            f"{required_current_a:.4g} A at {torque_constant_nm_per_a:g} N·m/A, and the driver sets no more than "
+            f"{max_current_a:g} A: {suggestion}; or lower `torque_nm`",
             code="drive/unsupported-setting",
         )
 

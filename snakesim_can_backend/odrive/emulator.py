@@ -9,12 +9,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
-from snakesim_can_backend.odrive.axes import EMULATED_CONSTANT_NM_PER_A, REVOLUTION_RAD, needed_current_a
-from snakesim_can_backend.odrive.endpoints import EMULATED, FORMATS, TYPES, AxisSetting, read_all_endpoints
+from snakesim_can_backend.odrive.axes import EMULATED_CONSTANT_NM_PER_A, REVOLUTION_RAD, compute_required_current_a
+from snakesim_can_backend.odrive.endpoints import (
+    EMULATED,
+    SETTING_TYPES,
+    VALUE_FORMATS,
+    AxisSetting,
+    read_all_endpoints,
+)
 from snakesim_can_backend.odrive.protocol import (
     PAYLOADS,
     READ_SETTING,
-    SDO_HEAD,
+    SDO_HEADER,
     AxisError,
     AxisState,
     ControlMode,
@@ -34,12 +40,16 @@ COUNTS_PER_TURN = 16384  # of the encoder
 VERSION = (2, 4, 4, 58, 0, 6, 11, 0)  # protocol, hardware (3), firmware (3), unreleased
 FIRST_SERIAL = 0x3855_0000_0001
 DUPLICATE_SERIAL_BITS = 0x0000_0100_0000  # in which the serial number of a second axis with the same id differs
-MODES = {
+MODE_BY_CONTROL_MODE = {
     ControlMode.TORQUE: Mode.TORQUE,
     ControlMode.VELOCITY: Mode.VELOCITY,
     ControlMode.POSITION: Mode.POSITION,
 }
-INPUT_INDEX = {MessageId.SET_TORQUE: 0, MessageId.SET_VELOCITY: 1, MessageId.SET_POSITION: 2}  # `EmulatedAxis.inputs`
+SETPOINT_INDEX = {
+    MessageId.SET_TORQUE: 0,
+    MessageId.SET_VELOCITY: 1,
+    MessageId.SET_POSITION: 2,
+}  # `EmulatedAxis.setpoints`
 
 
 @dataclass(frozen=True)
@@ -63,10 +73,10 @@ class EmulatedAxis:
     state: int = AxisState.IDLE
     errors: int = 0
     disarm_reason: int = 0
-    setpoint_us: float = 0.0  # when the watchdog was fed
+    watchdog_fed_us: float = 0.0  # when the watchdog was fed
     # Inputs and gains.
-    control: int = ControlMode.POSITION
-    inputs: tuple[float, ...] = (0.0, 0.0, 0.0)  # torque in N·m, velocity in turns/s, position in turns
+    control_mode: int = ControlMode.POSITION
+    setpoints: tuple[float, ...] = (0.0, 0.0, 0.0)  # torque in N·m, velocity in turns/s, position in turns
     position_gain: float = 20.0  # 1/s
     velocity_gain: float = 0.16  # N·m / (turn/s)
 
@@ -79,7 +89,7 @@ class EmulatedAxis:
         self.vel_limit_turns_s = self.saved.vel_limit_turns_s
 
     def read_setting(self, setting: AxisSetting) -> float:
-        """Return the present value of a setting."""
+        """Return the current value of a setting."""
         match setting:
             case AxisSetting.WATCHDOG_ENABLED:
                 return self.saved.watchdog_enabled
@@ -98,7 +108,7 @@ class EmulatedOdrive(CanEmulator):
         """Start one emulated axis for each joint, configured as the joint needs it unless the scenario differs.
 
         Args:
-            context: joints, settings, and the body that the axes move.
+            context: Joints, settings, buses, and the body that the axes move.
         """
         super().__init__(context)
         settings: OdriveSettings = context.settings
@@ -115,10 +125,10 @@ class EmulatedOdrive(CanEmulator):
             )
             for joint, true_joint in zip(context.joints, context.body.joints, strict=True)
         ]
-        self._heartbeat_us = -math.inf
+        self._last_heartbeat_us = -math.inf
         self.on_step(0.0)
 
-    def find_addressee(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: Frame) -> int:
         """Return the node of a frame."""
         node, _ = split_id(frame)
         return node
@@ -138,26 +148,26 @@ class EmulatedOdrive(CanEmulator):
         self._drive_motor(i, self.axes[i])
 
     def handle_frame(self, i: int, frame: Frame) -> None:
-        """Answer a request or obey a message. Requests have no data, except those for settings."""
-        message = MessageId(split_id(frame)[1])
+        """Send the report that a frame requests, or execute its command. Requests have no data, except for settings."""
+        message_id = MessageId(split_id(frame)[1])
         axis = self.axes[i]
-        if message == MessageId.RX_SDO:
+        if message_id == MessageId.RX_SDO:
             self._answer_setting(i, frame.data)
             return
-        values = PAYLOADS[message].unpack(frame.data) if frame.data else ()
-        if not values and message not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
-            self.send_frame(i, self._make_report(i, axis, message))
+        values = PAYLOADS[message_id].unpack(frame.data) if frame.data else ()
+        if not values and message_id not in (MessageId.ESTOP, MessageId.CLEAR_ERRORS):
+            self.send_frame(i, self._make_report(i, axis, message_id))
         else:
-            self._obey(i, axis, message, values)
+            self._execute_command(i, axis, message_id, values)
 
     def on_step(self, now_us: float) -> None:
         """Stop axes whose watchdog has expired; at each heartbeat, also those that are too hot."""
         for i, axis in enumerate(self.axes):
-            if axis.state == AxisState.CLOSED_LOOP and now_us - axis.setpoint_us > axis.watchdog_us:
+            if axis.state == AxisState.CLOSED_LOOP and now_us - axis.watchdog_fed_us > axis.watchdog_us:
                 self._fail(i, axis, AxisError.WATCHDOG_TIMER_EXPIRED)
-        if now_us - self._heartbeat_us < HEARTBEAT_US:
+        if now_us - self._last_heartbeat_us < HEARTBEAT_US:
             return
-        self._heartbeat_us = now_us
+        self._last_heartbeat_us = now_us
         for i, axis in enumerate(self.axes):
             if self.body.is_too_hot(i):
                 self._fail(i, axis, AxisError.MOTOR_OVER_TEMP)
@@ -165,31 +175,31 @@ class EmulatedOdrive(CanEmulator):
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _obey(self, i: int, axis: EmulatedAxis, message: MessageId, values: tuple[float, ...]) -> None:
+    def _execute_command(self, i: int, axis: EmulatedAxis, message_id: MessageId, values: tuple[float, ...]) -> None:
         """Execute a command that the host has sent to an axis; an unknown command has no effect.
 
         Args:
-            i: index of the axis.
-            axis: the axis, whose state is changed.
-            message: kind of the command.
-            values: values of its payload, in the units of ODrive.
+            i: Index of the axis.
+            axis: State of the axis, which is changed.
+            message_id: Id of the command.
+            values: Values of the payload of the command, in the units of ODrive.
         """
-        match message:
+        match message_id:
             case MessageId.ESTOP:
                 self._fail(i, axis, AxisError.ESTOP_REQUESTED)
             case MessageId.CLEAR_ERRORS:
                 axis.errors = 0
             case MessageId.SET_STATE if values[0] == AxisState.CLOSED_LOOP and not axis.errors:
-                axis.setpoint_us = self.body.now_us
+                axis.watchdog_fed_us = self.body.now_us
                 axis.state = AxisState.CLOSED_LOOP
             case MessageId.SET_STATE:
                 axis.state = AxisState.IDLE
             case MessageId.SET_MODE:
-                axis.control = int(values[0])
+                axis.control_mode = int(values[0])
             case MessageId.SET_POSITION | MessageId.SET_VELOCITY | MessageId.SET_TORQUE:
-                axis.setpoint_us = self.body.now_us
-                index = INPUT_INDEX[message]
-                axis.inputs = (*axis.inputs[:index], values[0], *axis.inputs[index + 1 :])
+                axis.watchdog_fed_us = self.body.now_us
+                index = SETPOINT_INDEX[message_id]
+                axis.setpoints = (*axis.setpoints[:index], values[0], *axis.setpoints[index + 1 :])
             case MessageId.SET_LIMITS:
                 axis.vel_limit_turns_s, axis.current_soft_max_a = values
             case MessageId.SET_POSITION_GAIN:
@@ -201,25 +211,28 @@ class EmulatedOdrive(CanEmulator):
         self._drive_motor(i, axis)
 
     def _answer_setting(self, i: int, data: bytes) -> None:
-        """Answer a request for a setting; unknown endpoints get no answer, and writing is not emulated."""
-        opcode, endpoint, _ = SDO_HEAD.unpack_from(data)
-        setting = self._endpoints.setting_at(endpoint)
+        """Send the setting that a frame requests; unknown endpoints get no response, and writing is not emulated."""
+        opcode, endpoint, _ = SDO_HEADER.unpack_from(data)
+        setting = self._endpoints.find_setting(endpoint)
         axis = self.axes[i]
         if setting is not None and opcode == READ_SETTING:
-            value = FORMATS[TYPES[setting]].pack(axis.read_setting(setting))
+            value = VALUE_FORMATS[SETTING_TYPES[setting]].pack(axis.read_setting(setting))
             self.send_frame(i, encode_setting_answer(axis.node, endpoint, value))
 
-    def _make_report(self, i: int, axis: EmulatedAxis, message: MessageId) -> Frame:
-        """Return a message in which an axis reports its state; without data if it does not know the message.
+    def _make_report(self, i: int, axis: EmulatedAxis, message_id: MessageId) -> Frame:
+        """Return a frame in which an axis reports values of its state.
 
         Args:
-            i: index of the axis.
-            axis: the axis.
-            message: kind of the message that the host has requested or that is due.
+            i: Index of the axis.
+            axis: State of the axis.
+            message_id: Id of the message that the host has requested or that is due.
+
+        Returns:
+            The frame, without data if the axis does not know the message.
         """
         angle_rad, velocity_rad_s, torque_nm = self.body.read_shaft(i)
         values: tuple[Any, ...]
-        match message:
+        match message_id:
             case MessageId.VERSION:
                 values = VERSION
             case MessageId.ADDRESS:
@@ -240,27 +253,27 @@ class EmulatedOdrive(CanEmulator):
             case MessageId.SUPPLY:
                 values = self.body.read_supply(i)
             case _:
-                return encode_request(axis.node, message)
-        return encode_message(axis.node, message, *values)
+                return encode_request(axis.node, message_id)
+        return encode_message(axis.node, message_id, *values)
 
     def _drive_motor(self, i: int, axis: EmulatedAxis) -> None:
-        """Apply state, control mode and inputs of an axis to its motor.
+        """Apply state, control mode and setpoints of an axis to its motor.
 
-        An unknown control mode counts as torque control.
+        An unknown control mode counts as torque control. The motor is passive unless the axis is in closed loop.
 
         Args:
-            i: index of the axis.
-            axis: the axis.
+            i: Index of the axis.
+            axis: State of the axis.
         """
-        control = ControlMode.TORQUE
-        if axis.control in list(ControlMode):
-            control = ControlMode(axis.control)
+        control_mode = ControlMode.TORQUE
+        if axis.control_mode in list(ControlMode):
+            control_mode = ControlMode(axis.control_mode)
         mode = Mode.PASSIVE
         target = 0.0
         if axis.state == AxisState.CLOSED_LOOP:
-            mode = MODES[control]
-            unit = 1.0 if control == ControlMode.TORQUE else REVOLUTION_RAD
-            target = axis.inputs[control - 1] * unit
+            mode = MODE_BY_CONTROL_MODE[control_mode]
+            unit = 1.0 if control_mode == ControlMode.TORQUE else REVOLUTION_RAD
+            target = axis.setpoints[control_mode - 1] * unit
         damping = axis.velocity_gain / REVOLUTION_RAD
         self.body.drive_motor(
             i,
@@ -280,17 +293,17 @@ class EmulatedOdrive(CanEmulator):
 
 
 def make_configuration(joint: Joint, settings: OdriveSettings) -> AxisConfiguration:
-    """Return what an emulated axis is configured for: what its joint needs, unless the scenario differs.
+    """Return the configuration of an emulated axis: what its joint needs, unless the settings override a value.
 
     Args:
-        joint: the joint, as the robot file describes it.
-        settings: settings of the driver type, which may mount an axis that is configured otherwise.
+        joint: Joint as the robot file describes it.
+        settings: Settings of the driver type, with overrides for emulated axes in `mounted`.
     """
     mounted = settings.mounted.get(joint.name, MountedAxis())
     watchdog_timeout_s = settings.watchdog_s
     if mounted.watchdog_timeout_s is not None:
         watchdog_timeout_s = mounted.watchdog_timeout_s
-    current_soft_max_a = needed_current_a(joint)
+    current_soft_max_a = compute_required_current_a(joint)
     if mounted.current_soft_max_a is not None:
         current_soft_max_a = mounted.current_soft_max_a
     vel_limit_turns_s = joint.limits.speed_rad_s * joint.drive.gear / REVOLUTION_RAD

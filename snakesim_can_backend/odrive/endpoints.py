@@ -24,13 +24,13 @@ class AxisSetting(StrEnum):
     SPEED = "axis0.controller.config.vel_limit"  # turns/s
 
 
-TYPES = {
+SETTING_TYPES = {
     AxisSetting.WATCHDOG_ENABLED: "bool",
     AxisSetting.WATCHDOG_TIMEOUT: "float",
     AxisSetting.CURRENT: "float",
     AxisSetting.SPEED: "float",
 }
-FORMATS = {"bool": Struct("<?"), "float": Struct("<f")}
+VALUE_FORMATS = {"bool": Struct("<?"), "float": Struct("<f")}
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Endpoints:
     hardware: str  # such as 4.4.58
     ids: Mapping[AxisSetting, int]
 
-    def setting_at(self, endpoint: int) -> AxisSetting | None:
-        """Return the setting with this endpoint id; None: it is none of those."""
+    def find_setting(self, endpoint: int) -> AxisSetting | None:
+        """Return the setting with this endpoint id; None if no setting of the driver has it."""
         return next((setting for setting, number in self.ids.items() if number == endpoint), None)
 
 
@@ -62,7 +62,11 @@ class _File(msgspec.Struct):
 
 
 def read_all_endpoints(paths: Sequence[str]) -> list[Endpoints]:
-    """Read the files that the scenario names. Raises ConfigError."""
+    """Read all endpoint files that the scenario names.
+
+    Raises:
+        ConfigError: A file cannot be read, or a setting is missing in it.
+    """
     return [read_endpoints(path) for path in paths]
 
 
@@ -70,34 +74,34 @@ def read_endpoints(path: str) -> Endpoints:
     """Read from a `flat_endpoints.json` of ODrive the ids of the settings that this driver uses.
 
     Args:
-        path: path of the file.
+        path: Path of the file.
 
     Returns:
         The ids, with the firmware and the hardware that the file is for.
 
     Raises:
-        ConfigError: the file cannot be read, or a setting is missing.
+        ConfigError: The file cannot be read, or a setting is missing in it or has another type.
     """
-    where = "`backends.odrive.endpoints`"
-    advice = "take the flat_endpoints.json that ODrive publishes with the axes' firmware"
+    context = "`backends.odrive.endpoints`"
+    suggestion = "take the flat_endpoints.json that ODrive publishes with the axes' firmware"
     try:
         file = msgspec.json.decode(read_text(Path(path)), type=_File)
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}; {advice}", code="file/not-readable") from None
+        raise ConfigError(f"{context}: {error}; {suggestion}", code="file/not-readable") from None
     except (msgspec.DecodeError, RecursionError) as error:
-        raise ConfigError(f"{where}: {path}: {error}; {advice}", code="file/not-readable") from None
+        raise ConfigError(f"{context}: {path}: {error}; {suggestion}", code="file/not-readable") from None
     ids: dict[AxisSetting, int] = {}
     for setting in AxisSetting:
         endpoint = file.endpoints.get(setting)
         if endpoint is None or not 0 <= endpoint.id <= 0xFFFF:
             raise ConfigError(
-                f"{where}: {path} has no endpoint {setting} with an id of 0 to 65535; {advice}",
+                f"{context}: {path} has no endpoint {setting} with an id of 0 to 65535; {suggestion}",
                 code="file/not-readable",
             )
-        if endpoint.type != TYPES[setting]:
+        if endpoint.type != SETTING_TYPES[setting]:
             raise ConfigError(
-                f"{where}: {path}: {setting} has the type {endpoint.type!r}, and this driver needs {TYPES[setting]!r}; "
-                f"{advice}",
+                f"{context}: {path}: {setting} has the type {endpoint.type!r}, and this driver needs "
+                f"{SETTING_TYPES[setting]!r}; {suggestion}",
                 code="file/not-readable",
             )
         ids[setting] = endpoint.id

@@ -108,39 +108,39 @@ PAYLOADS = {
 }
 READ_SETTING = 0  # first byte of RxSdo
 WRITE_SETTING = 1
-SDO_HEAD = Struct("<BHB")  # opcode, or reserved in an answer; endpoint id; reserved. The value follows
-SETTERS = frozenset(message for message in MessageId if message.name.startswith("SET_"))
+SDO_HEADER = Struct("<BHB")  # opcode, or reserved in an answer; endpoint id; reserved. The value follows
+SETTERS = frozenset(message_id for message_id in MessageId if message_id.name.startswith("SET_"))
 FROM_HOST = SETTERS | {MessageId.ESTOP, MessageId.CLEAR_ERRORS}  # messages that only a host sends
 
 
-def encode_message(node: int, message: MessageId, *values: float | bytes) -> Frame:
+def encode_message(node: int, message_id: MessageId, *values: float | bytes) -> Frame:
     """Return a message of, or to, an axis."""
-    return Frame(node << NODE_BITS | message, PAYLOADS[message].pack(*values))
+    return Frame(node << NODE_BITS | message_id, PAYLOADS[message_id].pack(*values))
 
 
-def encode_request(node: int, message: MessageId) -> Frame:
+def encode_request(node: int, message_id: MessageId) -> Frame:
     """Return the request for a message: the message without data."""
-    return Frame(node << NODE_BITS | message, b"")
+    return Frame(node << NODE_BITS | message_id, b"")
 
 
 def encode_setting_request(node: int, endpoint: int) -> Frame:
     """Return the request for the setting with an endpoint id."""
-    return Frame(node << NODE_BITS | MessageId.RX_SDO, SDO_HEAD.pack(READ_SETTING, endpoint, 0))
+    return Frame(node << NODE_BITS | MessageId.RX_SDO, SDO_HEADER.pack(READ_SETTING, endpoint, 0))
 
 
 def encode_setting_answer(node: int, endpoint: int, value: bytes) -> Frame:
     """Return an axis' answer to the request for a setting."""
-    return Frame(node << NODE_BITS | MessageId.TX_SDO, SDO_HEAD.pack(0, endpoint, 0) + value)
+    return Frame(node << NODE_BITS | MessageId.TX_SDO, SDO_HEADER.pack(0, endpoint, 0) + value)
 
 
 def decode_setting_answer(data: bytes) -> tuple[int, bytes]:
     """Return endpoint id and value of an answer with a setting.
 
     Raises:
-        struct.error: the answer is too short.
+        struct.error: The answer is too short.
     """
-    _, endpoint, _ = SDO_HEAD.unpack_from(data)
-    return endpoint, data[SDO_HEAD.size :]
+    _, endpoint, _ = SDO_HEADER.unpack_from(data)
+    return endpoint, data[SDO_HEADER.size :]
 
 
 def split_id(frame: Frame) -> tuple[int, int]:

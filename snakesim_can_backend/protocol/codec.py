@@ -26,7 +26,7 @@ from snakesim_can_backend.protocol.definitions import (
     frame_id,
 )
 from snakesim_hal.base.errors import SnakesimError
-from snakesim_hal.model.files import SCHEMAS
+from snakesim_hal.model.files import SCHEMAS_DIR
 
 DBC = "snakesim.dbc"
 OPCODE_MASK = 0x7FF & ~NODE_MASK  # of an 11-bit id
@@ -102,47 +102,47 @@ class MessageLayout:
         self._readers = {name: self.make_reader(name) for name in self.signals}
 
     def make_reader(self, *names: str) -> Reader:
-        """Return a function that reads some signals' raw numbers, in this order, from the data of a frame.
+        """Return a function that reads the raw numbers of some signals, in this order, from the data of a frame.
 
         The function is compiled once, because it runs for every frame. Its data must have the length of this message.
 
         Args:
-            names: names of the signals, which must not overlap.
+            names: Names of the signals, which must not overlap.
 
         Raises:
-            CodecError: signals overlap.
+            CodecError: Some of the signals overlap.
         """
         signals = [self.signals[name] for name in names]
         # bitstruct begins with the highest bit, so the function reverses the bytes and reads the last signal first.
-        from_high_to_low = sorted(signals, key=lambda signal: -signal.shift)
+        signals_from_high_bits = sorted(signals, key=lambda signal: -signal.shift)
         formats: list[str] = []
         end = 8 * self.length
-        for signal in from_high_to_low:
+        for signal in signals_from_high_bits:
             formats.append(_padding_format(end - signal.shift - signal.bits))
             formats.append(signal.bitstruct_format)
             end = signal.shift
         formats.append(_padding_format(end))
         unpack = bitstruct.c.compile("".join(formats)).unpack
-        read_names = [signal.name for signal in from_high_to_low]
+        read_names = [signal.name for signal in signals_from_high_bits]
         if read_names == list(names):
             return lambda data: unpack(data[::-1])
         select = itemgetter(*(read_names.index(name) for name in names))
         return lambda data: select(unpack(data[::-1]))
 
     def make_writer(self, *names: str) -> Writer:
-        """Return a function that makes the frame of a node from some signals' raw numbers, and adds the checksum.
+        """Return a function that makes the frame of a node from the raw numbers of some signals, with the checksum.
 
         Args:
-            names: names of the signals, in the order in which the function takes their numbers.
+            names: Names of the signals, in the order in which the function takes their raw numbers.
         """
-        places = [(self.signals[name].shift, self.signals[name].mask) for name in names]
+        bit_fields = [(self.signals[name].shift, self.signals[name].mask) for name in names]
         opcode = self.opcode
         has_checksum = self._has_checksum
         payload_bytes = self.length - 1 if has_checksum else self.length
 
         def write(node: int, raw: Sequence[int]) -> Frame:
             bits = 0
-            for (shift, mask), number in zip(places, raw, strict=True):
+            for (shift, mask), number in zip(bit_fields, raw, strict=True):
                 bits |= (number & mask) << shift
             identifier = frame_id(opcode, node)
             data = bits.to_bytes(payload_bytes, "little")
@@ -156,11 +156,11 @@ class MessageLayout:
         """Return the frame of a node with some values.
 
         Args:
-            node: sender or receiver.
-            values: by signal, in the signal's unit. Signals that are not named are 0.
+            node: Sender or receiver.
+            values: By signal, in the signal's unit. Signals that are not named are 0.
 
         Raises:
-            CodecError: a value is out of range.
+            CodecError: A value is out of range.
         """
         raw = [self.signals[name].encode(value) for name, value in values.items()]
         return self.make_writer(*values)(node, raw)
@@ -171,7 +171,7 @@ class MessageLayout:
         Signals that share their bits all get a value; only the one that belongs to the frame's `mode` has a meaning.
 
         Raises:
-            CodecError: the data has another length than this message.
+            CodecError: The data has another length than this message.
         """
         if len(data) != self.length:
             raise CodecError(f"{self.name} has {self.length} bytes, this one {len(data)}")
@@ -191,7 +191,7 @@ def load_layouts() -> dict[Opcode, MessageLayout]:
 
 def load_database() -> Database:
     """Load the DBC file that comes with the HAL into cantools. The ids of all nodes find their message."""
-    database = cantools.database.load_file(SCHEMAS / "can" / DBC, frame_id_mask=OPCODE_MASK)
+    database = cantools.database.load_file(SCHEMAS_DIR / "can" / DBC, frame_id_mask=OPCODE_MASK)
     assert isinstance(database, Database)
     return database
 

@@ -75,8 +75,11 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     The lifecycle may have passed through other states between `before` and `now`, within one control cycle.
 
     Args:
-        before: state in the cycle before.
-        now: present state.
+        before: Lifecycle state in the control cycle before.
+        now: Current lifecycle state.
+
+    Returns:
+        The frames in the order in which they have to be sent; empty if no command is needed.
     """
     if now == before:
         return []
@@ -93,7 +96,7 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     return frames
 
 
-def make_reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
+def make_repeated_command(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
     """Return the frame to repeat to a module in an unexpected state, because an earlier one may have been lost."""
     match lifecycle, state:
         case "armed", ModuleState.DISARMED:
@@ -130,8 +133,8 @@ def make_sync(count: int, time_us: int) -> Frame:
     """Return the frame at which all modules sample their sensors and then follow their newest setpoints.
 
     Args:
-        count: number of the Sync; the frame has its lowest 8 bits.
-        time_us: time of the host; the frame has its lowest 32 bits.
+        count: Number of the Sync; the frame has its lowest 8 bits.
+        time_us: Time of the host; the frame has its lowest 32 bits.
     """
     return _sync_writer()(BROADCAST, (count & SYNC_COUNT_MASK, time_us & SYNC_TIME_MASK))
 

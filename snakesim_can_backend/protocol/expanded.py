@@ -15,7 +15,7 @@ TO_ALL = (Opcode.EMERGENCY, Opcode.SYNC)
 TO_ONE_OR_ALL = (Opcode.COMMAND,)
 
 
-def expanded_dbc() -> str:
+def make_expanded_dbc() -> str:
     """Return the text of the expanded file. `JointState` of node 5 is called `JointState_05`."""
     source = load_database()
     messages: list[Message] = []

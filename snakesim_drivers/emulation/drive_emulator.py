@@ -7,37 +7,38 @@ from typing import Generic, Protocol, TypeVar
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.base.process import (
     SERVICE_PRIORITY,
+    call_on_stop_signals,
     drop_priority_after,
-    on_stop_signal,
     set_realtime_priority,
     tune_garbage_collector,
 )
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.fault_kinds import Injection
 
-POLL_S = 0.001  # longest wait for frames or bytes, of drives in a process of their own
-MAX_BUSY_S = 0.2  # computing without a pause, after which emulated drives give up their real-time priority
+MAX_WAIT_S = 0.001  # longest wait for frames or bytes, of drives in a process of their own
+MAX_REALTIME_BUSY_S = 0.2  # computing without a pause, after which emulated drives give up their real-time priority
 
 
-def serve_until_stopped(ready: str, emulator: Callable[[], object], wait: Callable[[float], object]) -> None:
+def serve_until_stopped(ready_text: str, emulator: Callable[[], object], wait: Callable[[float], object]) -> None:
     """Run emulated drives until this process gets a stop signal.
 
-    They get real-time priority if the system allows it: real drives answer however busy the computer is.
+    The process gets real-time priority if the system allows it, because real drives answer however busy the computer
+    is.
 
     Args:
-        ready: The line to print once they run.
-        emulator: Handles what has arrived, and simulates up to the present time.
-        wait: Waits for frames or bytes, at most so many seconds.
+        ready_text: Line that is printed when the drives are ready.
+        emulator: Function that handles what has arrived, and simulates up to the current time.
+        wait: Function that waits until frames or bytes arrive; its argument is the maximum wait in s.
     """
-    running = [True]
-    on_stop_signal(running.clear)
+    run_flag = [True]  # emptied by the signal handler
+    call_on_stop_signals(run_flag.clear)
     tune_garbage_collector()
     if set_realtime_priority(SERVICE_PRIORITY) is None:
-        drop_priority_after(MAX_BUSY_S)
-    print_line(ready)
-    while running:
+        drop_priority_after(MAX_REALTIME_BUSY_S)
+    print_line(ready_text)
+    while run_flag:
         emulator()
-        wait(POLL_S)
+        wait(MAX_WAIT_S)
 
 
 class BusEnd(Protocol):
@@ -59,36 +60,37 @@ class DriveEmulator(ABC, Generic[BusEndT]):
     """
 
     def __init__(self, body: EmulatedBody, bus_ends: Sequence[BusEndT], clock_ns: Callable[[], int]) -> None:
-        """Begin to simulate at the present time of the clock.
+        """Start to simulate at the current time of the clock.
 
         Args:
-            body: The body that these drives move.
-            bus_ends: The drives' end of every drive's bus. Drives of one bus have the same object. `close` closes them.
-            clock_ns: A steady time, with any origin.
+            body: Body that these drives move.
+            bus_ends: The drives' end of the bus of every drive. Drives of one bus have the same object. `close` closes
+                them.
+            clock_ns: Function that returns a steady time in ns, with any origin.
         """
         self.body = body
         self._clock_ns = clock_ns
         self._start_ns = clock_ns()
-        self._bus_ends: list[BusEndT] = list({id(end): end for end in bus_ends}.values())  # each once
+        self._bus_ends: list[BusEndT] = list({id(bus_end): bus_end for bus_end in bus_ends}.values())  # each once
         body.add_step_callback(self.on_step)
 
     @abstractmethod
     def restart(self, i: int) -> None:
-        """Put a drive into the state in which it is switched on."""
+        """Put a drive into its state after power-on."""
 
     @abstractmethod
     def on_step(self, now_us: float) -> None:
-        """Let the drives act at a time of their own: watchdogs, heat, and reports that are due."""
+        """Update the drives after a physics step: watchdogs, over-temperature, and reports that are due."""
 
     def list_enabled(self) -> list[bool]:
-        """Return for each drive whether it would follow a setpoint now; the contract suite looks at it.
+        """Return for each drive whether it would follow a setpoint now, for the contract suite.
 
         The default is for emulators that the contract suite knows.
         """
         raise NotImplementedError(f"{type(self).__name__}.list_enabled")
 
     def catch_up(self) -> None:
-        """Simulate a pause of this process before anything that was sent since then is handled.
+        """Simulate the time in which this process was paused, before any frame that has arrived since is handled.
 
         Real drives do not pause with the computer: their watchdogs expire.
         """
@@ -96,30 +98,30 @@ class DriveEmulator(ABC, Generic[BusEndT]):
         if self.body.is_late(clock_us):
             self.body.advance_to(clock_us)
 
-    def pass_time(self) -> None:
-        """Simulate up to the present time."""
+    def simulate_to_now(self) -> None:
+        """Simulate up to the current time."""
         self.body.advance_to(self._read_clock_us())
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Begin or end an injected fault of a drive.
+        """Start or end an injected fault of a drive.
 
         Args:
             injection: The fault.
-            begins: True to begin it, False to end it.
+            begins: True to start the fault, False to end it.
 
         Raises:
             ConfigError: There is no such fault, or no such joint.
         """
         with self.body.lock:
-            restarted = self.body.inject(injection, begins=begins)
-            if restarted is not None:
-                self.restart(restarted)
+            restarted_drive = self.body.inject(injection, begins=begins)
+            if restarted_drive is not None:
+                self.restart(restarted_drive)
 
     def close(self) -> None:
         """Leave the body and close the buses."""
         self.body.remove_step_callback(self.on_step)
-        for end in self._bus_ends:
-            end.close()
+        for bus_end in self._bus_ends:
+            bus_end.close()
 
     def _read_clock_us(self) -> float:
         """Return the time since these drives began."""

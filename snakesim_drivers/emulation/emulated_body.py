@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from snakesim_drivers.emulation.shared_physics import MAX_AT_ONCE_US, SharedPhysics
+from snakesim_drivers.emulation.shared_physics import MAX_CATCH_UP_US, SharedPhysics
 from snakesim_drivers.mounting import to_joint_target
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection
@@ -34,8 +34,8 @@ class EmulatedBody:
         """Select the drives of some joints. Motors are passive at first.
 
         Args:
-            shared: The physics of the whole robot.
-            joint_indices: The indices of these joints in the robot.
+            shared: Physics of the whole robot.
+            joint_indices: Indices of these joints in the robot, from tail to head.
         """
         self._shared = shared
         self._joint_indices = list(joint_indices)
@@ -67,7 +67,7 @@ class EmulatedBody:
 
     def is_late(self, clock_us: float) -> bool:
         """Return whether the process of these drives has paused for longer than they catch up with."""
-        return self._shared.measure_lag_us(clock_us) > MAX_AT_ONCE_US
+        return self._shared.measure_lag_us(clock_us) > MAX_CATCH_UP_US
 
     def advance_to(self, clock_us: float) -> None:
         """Simulate up to a time of the clock. The caller holds `lock`."""
@@ -78,19 +78,19 @@ class EmulatedBody:
     def drive_motor(
         self, i: int, mode: Mode, target: float, limit_nm: float, stiffness: float, damping: float, speed_rad_s: float
     ) -> None:
-        """Set what a drive demands of its motor until the next call.
+        """Set the setpoint, gains and limits of a drive's motor, all at the drive's shaft, until the next call.
 
         Args:
-            i: Number of the drive, from 0 at the tail.
-            mode: Its control mode.
-            target: In rad, rad/s or N·m, by the mode.
+            i: Index of the drive, from 0 at the tail.
+            mode: Control mode of the motor.
+            target: Setpoint in rad, rad/s or N·m, by the mode.
             limit_nm: Torque limit.
             stiffness: Gain of position mode in N·m/rad.
             damping: Gain of position and velocity mode in N·m·s/rad.
             speed_rad_s: Speed limit.
         """
         drive = self.joints[i].drive
-        gear = drive.gear
+        gear = drive.gear  # revolutions of the shaft for one of the joint, so torques at the joint are higher by it
         self.motors.set_demand(
             self._joint_indices[i],
             mode,
@@ -115,19 +115,19 @@ class EmulatedBody:
         """Return the voltage in V and the current in A of a drive's supply."""
         supply = self.joints[i].supply
         j = self._joint_indices[i]
-        power_w = self.thermal.power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s)[j]
-        voltage_v = UNDERVOLTAGE_V if j in self._shared.undervolted else supply.voltage_v
+        power_w = self.thermal.compute_power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s)[j]
+        voltage_v = UNDERVOLTAGE_V if j in self._shared.undervoltage_joints else supply.voltage_v
         return voltage_v, supply.idle_a + float(power_w) / voltage_v
 
     def read_temperatures(self, i: int) -> tuple[float, float]:
         """Return the temperatures of a drive's winding and of its electronics in °C."""
         j = self._joint_indices[i]
-        return float(self.thermal.winding_c[j]), float(self.thermal.board_c()[j])
+        return float(self.thermal.winding_temperature_c[j]), float(self.thermal.compute_board_temperatures_c()[j])
 
     def is_too_hot(self, i: int) -> bool:
         """Return whether a drive's winding has reached `stop_at_c`."""
         j = self._joint_indices[i]
-        return bool(self.thermal.winding_c[j] >= self.thermal.stop_at_c[j])
+        return bool(self.thermal.winding_temperature_c[j] >= self.thermal.stop_at_c[j])
 
     # --- faults -----------------------------------------------------------------------------------------------
 
@@ -137,25 +137,25 @@ class EmulatedBody:
 
     def is_booting(self, i: int) -> bool:
         """Return whether a drive restarts, and neither receives nor sends."""
-        return self.now_us < self._shared.boots_until_us[self._joint_indices[i]]
+        return self.now_us < self._shared.boot_end_us[self._joint_indices[i]]
 
     def is_duplicated(self, i: int) -> bool:
         """Return whether a second drive with the id of this one is on its bus."""
         return self._joint_indices[i] in self._shared.duplicated
 
     def start_boot(self, i: int) -> None:
-        """Let a drive restart. Until it has, it neither receives nor sends."""
-        self._shared.boots_until_us[self._joint_indices[i]] = self.now_us + BOOT_US
+        """Start to reboot a drive, which neither receives nor sends for `BOOT_US`."""
+        self._shared.boot_end_us[self._joint_indices[i]] = self.now_us + BOOT_US
 
     def inject(self, injection: Injection, *, begins: bool) -> int | None:
-        """Begin or end an injected fault of a drive.
+        """Start or end an injected fault of a drive.
 
         Args:
-            injection: The fault.
-            begins: True to begin it, False to end it.
+            injection: The fault, with the number of the drive among these as its target.
+            begins: True to start the fault, False to end it.
 
         Returns:
-            The index of the drive if it restarts now, or None.
+            Index of the drive if the fault lets it restart now; otherwise None.
 
         Raises:
             ConfigError: There is no such fault, or no such joint.
@@ -164,7 +164,7 @@ class EmulatedBody:
             raise ConfigError(
                 f"fault {str(injection)!r}: emulated drives know {', '.join(FAULTS)}", code="injection/unknown-fault"
             )
-        i = injection.number
+        i = injection.target_index
         if i >= len(self.joints):
             raise ConfigError(
                 f"fault {str(injection)!r}: this robot has joint_1 to joint_{len(self.joints)}",
@@ -175,13 +175,13 @@ class EmulatedBody:
             case "mute":
                 _set_membership(self._shared.muted, j, is_member=begins)
             case "undervoltage":
-                _set_membership(self._shared.undervolted, j, is_member=begins)
+                _set_membership(self._shared.undervoltage_joints, j, is_member=begins)
             case "duplicate":
                 _set_membership(self._shared.duplicated, j, is_member=begins)
             case "overheat":
-                lasts = injection.end_s != math.inf
-                self.thermal.inject(j, heat=begins, hold=begins and lasts)
-            case _:  # reboot, which has no end
+                has_end = injection.end_s != math.inf
+                self.thermal.inject_heat(j, heat=begins, hold=begins and has_end)
+            case _:  # "reboot", which ends by itself
                 if begins:
                     self.start_boot(i)
                     return i

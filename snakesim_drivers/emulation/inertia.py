@@ -17,12 +17,12 @@ from msgspec import Meta
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.scenario import RunConfig, find_start_pose
+from snakesim_hal.model.scenario import RunConfig, compute_start_pose
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.quantities import from_zero
 
 MIN_INERTIA_KG_M2 = 1e-6  # of a joint, so that the equations have a solution for any robot file
-STEP_ROUNDING = 1e-9  # steps per period; a quotient of floats may exceed its whole number by less
+STEP_COUNT_TOLERANCE = 1e-9  # steps per period; a quotient of floats may exceed its whole number by less
 
 
 class InertiaSettings(FileStruct, frozen=True, kw_only=True):
@@ -41,38 +41,41 @@ class InertiaModel(PhysicsModel):
     Settings = InertiaSettings
 
     def __init__(self, config: RunConfig, settings: InertiaSettings) -> None:
-        """Begin at the run's start pose, at rest, with the inertia of each joint's rotor and of the link ahead of it.
+        """Create the model at the run's start pose, at rest.
 
-        The step is shortened so that a control period is a multiple of it.
+        Each joint moves the inertia of its rotor and of the link ahead of it. The time step is shortened so that a
+        control period is a multiple of it.
 
         Args:
-            config: configuration of the run, with robot and start pose.
-            settings: duration of a step, and friction in addition to that of the robot file.
+            config: Configuration of the run, with robot and start pose.
+            settings: Maximum time step, and dry friction in addition to that of the robot file.
         """
         robot = config.robot
         joints = robot.joint_table
         count = len(joints)
         period_s = config.period_ns * 1e-9
-        steps_per_period = max(int(np.ceil(period_s / settings.timestep_s - STEP_ROUNDING)), 1)
+        steps_per_period = max(int(np.ceil(period_s / settings.timestep_s - STEP_COUNT_TOLERANCE)), 1)
         self.step_s = period_s / steps_per_period
 
         # Inertia and friction of every joint.
-        link_inertia = [
+        link_inertias_kg_m2 = [
             mass_kg * length_m**2 / 12
             for mass_kg, length_m in zip(robot.link_masses_kg, robot.link_lengths_m, strict=True)
         ]
-        rotor_inertia = np.array([joint.motor.armature_kg_m2 for joint in joints])
-        inertia = np.maximum(rotor_inertia + np.array(link_inertia[1:]), MIN_INERTIA_KG_M2)
-        viscous = np.array([joint.motor.viscous_nm_s_per_rad for joint in joints])
-        dry_nm = np.array([joint.motor.friction_nm for joint in joints]) + settings.drag_nm
-        self._velocity_per_nm = self.step_s / inertia  # velocity that 1 N·m adds in one step
-        self._viscous_factor = 1.0 / (1.0 + self._velocity_per_nm * viscous)
-        self._dry_loss_rad_s = self._velocity_per_nm * dry_nm  # velocity that dry friction takes in one step
+        rotor_inertias_kg_m2 = np.array([joint.motor.armature_kg_m2 for joint in joints])
+        inertias_kg_m2 = np.maximum(rotor_inertias_kg_m2 + np.array(link_inertias_kg_m2[1:]), MIN_INERTIA_KG_M2)
+        viscous_friction_nm_s_per_rad = np.array([joint.motor.viscous_nm_s_per_rad for joint in joints])
+        dry_friction_nm = np.array([joint.motor.friction_nm for joint in joints]) + settings.drag_nm
+        self._velocity_step_per_nm = self.step_s / inertias_kg_m2  # rad/s that 1 N·m adds in one step
+        self._viscous_damping_factor = 1.0 / (1.0 + self._velocity_step_per_nm * viscous_friction_nm_s_per_rad)
+        self._dry_friction_step_rad_s = (
+            self._velocity_step_per_nm * dry_friction_nm
+        )  # velocity that dry friction removes in one step
         self._lower_rad = np.array([joint.limits.lower_rad for joint in joints])
         self._upper_rad = np.array([joint.limits.upper_rad for joint in joints])
 
         # State.
-        self._angle_rad: Floats = np.array(find_start_pose(config).angles_rad, dtype=np.float64)
+        self._angle_rad: Floats = np.array(compute_start_pose(config).angles_rad, dtype=np.float64)
         self._velocity_rad_s = np.zeros(count)
         self._torque_nm = np.zeros(count)
         self._buffer = np.zeros(count)  # of intermediate results, so that a step allocates no memory
@@ -92,10 +95,10 @@ class InertiaModel(PhysicsModel):
         self._torque_nm[:] = torque_nm
 
         # Velocity.
-        np.multiply(torque_nm, self._velocity_per_nm, out=buffer)
+        np.multiply(torque_nm, self._velocity_step_per_nm, out=buffer)
         velocity_rad_s += buffer
-        velocity_rad_s *= self._viscous_factor
-        np.clip(velocity_rad_s, -self._dry_loss_rad_s, self._dry_loss_rad_s, out=buffer)
+        velocity_rad_s *= self._viscous_damping_factor
+        np.clip(velocity_rad_s, -self._dry_friction_step_rad_s, self._dry_friction_step_rad_s, out=buffer)
         velocity_rad_s -= buffer
 
         # Angle.
@@ -103,7 +106,7 @@ class InertiaModel(PhysicsModel):
         angle_rad += buffer
         np.clip(angle_rad, self._lower_rad, self._upper_rad, out=buffer)
         buffer -= angle_rad
-        if buffer.any():  # also for NaN
+        if buffer.any():  # a joint is beyond an end stop, or its angle is NaN
             self._stop_at_limits(buffer)
 
     @property
@@ -122,7 +125,7 @@ class InertiaModel(PhysicsModel):
         """Stop the joints beyond their end stops.
 
         Args:
-            correction_rad: (n_joints,) the way back to the end stop.
+            correction_rad: Angle back to the end stop for each joint, (n_joints,); 0 for joints within their travel.
 
         Raises:
             BackendError: An angle is not finite.

@@ -64,67 +64,69 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     """Whole backlash of the gear, between the encoder on the motor and the link. None: no backlash."""
 
 
-def build_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
-    """Return every joint with its drive and motor as they are in truth, from tail to head.
+def build_true_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
+    """Return every joint with the drive and motor that are really mounted, from tail to head.
 
     Args:
         robot: The robot as its file describes it.
-        mounted: What differs, by the name of the joint.
+        mounted: Differences between the real mounting and the robot file, by the name of the joint.
     """
     joints = robot.joint_table
     for i, joint in enumerate(joints):
-        truth = mounted.get(joint.name)
-        if truth is not None:
-            drive = msgspec.structs.replace(joint.drive, **_list_differences(truth, Drive))
-            motor = msgspec.structs.replace(joint.motor, **_list_differences(truth, Motor))
+        true_mounting = mounted.get(joint.name)
+        if true_mounting is not None:
+            drive = msgspec.structs.replace(joint.drive, **_collect_overrides(true_mounting, Drive))
+            motor = msgspec.structs.replace(joint.motor, **_collect_overrides(true_mounting, Motor))
             joints[i] = dataclasses.replace(joint, drive=drive, motor=motor)
     return joints
 
 
-def build_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
-    """Return the configuration of the physics model that the drives move: with motors as they are in truth.
+def build_true_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
+    """Return the configuration for the physics model that the drives move, with the motors that are really mounted.
 
     Args:
-        config: Configuration of the run, with the robot and the settings of its backend.
-        mounted: What differs, by the name of the joint.
+        config: Configuration of the run, with the robot as its file describes it.
+        mounted: Differences between the real mounting and the robot file, by the name of the joint.
     """
     joints = dict(config.robot.joints)
-    for name, truth in mounted.items():
-        differences = _list_differences(truth, Motor)
-        if differences:
+    for name, true_mounting in mounted.items():
+        overrides = _collect_overrides(true_mounting, Motor)
+        if overrides:
             exceptions = joints.get(name, JointExceptions())
-            joints[name] = msgspec.structs.replace(exceptions, **differences)
+            joints[name] = msgspec.structs.replace(exceptions, **overrides)
     robot = msgspec.structs.replace(config.robot, joints=joints)
     return msgspec.structs.replace(config, robot=robot)
 
 
-def _list_differences(truth: Mounted, section: type[Drive | Motor]) -> dict[str, Any]:
-    """Return the fields of a section that differ from the robot file, with their true values."""
+def _collect_overrides(true_mounting: Mounted, section: type[Drive | Motor]) -> dict[str, Any]:
+    """Return the true values of those fields of `Drive` or `Motor` that differ from the robot file."""
     common_fields = {*section.__struct_fields__} & {*Mounted.__struct_fields__}
-    true_values = msgspec.structs.asdict(truth)
+    true_values = msgspec.structs.asdict(true_mounting)
     return {field: value for field, value in true_values.items() if field in common_fields and value is not None}
 
 
-def check_mounted(robot: RobotFile, section: str, mounted: Mapping[str, Mounted], *, emulators: bool) -> None:
-    """Check the settings that mount emulated drives otherwise than the robot file describes.
+def validate_mounting_overrides(
+    robot: RobotFile, section: str, mounted: Mapping[str, Mounted], *, are_emulated: bool
+) -> None:
+    """Check the settings that override the mounting of drives in the robot file, for emulated drives.
 
     Args:
         robot: The robot as its file describes it.
-        section: Section of the settings, for messages.
-        mounted: The differences from the robot file, by the name of the joint.
-        emulators: Whether this process emulates the drives.
+        section: Dotted name of the settings section, used in error messages.
+        mounted: Differences between the real mounting of drives and the robot file, by the name of the joint.
+        are_emulated: Whether this process emulates the drives.
 
     Raises:
-        ConfigError: The robot does not have such a joint, or the drives are not emulated here.
+        ConfigError: A joint does not exist, or there are overrides although the drives are not emulated.
     """
-    names = [joint.name for joint in robot.joint_table]
+    joint_names = [joint.name for joint in robot.joint_table]  # from tail to head, joint_1 first
     for name in mounted:
-        if name not in names:
+        if name not in joint_names:
             raise ConfigError(
-                f"`{section}.mounted.{name}`: robot {robot.name!r} has {names[0]} to {names[-1]}",
+                f"`{section}.mounted.{name}`: robot {robot.name!r} has {joint_names[0]} to {joint_names[-1]}",
                 code="config/conflict",
             )
-    if mounted and not emulators:
+    if mounted and not are_emulated:
         raise ConfigError(
             f"`{section}.mounted` is for emulators; the modules on this bus are mounted as they are",
             code="config/conflict",

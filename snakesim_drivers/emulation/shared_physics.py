@@ -6,19 +6,19 @@ from typing import Any, Protocol
 
 import msgspec
 
-from snakesim_drivers.emulation.mounted import Mounted, build_config, build_joints
+from snakesim_drivers.emulation.mounted import Mounted, build_true_config, build_true_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
-from snakesim_hal.model.plugins import PHYSICS_MODELS, find_plugin, plugin_settings, require_base_class
+from snakesim_hal.model.plugins import PHYSICS_MODELS, decode_plugin_settings, load_plugin, require_base_class
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.backlash import BacklashModel, without_rotors
+from snakesim_hal.physics.backlash import BacklashModel, move_rotors_behind_gears
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.physics.thermal import Thermal
 
-HEAT_DECIMATION = 10  # physics steps from one step of the windings' heat to the next: they heat up slowly
-MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process the drives skip the rest of it
-STEP_ROUNDING = 0.49  # a step is simulated as soon as all of it but so much has passed: clocks are rounded
-POSE_SLACK_US = 1.0  # a pose is captured so long before it is due at the earliest: clocks are rounded
+THERMAL_DECIMATION = 10  # physics steps from one step of the windings' heat to the next: they heat up slowly
+MAX_CATCH_UP_US = 200_000.0  # after a longer delay of this process the drives skip the rest of it
+STEP_COUNT_TOLERANCE = 0.49  # a step is simulated as soon as all of it but so much has passed: clocks are rounded
+POSE_TIME_TOLERANCE_US = 1.0  # a pose is captured so long before it is due at the earliest: clocks are rounded
 
 
 class PhysicsSettings(Protocol):
@@ -41,12 +41,12 @@ class PhysicsSettings(Protocol):
 
 
 def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: str) -> PhysicsModel:
-    """Create the physics model behind emulated drives, with the drives mounted as the settings name it.
+    """Create the physics model that emulated drives move, with the drives mounted as the settings say.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
-        settings: The backend's settings, which name the physics model.
-        backend: Name of the backend, for messages.
+        settings: Settings of the backend, which name the physics model.
+        backend: Name of the backend, used in error messages.
 
     Returns:
         The model, with backlash in the gears if the settings name any.
@@ -54,17 +54,17 @@ def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: st
     Raises:
         ConfigError: There is no such physics model, or it does not accept its settings.
     """
-    model_type = find_plugin(PHYSICS_MODELS, settings.physics_model)
+    model_type = load_plugin(PHYSICS_MODELS, settings.physics_model)
     label = f"physics_model {settings.physics_model!r}"
     require_base_class(model_type, PhysicsModel, label)
     section = f"backends.{backend}.physics_model_settings"
-    model_settings = plugin_settings(model_type, settings.physics_model_settings, label, section)
-    true_config = build_config(config, settings.mounted)
+    model_settings = decode_plugin_settings(model_type, settings.physics_model_settings, label, section)
+    true_config = build_true_config(config, settings.mounted)
     backlash_rad = {name: mounted.backlash_rad for name, mounted in settings.mounted.items() if mounted.backlash_rad}
     if not backlash_rad:
         return model_type(true_config, model_settings)
-    joints = build_joints(config.robot, settings.mounted)
-    links = model_type(without_rotors(true_config, joints, backlash_rad), model_settings)
+    joints = build_true_joints(config.robot, settings.mounted)
+    links = model_type(move_rotors_behind_gears(true_config, joints, backlash_rad), model_settings)
     return BacklashModel(links, joints, backlash_rad, config.seed)
 
 
@@ -78,38 +78,39 @@ class SharedPhysics:
         mounted: Mapping[str, Mounted],
         send_pose: Callable[[bytes], None] | None,
     ) -> None:
-        """Begin at time 0, with all motors passive.
+        """Create the physics at time 0, with all motors passive.
 
         Args:
             config: Configuration of the run, with the robot and the settings of its backend.
-            physics_model: The physics model that the motors move.
-            mounted: How drives are mounted in truth, where that differs from the robot file; by the joint's name.
-            send_pose: Gets a datagram of motion capture in every control period; None: no motion capture.
+            physics_model: Physics model that the motors move.
+            mounted: Differences between the real mounting of drives and the robot file, by the name of the joint.
+            send_pose: Function that sends a datagram of motion capture, in every control period; None if there is no
+                motion capture.
         """
         # Physics.
         self.physics_model = physics_model
-        self.joints = build_joints(config.robot, mounted)
-        self.motors = Motors(build_config(config, mounted).robot, physics_model.step_s)
+        self.joints = build_true_joints(config.robot, mounted)
+        self.motors = Motors(build_true_config(config, mounted).robot, physics_model.step_s)
         self.thermal = Thermal(self.joints)
 
         # Time.
         self.now_us = 0.0  # since the start
         self.step_callbacks: list[Callable[[float], None]] = []
         self._step_us = physics_model.step_s * 1e6
-        self._steps = 0
+        self._step_count = 0
         self._skipped_us = 0.0  # by which the clock is ahead of the physics
 
         # Injected faults.
-        self.boots_until_us = [0.0] * len(self.joints)
+        self.boot_end_us = [0.0] * len(self.joints)
         self.muted: set[int] = set()
-        self.undervolted: set[int] = set()
+        self.undervoltage_joints: set[int] = set()
         self.duplicated: set[int] = set()
 
         # Held by emulators while they act, because those of several buses may be in threads.
         self.lock = threading.RLock()
 
         # Motion capture.
-        self._send_pose = send_pose
+        self._send_pose_datagram = send_pose
         self._period_us = config.period_ns / 1000
         self._next_pose_us = 0.0
         self._camera: PoseCamera | None = None
@@ -123,40 +124,47 @@ class SharedPhysics:
         return clock_us - self._skipped_us - self.now_us
 
     def advance_to(self, clock_us: float) -> None:
-        """Simulate up to a time of the clock. After a long delay of this process, a part of it is skipped."""
-        if self.measure_lag_us(clock_us) > MAX_AT_ONCE_US:
-            self._skipped_us = clock_us - self.now_us - MAX_AT_ONCE_US
+        """Simulate up to a time of the clock, and capture a pose if one is due.
+
+        After a long delay of this process, a part of the delay is skipped.
+
+        Args:
+            clock_us: Time since the emulators were started.
+        """
+        if self.measure_lag_us(clock_us) > MAX_CATCH_UP_US:
+            self._skipped_us = clock_us - self.now_us - MAX_CATCH_UP_US
         until_us = clock_us - self._skipped_us
-        due_steps = round(until_us / self._step_us - STEP_ROUNDING)
-        for _ in range(due_steps - self._steps):
+        due_step_count = round(until_us / self._step_us - STEP_COUNT_TOLERANCE)
+        for _ in range(due_step_count - self._step_count):
             self._step()
         self._capture_pose()
 
     def _step(self) -> None:
+        """Advance motors, physics model and temperatures by one step, and call all step callbacks."""
         model = self.physics_model
-        model.advance(self.motors.step(model.angle_rad, model.velocity_rad_s))
-        self._steps += 1
-        self.now_us = self._steps * self._step_us
-        if self._steps % HEAT_DECIMATION == 0:
-            self._warm_windings()
+        model.advance(self.motors.compute_torques(model.angle_rad, model.velocity_rad_s))
+        self._step_count += 1
+        self.now_us = self._step_count * self._step_us
+        if self._step_count % THERMAL_DECIMATION == 0:
+            self._update_motor_temperatures()
         for callback in self.step_callbacks:
             callback(self.now_us)
 
-    def _warm_windings(self) -> None:
-        """Let the heat of the last steps act, and derate hot motors."""
-        duration_s = HEAT_DECIMATION * self.physics_model.step_s
-        self.thermal.pass_time(duration_s, self.motors.pop_mean_square_torque())
-        remaining_fraction = self.thermal.remaining_fraction()
+    def _update_motor_temperatures(self) -> None:
+        """Heat the windings by the losses of the last steps, and derate hot motors."""
+        duration_s = THERMAL_DECIMATION * self.physics_model.step_s
+        self.thermal.advance_temperatures(duration_s, self.motors.pop_mean_square_torque())
+        remaining_fraction = self.thermal.compute_remaining_fractions()
         if remaining_fraction is not None:
-            self.motors.derate(remaining_fraction)
+            self.motors.apply_derating(remaining_fraction)
 
     def _capture_pose(self) -> None:
         """Capture and send a pose if one is due."""
-        if self._camera is None or self._send_pose is None:
+        if self._camera is None or self._send_pose_datagram is None:
             return
-        if self.now_us < self._next_pose_us - POSE_SLACK_US:
+        if self.now_us < self._next_pose_us - POSE_TIME_TOLERANCE_US:
             return
         self._next_pose_us += self._period_us
         sample = self._camera.capture(round(self.now_us * 1000))
         if sample is not None:
-            self._send_pose(msgspec.json.encode(sample))
+            self._send_pose_datagram(msgspec.json.encode(sample))

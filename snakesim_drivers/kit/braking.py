@@ -9,52 +9,58 @@ from collections.abc import Sequence
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Mode
 
-AT_REST_RAD_S = 0.05  # the limit that joint modules have
+AT_REST_SPEED_RAD_S = 0.05  # the limit that joint modules have
 
 
 class Braking:
     """The joints that still brake in a fault, by their indices in the robot."""
 
-    def __init__(self, limits_ns: Sequence[int], *, holds: bool) -> None:
-        """Begin without a fault.
+    def __init__(self, max_braking_durations_ns: Sequence[int], *, is_hold_mode: bool) -> None:
+        """Create the braking state of all joints, before any fault.
 
         Args:
-            limits_ns: Maximum braking time of every joint.
-            holds: True if the stop mode is `hold`, which has no end.
+            max_braking_durations_ns: Maximum braking time of every joint, from tail to head.
+            is_hold_mode: True if the stop mode is `hold`, in which joints are held until the operator's reset.
         """
-        self._limits_ns = limits_ns
-        self._holds = holds
-        self._start_ns: int | None = None  # of the present fault
-        self._finished: set[int] = set()  # joints that have braked in it
+        self._max_braking_durations_ns = max_braking_durations_ns
+        self._is_hold_mode = is_hold_mode
+        self._fault_start_ns: int | None = (
+            None  # driver time of the first cycle of the current fault; None without a fault
+        )
+        self._stopped_joints: set[int] = set()  # joints that have finished braking in the current fault
 
     def reset(self) -> None:
-        """Note that the robot is not in a fault, so that the next fault starts from the beginning."""
-        self._start_ns = None
-        self._finished.clear()
+        """Forget the braking of the last fault, because the robot is not in a fault now."""
+        self._fault_start_ns = None
+        self._stopped_joints.clear()
 
     def select_braking_joints(
-        self, following: frozenset[int], modes: Sequence[Mode], velocity_rad_s: Floats, now_ns: int
+        self, driven_joints: frozenset[int], modes: Sequence[Mode], velocity_rad_s: Floats, now_ns: int
     ) -> frozenset[int]:
-        """Return those of the following joints that continue to brake in this control cycle of a fault.
+        """Return the joints that continue to brake in this control cycle of a fault, and remember those that are done.
 
-        A joint stops braking when it is slow enough or its time is over, and does not begin again.
+        A joint is done when it is slow enough, its braking time is over, or its setpoint is passive. It does not brake
+        again in the same fault. Call it once in each control cycle of a fault.
 
         Args:
-            following: Joints that have got setpoints until now.
-            modes: Mode of every joint's setpoint in the stop mode. A passive joint does not brake.
-            velocity_rad_s: (n_joints,) measured velocities.
-            now_ns: The driver's time.
-        """
-        if self._start_ns is None:
-            self._start_ns = now_ns
-        duration_ns = now_ns - self._start_ns
-        for i in following:
-            speed_rad_s = abs(float(velocity_rad_s[i]))
-            if modes[i] == Mode.PASSIVE or self._is_over(i, speed_rad_s, duration_ns):
-                self._finished.add(i)
-        return following - self._finished
+            driven_joints: Indices of the joints that got setpoints in the last cycle.
+            modes: Mode of every joint's setpoint in the stop mode, from tail to head. A passive joint does not brake.
+            velocity_rad_s: Measured joint velocities, (n_joints,).
+            now_ns: Current time of the driver.
 
-    def _is_over(self, i: int, speed_rad_s: float, duration_ns: int) -> bool:
-        if self._holds:
+        Returns:
+            Indices of the joints that still need setpoints.
+        """
+        if self._fault_start_ns is None:
+            self._fault_start_ns = now_ns
+        braking_duration_ns = now_ns - self._fault_start_ns
+        for i in driven_joints:
+            speed_rad_s = abs(float(velocity_rad_s[i]))
+            if modes[i] == Mode.PASSIVE or self._has_stopped_braking(i, speed_rad_s, braking_duration_ns):
+                self._stopped_joints.add(i)
+        return driven_joints - self._stopped_joints
+
+    def _has_stopped_braking(self, i: int, speed_rad_s: float, braking_duration_ns: int) -> bool:
+        if self._is_hold_mode:
             return False
-        return speed_rad_s < AT_REST_RAD_S or duration_ns >= self._limits_ns[i]
+        return speed_rad_s < AT_REST_SPEED_RAD_S or braking_duration_ns >= self._max_braking_durations_ns[i]

@@ -15,7 +15,8 @@ from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.joints import Joint
 
-MAX_GAP_WATCHDOGS = 0.5  # a longer pause, as a fraction of the watchdog's time, may have let watchdogs expire
+# After a longer pause of the driver, as a fraction of the watchdog timeout, watchdogs of drives may have expired.
+MAX_PAUSE_WATCHDOG_FRACTION = 0.5
 MAX_READS_AFTER_PAUSE = 3  # the computer may pause again while the states are read
 
 
@@ -27,7 +28,7 @@ class BusSpec:
     joints: tuple[int, ...]  # indices in the robot
     open: Callable[[DriveReadings], Drives]  # gets the readings of these drives; raises ConfigError and BackendError
     decimation: int = 1  # control cycles from one reading of this bus to the next
-    watchdog_s: float = 0.1  # of its drives
+    watchdog_s: float = 0.1  # watchdog timeout of its drives
 
 
 class InlineBus:
@@ -38,25 +39,28 @@ class InlineBus:
 
         Args:
             spec: The bus, with its joints, its watchdog time, and the function that opens it.
-            joints: All joints of the robot.
-            clock_ns: Returns the driver's time.
+            joints: All joints of the robot, from tail to head.
+            clock_ns: Function that returns the driver's time in ns.
             period_ns: Duration of the robot's control cycle.
 
         Raises:
-            ConfigError: the settings do not suit the bus.
-            BackendError: the bus cannot be opened.
+            ConfigError: The settings do not suit the bus.
+            BackendError: The bus cannot be opened.
         """
         self.spec = spec
         self.readings = DriveReadings([joints[j] for j in spec.joints], clock_ns)
         self.drives = spec.open(self.readings)
-        self.last_selection: tuple[frozenset[int], bool, bool] | None = None  # following, may_enable, emergency
-        self.injected_delay_s = 0.0  # of every reading; only a bus in a thread can be slow
+        # (enabled drives, may_enable, emergency) of the newest command; None before the first one.
+        self.last_sent_selection: tuple[frozenset[int], bool, bool] | None = None
+        self.injected_delay_s = 0.0  # injected delay of every reading; only a `ThreadedBus` uses it
 
-        gap_ns = round(MAX_GAP_WATCHDOGS * spec.watchdog_s * 1e9)
-        grace_ns = RESET_GRACE_CYCLES * spec.decimation * period_ns
-        self._gap_ns = gap_ns
-        self._guard = DriveGuard(clock_ns, gap_ns=gap_ns, grace_ns=grace_ns)
-        self._early_findings: list[Finding] = []  # found after a pause, before any setpoint was sent
+        max_pause_ns = round(MAX_PAUSE_WATCHDOG_FRACTION * spec.watchdog_s * 1e9)
+        reset_grace_period_ns = RESET_GRACE_CYCLES * spec.decimation * period_ns
+        self._max_pause_ns = max_pause_ns
+        self._guard = DriveGuard(
+            clock_ns, watchdog_timeout_ns=max_pause_ns, reset_grace_period_ns=reset_grace_period_ns
+        )
+        self._findings_after_pause: list[Finding] = []  # found after a pause, before any setpoint was sent
 
     def start(self) -> None:
         """Prepare for control cycles. Called in each of them."""
@@ -67,30 +71,32 @@ class InlineBus:
             self._read_drives()
         return True
 
-    def wait_for_reading(self, slices: int) -> int:
+    def wait_for_reading(self, remaining_slices: int) -> int:
         """Wait until the requested reading is complete.
 
         Args:
-            slices: Slices of time that the host can still wait.
+            remaining_slices: Number of time slices that the host can still wait in this control cycle.
 
         Returns:
-            The slices that are left.
+            The number of time slices that are left afterwards.
         """
-        return slices
+        return remaining_slices
 
     def copy_readings_to(self, robot_readings: DriveReadings) -> None:
         """Copy the last readings of this bus into those of the robot.
 
         Raises:
-            BackendError: the bus has failed.
+            BackendError: The bus has failed.
         """
         robot_readings.copy_from(self.readings, self.spec.joints)
 
     def send(self, command: BusCommand) -> None:
         """Send setpoints. They replace earlier ones that are not sent yet."""
         self._recover_from_pause()
-        following = self._guard.drives_to_command(self._select_ready(command), may_enable=command.may_enable)
-        self.drives.send_setpoints(command._replace(following=following))
+        enabled_drives = self._guard.select_drives_to_enable(
+            self._select_ready_drives(command), may_enable=command.may_enable
+        )
+        self.drives.send_setpoints(command._replace(enabled_drives=enabled_drives))
 
     def reset_faults(self, joints: frozenset[int]) -> None:
         """Clear the errors of these drives before the next setpoints are sent."""
@@ -108,7 +114,7 @@ class InlineBus:
         """Return what is wrong with the drives and the bus.
 
         Raises:
-            BackendError: the bus has failed.
+            BackendError: The bus has failed.
         """
         return self._collect_findings()
 
@@ -122,7 +128,7 @@ class InlineBus:
             deadline_s: Time of `time.monotonic` after which a bus that hangs is left alone.
 
         Raises:
-            BackendError: the bus cannot be closed.
+            BackendError: The bus cannot be closed.
         """
         del deadline_s
         self.drives.close()
@@ -130,55 +136,63 @@ class InlineBus:
     # --- for the thread that operates the bus -----------------------------------------------------------------
 
     def _recover_from_pause(self) -> bool:
-        """Read the drives after a pause of the driver, to find those that have stopped meanwhile.
+        """Read all drives if the driver was paused for so long that watchdogs of drives may have expired.
 
-        A stop that a drive has latched would be lost with the next command that switches it off or clears its errors.
+        The states have to be read before anything is sent: the next command that switches a drive off or clears its
+        errors would also clear a stop that the drive has latched during the pause. What is found is stored, and
+        returned by the next call of `findings`.
 
         Returns:
-            True if there was a pause, and the drives were read.
+            True if there was a pause and the drives were read; False if nothing was done.
         """
         self._guard.mark_active()
-        if not self._guard.was_away:
+        if not self._guard.was_paused:
             return False
         for _ in range(MAX_READS_AFTER_PAUSE):
             self._guard.mark_states_read()
-            self.drives.poll()  # drops what drives sent before the pause: it does not tell their present state
+            self.drives.poll()  # drops what drives sent before the pause: it does not show their current state
             self.readings.require_check(range(len(self.spec.joints)))
             self._read_drives()
             self._guard.mark_active()
-            if not self._guard.was_away:
+            if not self._guard.was_paused:
                 break
-        self._early_findings = self._collect_findings()
+        self._findings_after_pause = self._collect_findings()
         return True
 
     def _read_drives(self) -> None:
-        """Read all drives. Drives that have been silent for long get a request for their state as well."""
-        silent = [i for i in range(len(self.spec.joints)) if self.readings.age_ns(i) > self._gap_ns]
-        self.readings.require_check(silent)
-        self.readings.count_request()
+        """Read all drives, and request also the states of those that were silent for long; continue their start-up."""
+        silent_drives = [
+            i for i in range(len(self.spec.joints)) if self.readings.compute_age_ns(i) > self._max_pause_ns
+        ]
+        self.readings.require_check(silent_drives)
+        self.readings.start_request()
         self.drives.read()
         if self.drives.start_up is not None:
             self.drives.start_up.update()
         self._guard.mark_active()
 
-    def _select_ready(self, command: BusCommand) -> frozenset[int]:
-        """Return the followers of a command whose drives are ready. An emergency stop ends the steps under way."""
+    def _select_ready_drives(self, command: BusCommand) -> frozenset[int]:
+        """Return the drives that a command enables and whose start-up is finished.
+
+        An emergency stop aborts all start-up steps that are in progress.
+        """
         start_up = self.drives.start_up
         if start_up is None:
-            return command.following
+            return command.enabled_drives
         if command.emergency:
             start_up.abort("emergency stop")
-        return frozenset(i for i in command.following if start_up.is_ready(i))
+        return frozenset(i for i in command.enabled_drives if start_up.is_ready(i))
 
     def _collect_findings(self) -> list[Finding]:
-        findings = [*self._early_findings, *self.drives.findings()]
+        """Return what is wrong with the drives and the bus, and keep the concerned drives off until a reset."""
+        findings = [*self._findings_after_pause, *self.drives.findings()]
         if self.drives.start_up is not None:
             findings += self.drives.start_up.findings()
-        self._early_findings = []
+        self._findings_after_pause = []
         self._guard.note_findings(findings)
         return findings
 
 
-def bus_findings(findings: list[Finding]) -> list[Finding]:
-    """Return the findings that concern a bus as a whole rather than one drive."""
+def select_bus_findings(findings: list[Finding]) -> list[Finding]:
+    """Return those findings that concern the bus as a whole rather than one drive."""
     return [finding for finding in findings if finding.joint is None]

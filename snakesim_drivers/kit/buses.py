@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from snakesim_drivers.kit.bus import BusSpec, InlineBus
-from snakesim_drivers.kit.drive_settings import answer_limit_s
+from snakesim_drivers.kit.drive_settings import compute_response_timeout_s
 from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
@@ -19,8 +19,10 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig
 
-MAX_WAIT_ANSWER_LIMITS = 1.2  # the host's wait for a bus, in answer limits of its drives: the bus itself takes time too
-CLOSE_LIMIT_S = 2.0  # for all buses together, before those that hang are left
+MAX_WAIT_RESPONSE_TIMEOUTS = (
+    1.2  # the host's wait for a bus, in answer limits of its drives: the bus itself takes time too
+)
+CLOSE_TIMEOUT_S = 2.0  # for all buses together, before those that hang are left
 
 
 class Buses(Drives):
@@ -32,7 +34,7 @@ class Buses(Drives):
         readings: DriveReadings,
         specs: Sequence[BusSpec],
         clock_ns: Callable[[], int],
-        pass_time: Callable[[int], None] | None = None,
+        advance_time: Callable[[int], None] | None = None,
     ) -> None:
         """Open all buses of a robot; if one cannot be opened, close the others.
 
@@ -40,17 +42,18 @@ class Buses(Drives):
             config: Configuration of the run, with the robot and the settings of its backend.
             readings: The readings of the whole robot, which this object fills.
             specs: The buses, which together have every joint once.
-            clock_ns: Returns the driver's time.
-            pass_time: In lockstep, lets the driver's time pass by some ns, for start-up; None: time passes by itself.
+            clock_ns: Function that returns the driver's time in ns.
+            advance_time: Function that advances the driver's time by a number of ns, for the start-up in lockstep.
+                None if time passes by itself.
 
         Raises:
-            ConfigError: the settings do not suit a bus.
-            BackendError: a bus cannot be opened.
+            ConfigError: The settings do not suit a bus.
+            BackendError: A bus cannot be opened.
         """
         self._readings = readings
-        self._pass_time = pass_time
+        self._advance_time = advance_time
         self._period_ns = config.period_ns
-        self._cycles = 0
+        self._cycle_count = 0
         self.buses: list[InlineBus] = []
         try:
             for spec in specs:
@@ -72,8 +75,8 @@ class Buses(Drives):
             lines = [line for error in errors for line in error.lines]
             distinct_lines = dict.fromkeys(lines)
             raise BackendError(*distinct_lines, code=errors[0].code)
-        if self._pass_time is not None:
-            self._run_start_up(self._pass_time)
+        if self._advance_time is not None:
+            self._run_start_up(self._advance_time)
         for bus in self.buses:
             self._readings.copy_from(bus.readings, bus.spec.joints)
 
@@ -84,41 +87,44 @@ class Buses(Drives):
             bus.start()
             if self._is_due(bus) and bus.request_reading():
                 requested.append(bus)
-        slices = WAIT_SLICES
+        remaining_slices = WAIT_SLICES
         for bus in requested:
-            slices = bus.wait_for_reading(slices)
+            remaining_slices = bus.wait_for_reading(remaining_slices)
         for bus in self.buses:
             bus.copy_readings_to(self._readings)
 
     def send_setpoints(self, command: BusCommand) -> None:
-        """Send setpoints on all buses that are due in this cycle, and at once where drives begin to follow or stop.
+        """Send setpoints on all buses that are due in this cycle, and on buses whose set of enabled drives changes.
+
+        A change does not wait for the decimation of the bus, so that drives are stopped at once. The end of this call
+        is the end of the control cycle.
 
         Args:
-            command: Setpoints of all joints of the robot, and which of them follow.
+            command: Setpoints of all joints of the robot, and which of their drives are enabled.
         """
         for bus in self.buses:
             joints = list(bus.spec.joints)
-            following_here = _local_indices(bus, command.following)
-            selection = (following_here, command.may_enable, command.emergency)
-            if self._is_due(bus) or bus.last_selection != selection:
-                bus.last_selection = selection
-                command_here = BusCommand(
-                    following=following_here,
+            enabled_on_bus = _to_bus_indices(bus, command.enabled_drives)
+            selection = (enabled_on_bus, command.may_enable, command.emergency)
+            if self._is_due(bus) or bus.last_sent_selection != selection:
+                bus.last_sent_selection = selection
+                bus_command = BusCommand(
+                    enabled_drives=enabled_on_bus,
                     modes=[command.modes[j] for j in joints],
                     targets=command.targets[joints],
                     limits_nm=command.limits_nm[joints],
                     may_enable=command.may_enable,
                     emergency=command.emergency,
                 )
-                bus.send(command_here)
-        self._cycles += 1
+                bus.send(bus_command)
+        self._cycle_count += 1
 
     def reset_faults(self, joints: frozenset[int]) -> None:
         """Clear the errors of these joints' drives, each on its bus."""
         for bus in self.buses:
-            joints_here = _local_indices(bus, joints)
-            if joints_here:
-                bus.reset_faults(joints_here)
+            joints_on_bus = _to_bus_indices(bus, joints)
+            if joints_on_bus:
+                bus.reset_faults(joints_on_bus)
 
     def findings(self) -> list[Finding]:
         """Return what is wrong on all buses, with joints numbered as in the robot."""
@@ -137,10 +143,13 @@ class Buses(Drives):
             bus.poll()
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault of a bus, by its number in the robot, or of a drive on a bus.
+        """Start or end an injected fault of a bus, by its number in the robot, or of a drive on a bus.
 
         Returns:
-            Whether this fault can be injected here; False for real drives, and for an unknown target.
+            True if the fault can be injected here; False for real drives and for an unknown joint.
+
+        Raises:
+            ConfigError: The robot has no bus of this number.
         """
         match injection.target_type:
             case "bus":
@@ -151,36 +160,39 @@ class Buses(Drives):
                 return False
 
     def close(self) -> None:
-        """Close all buses. None waits for another that hangs.
+        """Close all buses within a common time limit. A bus that hangs does not delay the other ones.
 
         Raises:
-            BackendError: a bus cannot be closed.
+            BackendError: A bus cannot be closed.
         """
         for bus in self.buses:
             bus.request_close()
-        deadline_s = time.monotonic() + CLOSE_LIMIT_S
+        deadline_s = time.monotonic() + CLOSE_TIMEOUT_S
         with contextlib.ExitStack() as closing:
             for bus in self.buses:
                 closing.callback(bus.close, deadline_s)
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _run_start_up(self, pass_time: Callable[[int], None]) -> None:
-        """In lockstep, run the start-up of all drives to its end: later their time is paused until the robot is armed.
+    def _run_start_up(self, advance_time: Callable[[int], None]) -> None:
+        """Run the start-up of all drives to its end, in lockstep: later, time is paused until the robot is armed.
 
         A drive whose start-up fails is not ready, as in real time.
+
+        Args:
+            advance_time: Function that advances the driver's time by a number of ns.
         """
         while any(bus.drives.start_up is not None and bus.drives.start_up.can_continue() for bus in self.buses):
-            pass_time(self._period_ns)
+            advance_time(self._period_ns)
             for bus in self.buses:
                 bus.request_reading()
                 bus.poll()
 
     def _is_due(self, bus: InlineBus) -> bool:
-        return self._cycles % bus.spec.decimation == 0
+        return self._cycle_count % bus.spec.decimation == 0
 
     def _inject_into_bus(self, injection: Injection, *, begins: bool) -> bool:
-        number = injection.number
+        number = injection.target_index
         if not 0 <= number < len(self.buses):
             raise ConfigError(
                 f"there is no {injection.target}; this robot has bus_1 to bus_{len(self.buses)}",
@@ -191,13 +203,13 @@ class Buses(Drives):
             delay_s = injection.amount or 0.0
             bus.injected_delay_s = delay_s if begins else 0.0
             return True
-        only_bus = replace(injection, target="bus_1")  # its `Drives` know no other
-        return bus.drives.inject(only_bus, begins=begins)
+        local_injection = replace(injection, target="bus_1")  # `Drives` number their own bus 1
+        return bus.drives.inject(local_injection, begins=begins)
 
     def _inject_into_drive(self, injection: Injection, *, begins: bool) -> bool:
         for bus in self.buses:
-            if injection.number in bus.spec.joints:
-                local_number = bus.spec.joints.index(injection.number) + 1
+            if injection.target_index in bus.spec.joints:
+                local_number = bus.spec.joints.index(injection.target_index) + 1  # targets count from 1
                 return bus.drives.inject(replace(injection, target=f"joint_{local_number}"), begins=begins)
         return False
 
@@ -206,10 +218,10 @@ def _open_bus(config: RunConfig, spec: BusSpec, clock_ns: Callable[[], int]) -> 
     joints = config.robot.joint_table
     if config.clock_mode == "lockstep":
         return InlineBus(spec, joints, clock_ns, config.period_ns)
-    max_wait_s = MAX_WAIT_ANSWER_LIMITS * answer_limit_s(config)
+    max_wait_s = MAX_WAIT_RESPONSE_TIMEOUTS * compute_response_timeout_s(config)
     return ThreadedBus(spec, joints, clock_ns, config.period_ns, config.lease_ns, max_wait_s)
 
 
-def _local_indices(bus: InlineBus, joints: frozenset[int]) -> frozenset[int]:
-    """Return the indices on a bus of those of the robot's joints that are on it."""
+def _to_bus_indices(bus: InlineBus, joints: frozenset[int]) -> frozenset[int]:
+    """Convert joint indices of the robot to indices on a bus, without the joints that are on other buses."""
     return frozenset(i for i, joint in enumerate(bus.spec.joints) if joint in joints)

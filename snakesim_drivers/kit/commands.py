@@ -15,23 +15,23 @@ DRIVE_NOUNS: Commands = (
 
 
 def add_channel(parser: argparse.ArgumentParser, about: str) -> None:
-    """Add `--channel`, the bus of emulated drives. about: for the help."""
+    """Add the option `--channel`, the bus of emulated drives; `about` is its help text."""
     parser.add_argument("--channel", action="append", metavar="CHANNEL", help=f"{about} (may be repeated)")
 
 
 def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
-    """Add the buses to scan. about: for the help."""
+    """Add the arguments of a scan: the buses, with `about` as their help text, and `--json`."""
     parser.add_argument("channel", nargs="+", metavar="CHANNEL", help=about)
     add_json(parser)
 
 
 def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = None) -> None:
-    """Add `--pose`, for emulated motion capture. about: more text for the help."""
+    """Add the option `--pose`, the receiver of emulated motion capture; `about` is added to its help text."""
     parser.add_argument("--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})")
 
 
 def add_emulation(parser: argparse.ArgumentParser, channel_about: str) -> None:
-    """Add the arguments of an emulator of drives. channel_about: for the help of `--channel`."""
+    """Add all arguments of a command that emulates drives; `channel_about` is the help text of `--channel`."""
     add_scenario_name(parser)
     add_channel(parser, channel_about)
     add_set(parser)

@@ -6,20 +6,20 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody
-from snakesim_drivers.emulation.mounted import Mounted, check_mounted
+from snakesim_drivers.emulation.mounted import Mounted, validate_mounting_overrides
 from snakesim_drivers.emulation.shared_physics import SharedPhysics, make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
-from snakesim_drivers.motion_capture.mocap import check_pose
+from snakesim_drivers.motion_capture.mocap import validate_pose_settings
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_plan import check_backend_can
+from snakesim_hal.model.fault_plan import validate_faults_for_backend
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
-ANSWER_PERIODS = 0.5  # control cycles that drives have for an answer: the rest is for the controller
-LOCKSTEP_ANSWER_S = 2.0  # robot time does not pass while the driver waits, so a busy computer changes nothing
-MIN_WATCHDOG_PERIODS = 2.2  # setpoint periods in a watchdog's time: one lost setpoint must not stop a drive
-MIN_LEASE_ROUNDS = 1.5  # readings of a bus in a lease: its joint states have to be younger than a lease
+RESPONSE_TIMEOUT_PERIODS = 0.5  # control periods that a bus waits for responses: the rest is for the controller
+LOCKSTEP_RESPONSE_TIMEOUT_S = 2.0  # robot time does not pass while the driver waits, so a busy computer changes nothing
+MIN_WATCHDOG_PERIODS = 2.2  # watchdog timeout in setpoint periods: one lost setpoint must not stop a drive
+MIN_LEASE_ROUNDS = 1.5  # duration of a lease in readings of a bus: joint states have to be younger than a lease
 
 
 class BodySettings(FileStruct, frozen=True, kw_only=True):
@@ -51,123 +51,141 @@ class DriveSettings(BodySettings, frozen=True, kw_only=True):
     """Control cycles from one reading of a bus to the next."""
 
 
-def make_body(config: RunConfig, settings: BodySettings, backend: str, pose_address: str | None) -> EmulatedBody:
-    """Create the body that the emulated drives of a whole robot move.
+def make_emulated_body(
+    config: RunConfig, settings: BodySettings, backend: str, pose_address: str | None
+) -> EmulatedBody:
+    """Create the physics body that the emulated drives of a whole robot move.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
-        settings: The settings of the backend.
-        backend: The backend's name.
-        pose_address: HOST:PORT to which its emulated motion capture sends; None: it does not send.
+        settings: Settings of the backend.
+        backend: Name of the backend.
+        pose_address: HOST:PORT to which emulated motion capture sends poses; None if it does not send.
 
     Raises:
-        ConfigError: the physics model is unknown, or the address is malformed.
+        ConfigError: The physics model is unknown, or the address is malformed.
     """
     physics_model = make_physics_model(config, settings, backend)
-    send_pose = PoseSender(pose_address) if pose_address else None
-    physics = SharedPhysics(config, physics_model, settings.mounted, send_pose)
+    pose_sender = PoseSender(pose_address) if pose_address else None
+    physics = SharedPhysics(config, physics_model, settings.mounted, pose_sender)
     return EmulatedBody(physics, range(config.robot.chain.modules))
 
 
-def check_body(
-    config: RunConfig, settings: BodySettings, *, emulators: bool, buses: int, bus_faults: Collection[str] = ()
+def validate_body_settings(
+    config: RunConfig,
+    settings: BodySettings,
+    *,
+    are_emulated: bool,
+    bus_count: int,
+    bus_fault_kinds: Collection[str] = (),
 ) -> None:
-    """Check the settings that all drive types share: motion capture, mounting and injected faults.
+    """Check the settings that all driver types share: motion capture, mounting and injected faults.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
-        settings: The settings of the backend.
-        emulators: Whether this process emulates the drives.
-        buses: Number of buses that the settings name.
-        bus_faults: Kinds of faults that can be injected into these buses.
+        settings: Settings of the backend.
+        are_emulated: Whether this process emulates the drives.
+        bus_count: Number of buses that the settings name; 0 if the drives are emulated in this process.
+        bus_fault_kinds: Kinds of faults that can be injected into these buses, such as "cut".
 
     Raises:
-        ConfigError: a setting or a fault does not suit the robot.
+        ConfigError: A setting or an injected fault does not suit the robot.
     """
-    check_pose(config, settings.pose_listen)
-    check_mounted(config.robot, config.backend_section, settings.mounted, emulators=emulators)
-    possible_faults = {*bus_faults}
-    if emulators:
-        possible_faults |= {*FAULTS}
-        because = f"its emulated drives know {', '.join(FAULTS)}"
+    validate_pose_settings(config, settings.pose_listen)
+    validate_mounting_overrides(config.robot, config.backend_section, settings.mounted, are_emulated=are_emulated)
+    possible_fault_kinds = {*bus_fault_kinds}
+    if are_emulated:
+        possible_fault_kinds |= {*FAULTS}
+        reason = f"its emulated drives know {', '.join(FAULTS)}"
     else:
-        because = "its drives are not emulated in its process"
-    if config.clock_mode == "lockstep" and emulators:
-        because += "; and in lockstep no bus is slow"
+        reason = "its drives are not emulated in its process"
+    if config.clock_mode == "lockstep" and are_emulated:
+        reason += "; and in lockstep no bus is slow"
     else:
-        possible_faults.add("slow")
-    check_backend_can(config, does=possible_faults, buses=max(buses, 1), because=because)
+        possible_fault_kinds.add("slow")
+    validate_faults_for_backend(config, supported_kinds=possible_fault_kinds, buses=max(bus_count, 1), reason=reason)
 
 
-def check_buses(
+def validate_bus_settings(
     config: RunConfig, settings: DriveSettings, section: str, joints: Sequence[Joint], ports: Collection[str]
 ) -> None:
-    """Check the ports of joints, the watchdog time and the rate of the buses.
+    """Check the ports of the joints, and the watchdog timeout and decimation of a driver type.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
-        settings: The settings of the driver type.
-        section: Where the scenario has them, for messages.
-        joints: The joints of the driver type.
-        ports: The names that a joint's `port` may be.
+        settings: Settings of the driver type.
+        section: Dotted name of the settings section in the scenario, used in error messages.
+        joints: The joints that drives of this type move.
+        ports: Valid values of `drive.port` of a joint.
 
     Raises:
-        ConfigError: a port does not exist, or times do not suit each other.
+        ConfigError: A joint names a port that does not exist, the watchdog timeout is too short for the control
+            period, or the decimation makes joint states older than a lease.
     """
     for joint in joints:
         if joint.drive.port and joint.drive.port not in ports:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
+                f"{make_joint_label(config, joint)}: `port` = {joint.drive.port!r} is not among those of "
                 f"`{section}`: {', '.join(ports) or 'none'}",
                 code="bus/invalid-channel",
             )
-    _check_watchdog(config, settings, section)
-    _check_decimation(config, settings.decimation, section)
+    _validate_watchdog(config, settings, section)
+    _validate_decimation(config, settings.decimation, section)
 
 
-def _check_watchdog(config: RunConfig, settings: DriveSettings, section: str) -> None:
+def _validate_watchdog(config: RunConfig, settings: DriveSettings, section: str) -> None:
+    """Raise ConfigError if a single lost setpoint would let the watchdogs of drives expire."""
     decimation = settings.decimation
-    min_s = MIN_WATCHDOG_PERIODS * decimation / config.rate_hz
-    if settings.watchdog_s >= min_s:
+    min_watchdog_s = MIN_WATCHDOG_PERIODS * decimation / config.rate_hz
+    if settings.watchdog_s >= min_watchdog_s:
         return
     decimation_text = f" and `decimation` = {decimation}" if decimation > 1 else ""
     raise ConfigError(
         f"`{section}.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}{decimation_text}: "
-        f"one lost setpoint would stop the drives; give them {min_s:.3g} s or more",
+        f"one lost setpoint would stop the drives; give them {min_watchdog_s:.3g} s or more",
         code="drive/watchdog-too-short",
     )
 
 
-def _check_decimation(config: RunConfig, decimation: int, section: str) -> None:
+def _validate_decimation(config: RunConfig, decimation: int, section: str) -> None:
+    """Raise ConfigError if joint states would be older than a lease because a bus is read too rarely."""
     max_decimation = int(config.lease_ns / (MIN_LEASE_ROUNDS * config.period_ns))
     if decimation <= max_decimation:
         return
-    age_ms = 1000 * decimation / config.rate_hz
+    joint_state_age_ms = 1000 * decimation / config.rate_hz
     raise ConfigError(
         f"`{section}.decimation` = {decimation} at `rate_hz` = {config.rate_hz:g}: its joint states would be "
-        f"{age_ms:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; at most {max_decimation}",
+        f"{joint_state_age_ms:.0f} ms old, and a lease is {config.lease_ns * 1e-6:.0f} ms; at most {max_decimation}",
         code="drive/watchdog-too-short",
     )
 
 
-def answer_limit_s(config: RunConfig, decimation: int = 1) -> float:
-    """Return how long a bus may wait for the answers of its drives."""
+def compute_response_timeout_s(config: RunConfig, decimation: int = 1) -> float:
+    """Return how long a bus may wait for the responses of its drives, in s.
+
+    Args:
+        config: Configuration of the run, with clock mode and control period.
+        decimation: Control cycles from one reading of the bus to the next.
+    """
     if config.clock_mode == "lockstep":
-        return LOCKSTEP_ANSWER_S
-    return ANSWER_PERIODS * decimation * config.period_ns * 1e-9
+        return LOCKSTEP_RESPONSE_TIMEOUT_S
+    return RESPONSE_TIMEOUT_PERIODS * decimation * config.period_ns * 1e-9
 
 
 def assign_ports(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
-    """Return for every joint the index of its port.
+    """Return the index of the port of every joint.
 
-    A joint without a `port` gets the port of its share: joints are distributed evenly, from the tail on. Without any
-    ports all joints get index 0.
+    Joints that name no `port` are distributed evenly, from the tail on. Without any ports all joints get index 0.
+
+    Args:
+        joints: Joints from tail to head.
+        ports: Names of the ports.
     """
-    numbers = {port: i for i, port in enumerate(ports)}
+    index_by_port = {port: i for i, port in enumerate(ports)}
     joints_per_port = -(-len(joints) // max(len(ports), 1))  # rounded up
-    return [numbers.get(joint.drive.port, i // joints_per_port) for i, joint in enumerate(joints)]
+    return [index_by_port.get(joint.drive.port, i // joints_per_port) for i, joint in enumerate(joints)]
 
 
-def joint_label(config: RunConfig, joint: Joint) -> str:
-    """Return a joint with its robot, as messages name it."""
+def make_joint_label(config: RunConfig, joint: Joint) -> str:
+    """Return the name of a joint with that of its robot, for error messages."""
     return f"robot {config.robot.name!r}, {joint.name}"

@@ -1,7 +1,7 @@
 """Compares what each drive should do with what it reports, and decides which commands a driver sends again. Pure.
 
-For drives on any bus that report whether they are on: a driver type passes these reports to `note_report`, and sends
-the commands that `next_commands` returns.
+For drives on any bus that report whether they are on: a driver type passes these reports to `record_report`, and sends
+the commands that `update_commands` returns.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -10,28 +10,28 @@ from typing import Literal
 
 from snakesim_drivers.kit.findings import Finding
 
-DriveCommand = Literal["follow", "idle", "stop"]  # stop: the drive's own emergency stop
+DriveCommand = Literal["follow", "idle", "stop"]  # enable, disable, or the drive's own emergency stop
 
-MIN_REPLY_REPORTS = 1.5  # report periods after a command, before a report surely is about the time after it
-MAX_FOLLOW_REPORTS = 5  # report periods after a command, in which a drive has to follow
+MIN_RESPONSE_REPORT_PERIODS = 1.5  # report periods after a command, from which on reports surely show its effect
+MAX_ENABLE_REPORT_PERIODS = 5  # report periods after a command, within which a drive has to be on
 
 
 @dataclass
 class DriveState:
-    """One drive: what it should do, and what it reported last."""
+    """One drive: whether it should be on, and what it reported last."""
 
     label: str  # for messages, such as "joint_2 (node 2 on can0)"
 
     # Commanded.
-    should_follow: bool = False
-    commanded_ns: int = -1  # when that changed
-    has_followed: bool = False  # since then
-    emergency_stopped: bool = False  # by the driver, since the last reset
+    should_be_enabled: bool = False
+    command_changed_ns: int = -1  # driver time when `should_be_enabled` last changed; -1: never
+    was_enabled: bool = False  # whether the drive has been on since it should be
+    is_emergency_stopped: bool = False  # by the driver, since the last reset
 
     # Reported.
-    enabled: bool | None = None  # None: not reported yet
+    enabled: bool | None = None  # whether it is on; None: not reported yet
     state: str = ""  # in the driver type's words
-    reported_ns: int = -1
+    last_report_ns: int = -1  # driver time of the last report; -1: none yet
     errors: str = ""  # in words; empty: none
     safe_torque_off: bool = False  # whether the input of this name keeps the motor off
 
@@ -40,101 +40,109 @@ class DriveStates:
     """The states of several drives, from tail to head."""
 
     def __init__(self, labels: Sequence[str], report_period_ns: int, clock_ns: Callable[[], int]) -> None:
-        """Begin with drives that should be idle and have not reported anything.
+        """Create the states of drives that should be off and have not reported anything.
 
         Args:
-            labels: Names of the drives for messages.
+            labels: Names of the drives for messages, from tail to head.
             report_period_ns: Time from one report of a drive to the next.
-            clock_ns: The driver's time.
+            clock_ns: Function that returns the driver's time in ns.
         """
         self.drives = [DriveState(label) for label in labels]
-        self._min_reply_ns = round(MIN_REPLY_REPORTS * report_period_ns)
-        self._max_follow_ns = MAX_FOLLOW_REPORTS * report_period_ns
+        self._min_response_delay_ns = round(MIN_RESPONSE_REPORT_PERIODS * report_period_ns)
+        self._max_enable_duration_ns = MAX_ENABLE_REPORT_PERIODS * report_period_ns
         self._clock_ns = clock_ns
 
-    def note_report(self, i: int, *, enabled: bool, state: str) -> None:
+    def record_report(self, i: int, *, enabled: bool, state: str) -> None:
         """Store whether a drive reports that it is on, and its state in words.
 
         Args:
             i: Index of the drive.
-            enabled: Whether it is on.
-            state: Its state in the driver type's words, for messages.
+            enabled: Whether the drive reports that it is on.
+            state: State of the drive in the driver type's words, for messages.
         """
         drive = self.drives[i]
         drive.enabled = enabled
         drive.state = state
-        drive.reported_ns = self._clock_ns()
-        if drive.should_follow and enabled and self._has_replied(drive):
-            drive.has_followed = True
+        drive.last_report_ns = self._clock_ns()
+        if drive.should_be_enabled and enabled and self._has_reported_since_command(drive):
+            drive.was_enabled = True
 
-    def next_commands(self, following: frozenset[int], *, emergency: bool) -> list[tuple[int, DriveCommand]]:
-        """Return the commands to send now: to drives that change, and again to those that did not obey.
+    def update_commands(self, enabled_drives: frozenset[int], *, emergency: bool) -> list[tuple[int, DriveCommand]]:
+        """Store which drives should be on, and return the commands to send now.
+
+        There is a command for each drive whose target state has changed, and again for each drive that reports that it
+        has not reached its target state. A change of `emergency` alone sends nothing: drives that are off stay off.
 
         Args:
-            following: Indices of the drives that should follow setpoints.
-            emergency: Whether the others stop by their own emergency stop.
+            enabled_drives: Indices of the drives that should follow setpoints.
+            emergency: Whether all other drives are stopped by their own emergency stop instead of disabled.
 
         Returns:
-            Indices of drives with their commands, such as enable, disable or emergency stop.
+            Pairs of a drive's index and its command: "follow" (enable), "idle" (disable) or "stop" (emergency stop).
         """
         commands: list[tuple[int, DriveCommand]] = []
         for i, drive in enumerate(self.drives):
-            should_follow = i in following
-            if drive.should_follow != should_follow:
-                drive.should_follow = should_follow
-                drive.has_followed = False
-                drive.commanded_ns = self._clock_ns()
-            elif not self._needs_repetition(drive):
+            should_be_enabled = i in enabled_drives
+            if drive.should_be_enabled != should_be_enabled:
+                drive.should_be_enabled = should_be_enabled
+                drive.was_enabled = False
+                drive.command_changed_ns = self._clock_ns()
+            elif not self._needs_retry(drive):
                 continue
-            command = _choose_command(should_follow=should_follow, emergency=emergency)
-            if emergency and not should_follow:
-                drive.emergency_stopped = True
+            command = _choose_command(should_be_enabled=should_be_enabled, emergency=emergency)
+            if emergency and not should_be_enabled:
+                drive.is_emergency_stopped = True
             commands.append((i, command))
         return commands
 
-    def following_drives(self) -> frozenset[int]:
-        """Return the drives that should follow and report that they are on."""
-        return frozenset(i for i, drive in enumerate(self.drives) if drive.should_follow and drive.enabled)
+    def get_enabled_drives(self) -> frozenset[int]:
+        """Return the indices of the drives that should be on and report that they are."""
+        return frozenset(i for i, drive in enumerate(self.drives) if drive.should_be_enabled and drive.enabled)
 
     def reset_errors(self, drives: Iterable[int]) -> None:
-        """Forget the errors of these drives, as the driver clears them."""
+        """Forget the errors of these drives, because the driver has just cleared them."""
         for i in drives:
             self.drives[i].errors = ""
-            self.drives[i].emergency_stopped = False
+            self.drives[i].is_emergency_stopped = False
 
     def findings(self) -> list[Finding]:
-        """Return a finding for each drive that reports errors, or that does not follow although it should."""
+        """Return a finding for each drive that reports errors, or that is off although it should be on."""
         findings: list[Finding] = []
         for i, drive in enumerate(self.drives):
             if drive.safe_torque_off:
                 cause = f"{drive.label}: its safe-torque-off input is active; release it, then reset and arm"
                 findings.append(Finding("safe_torque_off", cause, i))
             elif drive.errors:
-                findings.append(Finding("drive_fault", f"{drive.label} reports {drive.errors}", i, alone=True))
-            elif drive.should_follow and self._is_settled(drive) and not drive.enabled:
+                findings.append(
+                    Finding("drive_fault", f"{drive.label} reports {drive.errors}", i, affects_only_joint=True)
+                )
+            elif drive.should_be_enabled and self._should_have_enabled(drive) and not drive.enabled:
                 cause = f"{drive.label} does not follow: it is {drive.state or 'in an unknown state'}"
-                findings.append(Finding("drive_not_armed", cause, i, alone=drive.has_followed))
+                findings.append(Finding("drive_not_armed", cause, i, affects_only_joint=drive.was_enabled))
         return findings
 
-    def _needs_repetition(self, drive: DriveState) -> bool:
-        """Return whether a drive has reported that it did not obey.
+    def _needs_retry(self, drive: DriveState) -> bool:
+        """Return whether a drive has reported that it did not execute its last command.
 
-        A drive that has followed, or has had time to, gets no second command to follow: it has stopped by itself, and
+        A drive that was on, or has had time to switch on, is not enabled a second time: it has stopped by itself, and
         that is a finding.
         """
-        if drive.should_follow and self._is_settled(drive):
+        if drive.should_be_enabled and self._should_have_enabled(drive):
             return False
-        return self._has_replied(drive) and drive.enabled not in (None, drive.should_follow)
+        return self._has_reported_since_command(drive) and drive.enabled not in (None, drive.should_be_enabled)
 
-    def _has_replied(self, drive: DriveState) -> bool:
-        return drive.reported_ns - drive.commanded_ns > self._min_reply_ns
+    def _has_reported_since_command(self, drive: DriveState) -> bool:
+        """Return whether the last report is so late that it shows the effect of the last command."""
+        return drive.last_report_ns - drive.command_changed_ns > self._min_response_delay_ns
 
-    def _is_settled(self, drive: DriveState) -> bool:
-        return drive.has_followed or self._clock_ns() - drive.commanded_ns > self._max_follow_ns
+    def _should_have_enabled(self, drive: DriveState) -> bool:
+        """Return whether a drive was on since the last command, or has had enough time to switch on."""
+        return drive.was_enabled or self._clock_ns() - drive.command_changed_ns > self._max_enable_duration_ns
 
 
-def _choose_command(*, should_follow: bool, emergency: bool) -> DriveCommand:
-    if should_follow:
+def _choose_command(*, should_be_enabled: bool, emergency: bool) -> DriveCommand:
+    """Return the command that brings a drive into its target state."""
+    if should_be_enabled:
         return "follow"
     if emergency:
         return "stop"

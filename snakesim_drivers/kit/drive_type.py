@@ -17,19 +17,19 @@ from snakesim_drivers.kit.drive_backend import DriveBackend, DriveBackendParts, 
 from snakesim_drivers.kit.drive_settings import (
     DriveSettings,
     assign_ports,
-    check_body,
-    check_buses,
-    joint_label,
-    make_body,
+    make_emulated_body,
+    make_joint_label,
+    validate_body_settings,
+    validate_bus_settings,
 )
 from snakesim_drivers.kit.drives import Drives
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import make_receiver
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, Measurement
-from snakesim_hal.model.robot import RobotFile, without_measurements
+from snakesim_hal.model.robot import RobotFile, remove_measurements
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.motor import check_gains
+from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.wire.messages import ClockMode
 
 
@@ -44,7 +44,7 @@ class DriverTypePart:
 
     @property
     def ports(self) -> Sequence[str]:
-        """The names of its buses; empty: its drives are emulated in this process."""
+        """The names of the buses of this driver type; empty if its drives are emulated in this process."""
         return self.driver_type.list_ports(self.settings)
 
 
@@ -69,7 +69,7 @@ class BusesBackend(DriveBackend):
 
     @classmethod
     @abstractmethod
-    def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
+    def group_joints_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
         """Return the joints of each driver type in a robot.
 
         Raises:
@@ -78,31 +78,37 @@ class BusesBackend(DriveBackend):
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
-        """Check that a run is possible with the drives of its robot, without opening anything.
+        """Check that a run is possible with the drives of its robot, without opening any bus.
 
         Args:
             config: Configuration of the run.
             settings: Settings of this backend.
 
         Returns:
-            The clock modes that are possible: drives on a bus support real time only, emulators in this process also
-            lockstep.
+            The possible clock modes: drives on a bus support real time only, and emulators in this process support
+            lockstep, too.
 
         Raises:
-            ConfigError: the configuration does not suit the drives.
+            ConfigError: The configuration does not suit the drives.
         """
-        check_gains(config.robot)
-        parts = cls.split_by_driver_type(config, settings)
-        emulated_here = _are_emulated_here(parts)
-        possible_faults = [{*part.driver_type.list_bus_faults(part.settings)} for part in parts]
-        common_faults = set[str].intersection(*possible_faults)
+        validate_position_gains(config.robot)
+        parts = cls.group_joints_by_driver_type(config, settings)
+        are_emulated_in_process = _are_emulated_in_process(parts)
+        possible_fault_kinds = [{*part.driver_type.list_bus_faults(part.settings)} for part in parts]
+        common_fault_kinds = set[str].intersection(*possible_fault_kinds)
         bus_count = sum(max(len(part.ports), 1) for part in parts)
-        check_body(config, settings, emulators=emulated_here, buses=bus_count, bus_faults=common_faults)
+        validate_body_settings(
+            config,
+            settings,
+            are_emulated=are_emulated_in_process,
+            bus_count=bus_count,
+            bus_fault_kinds=common_fault_kinds,
+        )
         for part in parts:
             joints = list(part.joints.values())
-            check_buses(config, part.settings, part.section, joints, part.ports)
+            validate_bus_settings(config, part.settings, part.section, joints, part.ports)
             part.driver_type.check_drives(config, part.settings, joints)
-        return ("lockstep", "realtime") if emulated_here else ("realtime",)
+        return ("lockstep", "realtime") if are_emulated_in_process else ("realtime",)
 
     def __init__(self, config: RunConfig, settings: Any) -> None:
         """Open the buses of all driver types and bring up every drive; no drive is enabled.
@@ -114,43 +120,47 @@ class BusesBackend(DriveBackend):
             settings: Settings of this backend.
 
         Raises:
-            ConfigError: the configuration does not suit the drives.
-            BackendError: a bus cannot be opened, or a drive is missing.
+            ConfigError: The configuration does not suit the drives.
+            BackendError: A bus cannot be opened, or a drive is missing.
         """
         self.check(config, settings)
-        parts = self.split_by_driver_type(config, settings)
+        parts = self.group_joints_by_driver_type(config, settings)
         clock = DriverClock(config)
-        emulated_here = _are_emulated_here(parts)
+        are_emulated_in_process = _are_emulated_in_process(parts)
         mocap = make_receiver(
-            config, settings.pose_listen, emulators=emulated_here, clock=lambda _timestamp_ns: clock.now_ns()
+            config,
+            settings.pose_listen,
+            are_emulated=are_emulated_in_process,
+            clock=lambda _timestamp_ns: clock.now_ns(),
         )
 
         def open_buses(readings: DriveReadings) -> Buses:
+            """Open the buses of all driver types, with an emulated body if there is no real bus."""
             body = None
-            if emulated_here:
+            if are_emulated_in_process:
                 pose_address = mocap.address if mocap is not None else None
-                body = make_body(config, settings, self.name, pose_address)
+                body = make_emulated_body(config, settings, self.name, pose_address)
             specs: list[BusSpec] = []
             for part in parts:
                 part_body = body.select(list(part.joints)) if body is not None else None
                 context = DriverTypeContext(config, part.settings, part.joints, clock, part_body)
                 specs += part.driver_type.plan_buses(context)
-            pass_time = clock.pass_start_up_time if config.clock_mode == "lockstep" else None
-            return Buses(config, readings, specs, clock.now_ns, pass_time)
+            advance_time = clock.advance_start_up_time if config.clock_mode == "lockstep" else None
+            return Buses(config, readings, specs, clock.now_ns, advance_time)
 
-        backend_parts = DriveBackendParts(
+        drive_backend_parts = DriveBackendParts(
             name=self.name,
             hardware="+".join(port for part in parts for port in part.ports),
             clock=clock,
             mocap=mocap,
             open_drives=open_buses,
-            watchdogs_s=_list_watchdogs_s(parts),
+            watchdog_timeouts_s=_list_watchdog_timeouts_s(parts),
             decimation=max(part.settings.decimation for part in parts),
-            without_watchdog=frozenset(
+            joints_without_watchdog=frozenset(
                 joint for part in parts if not part.driver_type.has_watchdog for joint in part.joints
             ),
         )
-        super().__init__(config, backend_parts)
+        super().__init__(config, drive_backend_parts)
 
 
 class DriverTypeBackend(BusesBackend):
@@ -168,17 +178,17 @@ class DriverTypeBackend(BusesBackend):
 
     @classmethod
     def limit_modes(cls, robot: RobotFile) -> RobotFile:
-        return without_measurements(super().limit_modes(robot), cls.unmeasured)
+        return remove_measurements(super().limit_modes(robot), cls.unmeasured)
 
     @classmethod
     @abstractmethod
     def list_ports(cls, settings: Any) -> Sequence[str]:
-        """Return the names of the buses in the settings. Empty: the drives are emulated in this process."""
+        """Return the names of the buses in the settings; empty if the drives are emulated in this process."""
 
     @classmethod
     @abstractmethod
     def list_bus_faults(cls, settings: Any) -> Collection[str]:
-        """Return the kinds of faults that `Drives.inject` can inject into the buses. Empty: none."""
+        """Return the kinds of faults that `Drives.inject` can inject into the buses, such as "cut"."""
 
     @classmethod
     @abstractmethod
@@ -199,11 +209,11 @@ class DriverTypeBackend(BusesBackend):
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
         """Return the buses that have some of the joints. `BusSpec.open` opens each of them later.
 
-        `group_by_port` makes them for drives on named ports.
+        `make_bus_specs_by_port` makes them for drives on named ports.
         """
 
     @classmethod
-    def split_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
+    def group_joints_by_driver_type(cls, config: RunConfig, settings: Any) -> list[DriverTypePart]:
         """Return all joints as one part, because a robot with this backend has drives of this type alone.
 
         Args:
@@ -217,17 +227,18 @@ class DriverTypeBackend(BusesBackend):
         for joint in joints.values():
             if joint.drive.driver not in ("", cls.name):
                 raise ConfigError(
-                    f"{joint_label(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and backend "
-                    f"{config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
+                    f"{make_joint_label(config, joint)}: `driver` = {joint.drive.driver!r} in the robot file, and "
+                    f"backend {config.backend!r} drives {cls.name} alone; correct it, or take the backend `mixed`"
                 )
         return [DriverTypePart(cls, settings, config.backend_section, joints)]
 
 
-def _are_emulated_here(parts: Sequence[DriverTypePart]) -> bool:
+def _are_emulated_in_process(parts: Sequence[DriverTypePart]) -> bool:
+    """Return whether no driver type has a bus, so that all drives are emulated in this process."""
     return not any(part.ports for part in parts)
 
 
-def _list_watchdogs_s(parts: Sequence[DriverTypePart]) -> list[float]:
+def _list_watchdog_timeouts_s(parts: Sequence[DriverTypePart]) -> list[float]:
     """Return the watchdog time of every joint, from tail to head."""
     watchdog_s: dict[int, float] = {}
     for part in parts:
@@ -236,19 +247,23 @@ def _list_watchdogs_s(parts: Sequence[DriverTypePart]) -> list[float]:
     return [watchdog_s[joint] for joint in range(len(watchdog_s))]
 
 
-def group_by_port(
+def make_bus_specs_by_port(
     joints: Mapping[int, Joint],
     settings: DriveSettings,
     ports: Sequence[str],
     open_drives: Callable[[str, Sequence[int], DriveReadings], Drives],
 ) -> list[BusSpec]:
-    """Return a bus for each port that has some of the joints.
+    """Return the specification of a bus for each port that has some of the joints.
 
     Args:
-        joints: The joints of a driver type, by their indices in the robot.
-        settings: The settings of the driver type.
+        joints: The joints of a driver type, by their indices in the robot, from tail to head.
+        settings: Settings of the driver type.
         ports: Names of the ports.
-        open_drives: Opens a port, from its name, the indices of its joints, and the readings that its drives fill.
+        open_drives: Function that opens the bus on a port. Its arguments are the name of the port, the indices of its
+            joints in the robot, and the readings that its drives fill.
+
+    Returns:
+        The buses in the order of `ports`, without the ports to which no joint is assigned.
     """
     port_indices = assign_ports(list(joints.values()), ports)
     specs: list[BusSpec] = []

@@ -16,14 +16,14 @@ Threads
 Time
     `bring_up` may take `bring_up_limit_s` of the settings, 10 s by default, and `close` 2 s for all buses together. All
     other calls of a cycle together may take one control period times the `decimation` of the bus. `read` should wait
-    at most `drive_settings.answer_limit_s` for answers, half of that time. A bus that is slower delays neither the host
-    nor other buses: its joint states become older, and after one lease they are invalid.
+    at most `drive_settings.compute_response_timeout_s` for answers, half of that time. A bus that is slower delays
+    neither the host nor other buses: its joint states become older, and after one lease they are invalid.
 
 Start-up
     What takes seconds after `bring_up`, such as homing, goes into `start_up`, as steps with a time limit each. After
     every `read`, the same thread calls the functions of the steps, each of which returns at once. Until a drive has
-    finished, it is not among `BusCommand.following`, and the robot cannot be armed. In lockstep all steps end before
-    the first control cycle.
+    finished, it is not among `BusCommand.enabled_drives`, and the robot cannot be armed. In lockstep all steps end
+    before the first control cycle.
 
 Errors
     An exception of any call ends the run safely. The bus first switches its drives off, by `send_setpoints` without
@@ -47,7 +47,7 @@ from snakesim_hal.wire.messages import Mode
 class BusCommand(NamedTuple):
     """What all drives of a bus are to do until the next command."""
 
-    following: frozenset[int]  # the drives that get setpoints (all others are switched off)
+    enabled_drives: frozenset[int]  # indices of the drives that follow setpoints; all others are switched off
     modes: list[Mode]  # of every drive
     targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive (0 for passive drives)
     limits_nm: Floats  # (n_drives,) torque limits, not negative
@@ -73,7 +73,7 @@ class Drives(ABC):
     def read(self) -> None:
         """Request motion and torque of every drive, and put the answers into the readings.
 
-        Do not wait for drives that were silent before: `DriveReadings.is_incomplete` is whether waiting is useful.
+        Do not wait for drives that were silent before: `DriveReadings.is_incomplete` returns whether waiting is useful.
         Request also the state of the drives in `DriveReadings.drives_to_check`, and call `mark_checked` for each that
         reports it: these may have stopped by themselves.
 
@@ -83,13 +83,13 @@ class Drives(ABC):
 
     @abstractmethod
     def send_setpoints(self, command: BusCommand) -> None:
-        """Send setpoints to the drives that follow, and switch off all others.
+        """Send setpoints to the enabled drives, and switch off all others.
 
-        A drive that begins to follow is enabled after it has received its setpoint. A drive that should be off but
-        reports that it is on is switched off again. `drive_states.DriveStates` decides both.
+        A drive that is switched on gets its setpoint first. A drive that should be off but reports that it is on is
+        switched off again. `drive_states.DriveStates` decides both.
 
         Args:
-            command: Setpoints and followers. It replaces the one of the cycle before.
+            command: Setpoints, and which drives are enabled. It replaces the command of the cycle before.
 
         Raises:
             BackendError: The bus cannot be used any more.
@@ -124,7 +124,7 @@ class Drives(ABC):
         return []
 
     def poll(self) -> None:
-        """Receive what has arrived, without waiting. Drives that are emulated here simulate up to the present time.
+        """Receive what has arrived, without waiting. Drives that are emulated here simulate up to the current time.
 
         The default is for drives that only answer requests.
 
@@ -134,14 +134,14 @@ class Drives(ABC):
         return
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end an injected fault of the bus, `bus_1`, or of a drive emulated here, `joint_1` for drive 0.
+        """Start or end an injected fault of the bus, `bus_1`, or of a drive emulated here, `joint_1` for drive 0.
 
         Args:
             injection: The fault.
-            begins: True to begin it, False to end it.
+            begins: True to start the fault, False to end it.
 
         Returns:
-            False if the fault concerns neither of them. This is the default.
+            True if the fault was started or ended; False, the default, if it cannot be injected here.
 
         Raises:
             ConfigError: The fault cannot be injected here.

@@ -12,22 +12,22 @@ MAX_CAUSE_CHARACTERS = 500  # the limit of the message `Fault`
 class Finding:
     """One detected fault."""
 
-    what: str  # its kind, such as drive_silent
+    what: str  # kind of the fault, such as drive_silent
     cause: str  # for the operator
     joint: int | None = None  # index, tail to head (None: the bus)
-    alone: bool = False  # True: the other joints are not affected
+    affects_only_joint: bool = False  # True: the other joints are not affected
 
     @property
     def subject(self) -> tuple[str, int | str, bool]:
         """The key by which a finding is reported once: its kind and joint, or its cause if it has no joint."""
         place = self.cause if self.joint is None else self.joint
-        return self.what, place, self.alone
+        return self.what, place, self.affects_only_joint
 
     def to_fault(self, tick: int, joint_names: Sequence[str]) -> Fault:
-        """Return the finding as a message.
+        """Return the finding as a `Fault` message.
 
         Args:
-            tick: The control cycle in which it was found.
+            tick: Number of the control cycle in which it was found.
             joint_names: Names of all joints, from tail to head.
         """
         return Fault(
@@ -35,7 +35,7 @@ class Finding:
             what=self.what,
             cause=self.cause[:MAX_CAUSE_CHARACTERS],
             joint=None if self.joint is None else joint_names[self.joint],
-            reach="joint" if self.alone else "robot",
+            reach="joint" if self.affects_only_joint else "robot",
         )
 
 

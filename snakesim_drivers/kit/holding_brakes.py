@@ -26,75 +26,89 @@ class HoldingBrakes:
     """The brakes of all drives on one bus, by their indices on it. All are closed at first."""
 
     def __init__(self, count: int, *, release_s: float, engage_s: float, clock_ns: Callable[[], int]) -> None:
-        """Begin with closed brakes.
+        """Create the brakes of a bus, all closed.
 
         Args:
             count: Number of drives.
-            release_s: Time from the command until a brake is open.
-            engage_s: Time from the command until a brake holds.
-            clock_ns: The driver's time.
+            release_s: Duration from the command until a brake is open.
+            engage_s: Duration from the command until a brake holds.
+            clock_ns: Function that returns the driver's time in ns.
         """
-        self._release_ns = round(release_s * 1e9)
-        self._engage_ns = round(engage_s * 1e9)
+        self._release_duration_ns = round(release_s * 1e9)
+        self._engage_duration_ns = round(engage_s * 1e9)
         self._clock_ns = clock_ns
-        self._released_ns: list[int | None] = [None] * count  # when a brake was told to open; None: it is closed
-        self._engaged_ns: list[int | None] = [None] * count  # when it was told to close; None: long ago
-        self._hold_rad = [0.0] * count
-        self._hold_limit_nm = [0.0] * count
+        self._release_start_ns: list[int | None] = [
+            None
+        ] * count  # when each brake was commanded to open; None: it is closed
+        self._engage_start_ns: list[int | None] = [
+            None
+        ] * count  # when each brake was commanded to close; None: it opens or is closed
+        self._hold_angles_rad = [0.0] * count
+        self._hold_torque_limits_nm = [0.0] * count
 
-    def plan(self, command: BusCommand, enabled: Collection[int], angle_rad: Floats) -> BrakePlan:
-        """Return the command with holding drives, and the brakes that are to be open.
+    def update_brakes(self, command: BusCommand, drives_on: Collection[int], angle_rad: Floats) -> BrakePlan:
+        """Start to open or close brakes for a command, and let drives hold their position until that is done.
+
+        An enabled drive holds its position until its brake is open. A drive that is switched off stays enabled, and
+        holds its position, until its brake is closed; not after an emergency stop. Call it once in every cycle.
 
         Args:
-            command: What the drives are to do if they had no brakes.
-            enabled: The drives that report that they are on.
-            angle_rad: (n_drives,) measured angles of the shafts.
+            command: Command for drives without brakes.
+            drives_on: Indices of the drives that report that they are on.
+            angle_rad: Measured angles of the shafts, (n_drives,).
+
+        Returns:
+            The command to send, and the drives whose brake is to be open.
         """
         now_ns = self._clock_ns()
-        holding: set[int] = set()
+        holding_drives: set[int] = set()
         for i, angle in enumerate(angle_rad.tolist()):
-            if i in command.following:
-                self._open(i, now_ns, is_enabled=i in enabled, angle_rad=angle, limit_nm=float(command.limits_nm[i]))
-                if self._is_opening(i, now_ns):
-                    holding.add(i)
+            if i in command.enabled_drives:
+                self._start_brake_release(
+                    i, now_ns, is_enabled=i in drives_on, angle_rad=angle, limit_nm=float(command.limits_nm[i])
+                )
+                if self._is_brake_releasing(i, now_ns):
+                    holding_drives.add(i)
             else:
-                self._close(i, now_ns, angle_rad=angle)
-                if self._is_closing(i, now_ns) and i in enabled and not command.emergency:
-                    holding.add(i)
-        released = frozenset(i for i, released_ns in enumerate(self._released_ns) if released_ns is not None)
-        return BrakePlan(self._hold(command, holding), released)
+                self._start_brake_engagement(i, now_ns, angle_rad=angle)
+                if self._is_brake_engaging(i, now_ns) and i in drives_on and not command.emergency:
+                    holding_drives.add(i)
+        released = frozenset(
+            i for i, release_start_ns in enumerate(self._release_start_ns) if release_start_ns is not None
+        )
+        return BrakePlan(self._replace_with_hold_setpoints(command, holding_drives), released)
 
-    def _open(self, i: int, now_ns: int, *, is_enabled: bool, angle_rad: float, limit_nm: float) -> None:
-        self._engaged_ns[i] = None
-        self._hold_limit_nm[i] = limit_nm
-        if self._released_ns[i] is None:
-            self._hold_rad[i] = angle_rad
+    def _start_brake_release(self, i: int, now_ns: int, *, is_enabled: bool, angle_rad: float, limit_nm: float) -> None:
+        self._engage_start_ns[i] = None
+        self._hold_torque_limits_nm[i] = limit_nm
+        if self._release_start_ns[i] is None:
+            self._hold_angles_rad[i] = angle_rad
             if is_enabled:
-                self._released_ns[i] = now_ns
+                self._release_start_ns[i] = now_ns
 
-    def _close(self, i: int, now_ns: int, *, angle_rad: float) -> None:
-        if self._released_ns[i] is not None:
-            self._released_ns[i] = None
-            self._engaged_ns[i] = now_ns
-            self._hold_rad[i] = angle_rad
+    def _start_brake_engagement(self, i: int, now_ns: int, *, angle_rad: float) -> None:
+        if self._release_start_ns[i] is not None:
+            self._release_start_ns[i] = None
+            self._engage_start_ns[i] = now_ns
+            self._hold_angles_rad[i] = angle_rad
 
-    def _is_opening(self, i: int, now_ns: int) -> bool:
-        released_ns = self._released_ns[i]
-        return released_ns is None or now_ns - released_ns < self._release_ns
+    def _is_brake_releasing(self, i: int, now_ns: int) -> bool:
+        release_start_ns = self._release_start_ns[i]
+        return release_start_ns is None or now_ns - release_start_ns < self._release_duration_ns
 
-    def _is_closing(self, i: int, now_ns: int) -> bool:
-        engaged_ns = self._engaged_ns[i]
-        return engaged_ns is not None and now_ns - engaged_ns < self._engage_ns
+    def _is_brake_engaging(self, i: int, now_ns: int) -> bool:
+        engage_start_ns = self._engage_start_ns[i]
+        return engage_start_ns is not None and now_ns - engage_start_ns < self._engage_duration_ns
 
-    def _hold(self, command: BusCommand, holding: set[int]) -> BusCommand:
-        """Return the command with these drives at their angle, in position mode."""
+    def _replace_with_hold_setpoints(self, command: BusCommand, holding_drives: set[int]) -> BusCommand:
+        """Return the command with these drives enabled, in position mode at the angle that they have to hold."""
         modes = list(command.modes)
         targets = command.targets.copy()
         limits_nm = command.limits_nm.copy()
-        for i in holding:
+        for i in holding_drives:
             modes[i] = Mode.POSITION
-            targets[i] = self._hold_rad[i]
-            limits_nm[i] = self._hold_limit_nm[i]
+            targets[i] = self._hold_angles_rad[i]
+            limits_nm[i] = self._hold_torque_limits_nm[i]
         return command._replace(
-            following=command.following | holding, modes=modes, targets=targets, limits_nm=limits_nm
+            enabled_drives=command.enabled_drives | holding_drives, modes=modes, targets=targets, limits_nm=limits_nm
         )

@@ -16,19 +16,19 @@ class LimitSwitches:
     """The switches of all drives on one bus, by their indices on it. Lower and upper are at the drive's shaft."""
 
     def __init__(self, labels: Sequence[str]) -> None:
-        """Begin with open switches. labels: names of the drives for messages."""
+        """Create the switches of a bus, all open; `labels` are the names of the drives for messages."""
         self._labels = labels
         self._at_lower: set[int] = set()
         self._at_upper: set[int] = set()
         self._unacknowledged: set[int] = set()  # closed since the last reset
 
-    def note(self, i: int, *, lower: bool, upper: bool) -> None:
-        """Store which switches of a drive are closed.
+    def record_switches(self, i: int, *, lower: bool, upper: bool) -> None:
+        """Store which limit switches of a drive are closed.
 
         Args:
             i: Index of the drive.
-            lower: Whether the switch at the lower end of its travel is closed.
-            upper: Whether the switch at the upper end is closed.
+            lower: Whether the switch at the lower end of the travel is closed.
+            upper: Whether the switch at the upper end of the travel is closed.
         """
         for is_closed, closed in ((lower, self._at_lower), (upper, self._at_upper)):
             if is_closed and i not in closed:
@@ -46,20 +46,20 @@ class LimitSwitches:
         findings: list[Finding] = []
         for i in sorted(self._unacknowledged):
             cause = f"{self._labels[i]} has reached its {self._name_end(i)} limit switch; reset, and move away from it"
-            findings.append(Finding("limit_switch", cause, i, alone=True))
+            findings.append(Finding("limit_switch", cause, i, affects_only_joint=True))
         return findings
 
-    def restrict(self, command: BusCommand, angle_rad: Floats) -> BusCommand:
-        """Return the command without motion into a closed switch.
+    def restrict_command(self, command: BusCommand, angle_rad: Floats) -> BusCommand:
+        """Return the command without motion into a closed limit switch.
 
         Args:
-            command: What the drives are to do.
-            angle_rad: (n_drives,) measured angles of the shafts.
+            command: Command for drives without limit switches.
+            angle_rad: Measured angles of the shafts, (n_drives,).
         """
         if not self._at_lower and not self._at_upper:
             return command
         targets = command.targets.copy()
-        for i in command.following:
+        for i in command.enabled_drives:
             bound = float(angle_rad[i]) if command.modes[i] == Mode.POSITION else 0.0
             if i in self._at_lower:
                 targets[i] = max(targets[i], bound)

@@ -13,7 +13,7 @@ from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_drivers.kit.drive_type import BusesBackend, DriverTypeBackend, DriverTypePart
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, JointExceptions
-from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.model.plugins import BACKENDS, decode_plugin_settings, load_plugin
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
@@ -29,23 +29,23 @@ class MixedBackend(BusesBackend):
     name = "mixed"
 
     @classmethod
-    def split_by_driver_type(cls, config: RunConfig, settings: MixedSettings) -> list[DriverTypePart]:
+    def group_joints_by_driver_type(cls, config: RunConfig, settings: MixedSettings) -> list[DriverTypePart]:
         """Return the joints of each driver type, with the settings of its section.
 
         Raises:
-            ConfigError: a driver type is unknown, its section is wrong, or only some driver types have a bus.
+            ConfigError: A driver type is unknown, its section is wrong, or only some driver types have a bus.
         """
-        driver_types = {joint.drive.driver: find_driver_type(config.robot, joint) for joint in config.robot.joint_table}
+        driver_types = {joint.drive.driver: load_driver_type(config.robot, joint) for joint in config.robot.joint_table}
         parts = [_make_part(config, driver, driver_type) for driver, driver_type in driver_types.items()]
-        _check_same_world(parts)
+        _validate_all_or_no_emulation(parts)
         return parts
 
     @classmethod
     def limit_modes(cls, robot: RobotFile) -> RobotFile:
-        """Return the robot with only those modes that each joint has in its driver type."""
+        """Return the robot with only those modes and measurements that the driver type of each joint supports."""
         joints = dict(robot.joints)
         for joint in robot.joint_table:
-            driver_type = find_driver_type(robot, joint)
+            driver_type = load_driver_type(robot, joint)
             if driver_type.unmeasured:
                 measures = [quantity for quantity in joint.drive.measures if quantity not in driver_type.unmeasured]
                 exceptions = joints.get(joint.name, JointExceptions())
@@ -58,54 +58,58 @@ class MixedBackend(BusesBackend):
         return msgspec.structs.replace(robot, joints=joints)
 
 
-def find_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
+def load_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     """Return the class of the driver type that the robot file names for a joint.
 
     Args:
-        robot: The robot file, for messages.
-        joint: The joint.
+        robot: Robot that the joint belongs to, for error messages.
+        joint: Joint with the name of its driver type in `drive.driver`.
 
     Raises:
-        ConfigError: the robot file does not name one, or names something else.
+        ConfigError: The robot file names no driver type for the joint, an unknown one, or a backend that is none.
     """
     driver = joint.drive.driver
-    where = f"robot {robot.name!r}, {joint.name}: `driver`"
-    fix = f"set it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
+    context = f"robot {robot.name!r}, {joint.name}: `driver`"
+    suggestion = f"set it in [joints.{joint.name}] of the robot file, or for all joints in [drive]"
     if not driver:
         raise ConfigError(
-            f"{where} is missing, and the backend `mixed` drives each joint by its driver type: {fix}",
+            f"{context} is missing, and the backend `mixed` drives each joint by its driver type: {suggestion}",
             code="drive/unknown-type",
         )
     try:
-        plugin: Any = find_plugin(BACKENDS, driver)
+        plugin: Any = load_plugin(BACKENDS, driver)
     except ConfigError as error:
-        raise ConfigError(f"{where} = {driver!r}: {error}; {fix}", code="drive/unknown-type") from None
+        raise ConfigError(f"{context} = {driver!r}: {error}; {suggestion}", code="drive/unknown-type") from None
     if not (isinstance(plugin, type) and issubclass(plugin, DriverTypeBackend)):
         raise ConfigError(
-            f"{where} = {driver!r}, which is a backend of whole robots, and not a driver type; {fix}",
+            f"{context} = {driver!r}, which is a backend of whole robots, and not a driver type; {suggestion}",
             code="drive/unknown-type",
         )
     return plugin
 
 
 def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBackend]) -> DriverTypePart:
-    """Return the joints of a driver type, and its settings from the scenario."""
+    """Return the joints of a driver type, and its settings from the scenario.
+
+    Raises:
+        ConfigError: The section of the driver type is invalid, or has a key that concerns the whole robot.
+    """
     name = driver.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
     section = f"backends.{name}"
     section_values = config.backends.get(name, {})
-    robot_wide = sorted(section_values.keys() & {*BodySettings.__struct_fields__})
-    if robot_wide:
+    robot_wide_keys = sorted(section_values.keys() & {*BodySettings.__struct_fields__})
+    if robot_wide_keys:
         raise ConfigError(
-            f"`{section}.{robot_wide[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
-            f"set `backends.mixed.{robot_wide[0]}`",
+            f"`{section}.{robot_wide_keys[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
+            f"set `backends.mixed.{robot_wide_keys[0]}`",
             code="config/conflict",
         )
-    settings = plugin_settings(driver_type, section_values, f"scenario {config.name!r}", section)
+    settings = decode_plugin_settings(driver_type, section_values, f"scenario {config.name!r}", section)
     joints = {i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver}
     return DriverTypePart(driver_type, settings, section, joints)
 
 
-def _check_same_world(parts: list[DriverTypePart]) -> None:
+def _validate_all_or_no_emulation(parts: list[DriverTypePart]) -> None:
     """Raise ConfigError if some drives are emulated here and others are on a bus."""
     on_bus = [part for part in parts if part.ports]
     emulated = [part for part in parts if not part.ports]

@@ -3,9 +3,9 @@
 A driver type makes a `StartUp` in its constructor, as `Drives.start_up`, and lists the steps of a drive in order:
 
     self.start_up = StartUp(labels, readings, clock_ns, steps=[
-        StartUpStep("configuring", limit_s=1.0, begin=self.write_profile, is_done=self.has_acknowledged),
-        StartUpStep("homing", limit_s=10.0, begin=self.begin_homing, is_done=self.is_homed, abort=self.stop_homing,
-                    moves=True),
+        StartUpStep("configuring", timeout_s=1.0, start=self.write_profile, is_done=self.has_acknowledged),
+        StartUpStep("homing", timeout_s=10.0, start=self.start_homing, is_done=self.is_homed, abort=self.stop_homing,
+                    moves_joint=True),
     ], may_move=settings.home_at_start)
 
 The kit then calls `update` after every `read`. All drives go through their steps at the same time. Until a drive has
@@ -35,19 +35,19 @@ class StartUpStep:
     """One step of a drive's start-up. All functions get the index of the drive, and return at once."""
 
     name: str  # as an operator reads it, such as "homing"
-    limit_s: float  # time after which the step has failed
-    begin: Callable[[int], None]  # sends what starts the step
+    timeout_s: float  # time after which the step has failed
+    start: Callable[[int], None]  # sends what starts the step
     is_done: Callable[[int], bool]  # whether the drive has acknowledged it; called in every cycle of the bus
     abort: Callable[[int], None] = do_nothing  # sends what ends the step, after a failure or an emergency stop
-    moves: bool = False  # True: the drive moves its joint by itself, as in homing
+    moves_joint: bool = False  # True: the drive moves its joint by itself, as in homing
 
 
 @dataclass
 class _Progress:
     """How far one drive is."""
 
-    step: int = 0  # index of the present step; the number of steps: finished
-    begun_ns: int | None = None  # when the present step began; None: it has not begun
+    step: int = 0  # index of the current step; equal to the number of steps if the start-up is finished
+    start_time_ns: int | None = None  # when the current step was started; None: not yet
     failure: str = ""  # why the start-up ended early; empty: it did not
     is_fault: bool = False  # False: the operator ended it, by an emergency stop
 
@@ -64,14 +64,14 @@ class StartUp:
         steps: Sequence[StartUpStep],
         may_move: bool = True,
     ) -> None:
-        """Begin with drives that are not ready.
+        """Create the start-up of drives, none of which is ready; `update` starts the steps.
 
         Args:
             labels: Names of the drives for messages, such as "joint_3 (node 4 on can0)".
-            readings: The readings of these drives, which get the reason why a drive is not ready.
-            clock_ns: The driver's time.
-            steps: What each drive goes through, in order.
-            may_move: Whether steps that move a joint may begin. An operator allows it in the scenario.
+            readings: Readings of these drives, in which the reason is stored why a drive is not ready.
+            clock_ns: Function that returns the driver's time in ns.
+            steps: Steps that each drive has to finish, in order.
+            may_move: Whether steps that move a joint may start. An operator allows it in the scenario.
         """
         self._labels = labels
         self._readings = readings
@@ -79,14 +79,14 @@ class StartUp:
         self._steps = steps
         self._may_move = may_move
         self._progress = [_Progress() for _ in labels]
-        self._publish()
+        self._publish_not_ready_reasons()
 
     def update(self) -> None:
-        """Begin the steps that are due, and finish those that the drives have acknowledged."""
+        """Start the steps that are due, and finish those that the drives have acknowledged."""
         for i, progress in enumerate(self._progress):
             if not progress.failure:
                 self._update_drive(i, progress)
-        self._publish()
+        self._publish_not_ready_reasons()
 
     def is_ready(self, i: int) -> bool:
         """Return whether a drive has finished its start-up."""
@@ -97,104 +97,113 @@ class StartUp:
         """Return whether a drive is still at a step that neither has failed nor waits for the operator."""
         for progress in self._progress:
             is_finished = progress.step == len(self._steps)
-            if not is_finished and not progress.failure and not self._is_forbidden(progress):
+            if not is_finished and not progress.failure and not self._is_motion_forbidden(progress):
                 return True
         return False
 
-    def lose(self, i: int, reason: str) -> None:
-        """Note that a drive has lost what its start-up has established, as by a restart.
+    def invalidate(self, i: int, reason: str) -> None:
+        """Note that a drive has lost what its start-up has established, for example by a restart.
 
-        It is a fault. The start-up begins again after the operator's reset.
+        This is a fault. The start-up begins again after the operator's reset.
 
         Args:
             i: Index of the drive.
-            reason: Why, such as "position unknown after a restart".
+            reason: Cause for the operator, such as "position unknown after a restart".
         """
         progress = self._progress[i]
         if not progress.failure:
-            self._fail(i, progress, reason)
-        self._publish()
+            self._abort_start_up(i, progress, reason)
+        self._publish_not_ready_reasons()
 
     def abort(self, reason: str) -> None:
-        """End all steps that are under way, as after an emergency stop; they begin again after a reset.
+        """Abort all steps that are in progress, for example after an emergency stop; a reset starts them again.
 
         Args:
-            reason: Why, for the operator.
+            reason: Cause for the operator.
         """
         for i, progress in enumerate(self._progress):
-            if progress.begun_ns is not None:
+            if progress.start_time_ns is not None:
                 step_name = self._steps[progress.step].name
-                self._fail(i, progress, f"{step_name} was aborted: {reason}")
+                self._abort_start_up(i, progress, f"{step_name} was aborted: {reason}")
                 progress.is_fault = False
-        self._publish()
+        self._publish_not_ready_reasons()
 
     def reset(self, drives: frozenset[int]) -> None:
-        """Begin again, after the operator's reset, with those of these drives whose start-up has failed."""
+        """Restart the start-up of those of these drives whose start-up has failed, after the operator's reset."""
         for i in drives:
             if self._progress[i].failure:
                 self._progress[i] = _Progress()
-        self._publish()
+        self._publish_not_ready_reasons()
 
     def findings(self) -> list[Finding]:
-        """Return a finding for each drive whose start-up has failed or counts no more."""
+        """Return a finding for each drive whose start-up has failed or was invalidated."""
         findings: list[Finding] = []
         for i, progress in enumerate(self._progress):
             if progress.is_fault:
-                findings.append(Finding("drive_not_ready", f"{self._labels[i]}: {progress.failure}", i, alone=True))
+                findings.append(
+                    Finding("drive_not_ready", f"{self._labels[i]}: {progress.failure}", i, affects_only_joint=True)
+                )
         return findings
 
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _update_drive(self, i: int, progress: _Progress) -> None:
-        """Begin the present step, or go on to the next one if the drive has acknowledged it."""
-        while progress.step < len(self._steps) and not self._is_forbidden(progress):
+        """Start the current step of a drive, or the next one if the drive has acknowledged the current one.
+
+        A step that fails or exceeds its time limit is aborted, and ends the start-up of the drive.
+
+        Args:
+            i: Index of the drive.
+            progress: Progress of the drive, which is updated.
+        """
+        while progress.step < len(self._steps) and not self._is_motion_forbidden(progress):
             step = self._steps[progress.step]
-            if progress.begun_ns is None:
-                progress.begun_ns = self._clock_ns()
-                step.begin(i)
-                return  # the answer comes in a later cycle
+            if progress.start_time_ns is None:
+                progress.start_time_ns = self._clock_ns()
+                step.start(i)
+                return  # the drive responds in a later cycle
             try:
                 is_done = step.is_done(i)
             except StepFailedError as error:
-                self._fail(i, progress, f"{step.name} failed: {error}")
+                self._abort_start_up(i, progress, f"{step.name} failed: {error}")
                 return
             if not is_done:
-                if self._elapsed_s(progress) > step.limit_s:
-                    self._fail(i, progress, f"{step.name} did not end within {step.limit_s:g} s")
+                if self._elapsed_s(progress) > step.timeout_s:
+                    self._abort_start_up(i, progress, f"{step.name} did not end within {step.timeout_s:g} s")
                 return
             progress.step += 1
-            progress.begun_ns = None
+            progress.start_time_ns = None
 
-    def _fail(self, i: int, progress: _Progress, failure: str) -> None:
-        """End the present step and the start-up."""
-        if progress.begun_ns is not None:
+    def _abort_start_up(self, i: int, progress: _Progress, failure: str) -> None:
+        """Abort the current step, and end the start-up of a drive with a failure."""
+        if progress.start_time_ns is not None:
             self._steps[progress.step].abort(i)
-            progress.begun_ns = None
+            progress.start_time_ns = None
         progress.failure = failure
         progress.is_fault = True
 
-    def _is_forbidden(self, progress: _Progress) -> bool:
+    def _is_motion_forbidden(self, progress: _Progress) -> bool:
         if progress.step == len(self._steps):
             return False
-        return self._steps[progress.step].moves and not self._may_move
+        return self._steps[progress.step].moves_joint and not self._may_move
 
     def _elapsed_s(self, progress: _Progress) -> float:
-        begun_ns = progress.begun_ns
-        return 0.0 if begun_ns is None else (self._clock_ns() - begun_ns) * 1e-9
+        start_time_ns = progress.start_time_ns
+        return 0.0 if start_time_ns is None else (self._clock_ns() - start_time_ns) * 1e-9
 
-    def _publish(self) -> None:
-        """Put into the readings why each drive is not ready."""
+    def _publish_not_ready_reasons(self) -> None:
+        """Store in the readings why each drive is not ready."""
         for i, progress in enumerate(self._progress):
-            reason = self._describe(progress)
+            reason = self._describe_not_ready_reason(progress)
             self._readings.set_not_ready(i, f"{self._labels[i]}: {reason}" if reason else "")
 
-    def _describe(self, progress: _Progress) -> str:
+    def _describe_not_ready_reason(self, progress: _Progress) -> str:
         """Return the step and the reason why a drive is not ready; empty if it is."""
         if progress.failure:
             return f"{progress.failure}; `snakesim robot reset` begins its start-up again"
         if progress.step == len(self._steps):
             return ""
         step = self._steps[progress.step]
-        if self._is_forbidden(progress):
+        if self._is_motion_forbidden(progress):
             return f"{step.name} moves the joint, and the settings of its driver do not allow that at the start"
-        return f"{step.name}, {self._elapsed_s(progress):.1f} of {step.limit_s:g} s"
+        return f"{step.name}, {self._elapsed_s(progress):.1f} of {step.timeout_s:g} s"

@@ -54,34 +54,38 @@ class PoseCamera:
     """
 
     def __init__(self, sensor: PoseSensor, physics_model: PhysicsModel, seed: Sequence[int], period_ns: int) -> None:
-        """Begin without any captured pose.
+        """Create a camera that has not captured any pose yet.
 
         Args:
-            sensor: The entry of the robot file.
-            physics_model: The model to measure.
-            seed: Seed of the noise.
-            period_ns: Time between two captures.
+            sensor: Pose sensor of the robot file, with its noise and delay.
+            physics_model: Physics model whose base pose is measured.
+            seed: Entropy for `numpy.random.default_rng`, from which the noise is drawn.
+            period_ns: Time from one capture to the next.
         """
         self._physics_model = physics_model
         delay_periods = round(sensor.delay_s * 1e9 / period_ns)
-        self._delayed: deque[MocapSample] = deque(maxlen=1 + delay_periods)
+        self._captured_samples: deque[MocapSample] = deque(maxlen=1 + delay_periods)
         self._draw_normal = np.random.default_rng(seed).standard_normal
-        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion has half the angle
-        self._sigma = np.repeat(sigma, 3)
+        noise_sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion has half the angle
+        self._noise_sigma = np.repeat(noise_sigma, 3)
 
     def capture(self, timestamp_ns: int) -> MocapSample | None:
-        """Capture the pose of the base, with noise, and return the capture that arrives now. Velocities have no noise.
+        """Capture the pose of the base, with noise, and return the delayed capture that arrives now.
+
+        Velocities have no noise.
 
         Args:
-            timestamp_ns: The present time of the motion-capture system.
+            timestamp_ns: Current time of the motion-capture system.
 
         Returns:
-            The pose that arrives now, captured before the delay; None until the first one arrives, or without a world.
+            The capture that was made one delay ago; None until the first one arrives, or if the physics model has no
+            world.
         """
         pose = self._physics_model.pose()
         if pose is None:
             return None
-        error_x, error_y, error_z, a, b, c = (self._sigma * self._draw_normal(6)).tolist()
+        # Position errors, then the vector part (a, b, c) of the small random rotation.
+        error_x, error_y, error_z, a, b, c = (self._noise_sigma * self._draw_normal(6)).tolist()
         x, y, z = pose.position_w
         sample = MocapSample(
             timestamp_ns=timestamp_ns,
@@ -90,10 +94,10 @@ class PoseCamera:
             velocity_w=pose.velocity_w,
             angular_velocity_w=pose.angular_velocity_w,
         )
-        self._delayed.append(sample)
-        if len(self._delayed) < (self._delayed.maxlen or 0):
+        self._captured_samples.append(sample)
+        if len(self._captured_samples) < (self._captured_samples.maxlen or 0):  # the delay has not passed yet
             return None
-        return self._delayed[0]
+        return self._captured_samples[0]
 
 
 def _rotate_slightly(wxyz: Quaternion, a: float, b: float, c: float) -> Quaternion:

@@ -27,24 +27,24 @@ from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Pose
 
-MAX_BYTES = 2048  # of a datagram
+MAX_DATAGRAM_BYTES = 2048  # of a datagram
 # Datagrams a control cycle: six times those of a camera with 1 kHz in 10 ms. Rejecting them takes 0.6 ms at worst.
-MAX_AT_ONCE = 64
+MAX_DATAGRAMS_PER_CYCLE = 64
 RECEIVE_BUFFER_BYTES = 1 << 15  # the kernel buffers about as many datagrams, so that the rest of a flood is soon read
 MAX_NORM_ERROR = 0.05  # of a unit quaternion
-MAX_GAP_NS = 200_000_000  # between two poses that give a velocity
+MAX_VELOCITY_INTERVAL_NS = 200_000_000  # between two poses that give a velocity
 MAX_SPEED_M_S = 100.0  # of the base; poses that are further apart are of two bodies, or of confused markers
 MAX_DETAIL_CHARACTERS = 200  # of the error of a malformed datagram in the log
 
 _log = logging.getLogger("snakesim.mocap")
 
 
-def check_pose(config: RunConfig, pose_listen: str | None) -> None:
+def validate_pose_settings(config: RunConfig, pose_listen: str | None) -> None:
     """Check that the robot file has the delay of motion capture if a setting names its address.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
-        pose_listen: The setting; None or empty: no receiver.
+        pose_listen: Address HOST:PORT of the setting; None or empty if poses are not received.
 
     Raises:
         ConfigError: The robot file has no pose sensor.
@@ -59,20 +59,24 @@ def check_pose(config: RunConfig, pose_listen: str | None) -> None:
 
 
 def make_receiver(
-    config: RunConfig, pose_listen: str | None, *, emulators: bool, clock: Callable[[int], int]
+    config: RunConfig, pose_listen: str | None, *, are_emulated: bool, clock: Callable[[int], int]
 ) -> "MocapReceiver | None":
     """Create a receiver of motion capture if the robot has a pose sensor and there is an address.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
-        pose_listen: HOST:PORT to listen on; None or empty: emulators send to any free port.
-        emulators: Whether this process emulates the drives, and motion capture with them.
-        clock: Returns the time of the driver's clock in ns, for a robot time in ns.
+        pose_listen: HOST:PORT to listen on. If None or empty, emulated motion capture uses any free port, and poses
+            from a real system are not received.
+        are_emulated: Whether this process emulates the drives, and motion capture with them.
+        clock: Function that converts a robot time to the time of the driver's clock, both in ns.
+
+    Returns:
+        The open receiver; None if the robot has no pose sensor or there is no address.
 
     Raises:
         ConfigError: The address cannot be used.
     """
-    address = pose_listen or ("127.0.0.1:0" if emulators else "")
+    address = pose_listen or ("127.0.0.1:0" if are_emulated else "")
     pose_sensor = config.robot.sensors.pose
     if pose_sensor is None or not address:
         return None
@@ -87,9 +91,9 @@ class MocapReceiver:
 
         Args:
             address: HOST:PORT to listen on.
-            delay_s: Minimum time from capture to arrival.
-            clock: Returns the time of the driver's clock in ns, for a robot time in ns.
-            setting: The setting that named the address, for messages.
+            delay_s: Minimum duration from the capture of a pose to its arrival.
+            clock: Function that converts a robot time to the time of the driver's clock, both in ns.
+            setting: Name of the setting with the address, used in error messages.
 
         Raises:
             ConfigError: The address cannot be used.
@@ -100,10 +104,10 @@ class MocapReceiver:
         self._delay_ns = round(delay_s * 1e9)
         self._decoder = msgspec.json.Decoder(MocapSample)
         self._times = CaptureTimes()
-        self._known_jumps = 0  # of the other clock, as far as they were logged
+        self._logged_jump_count = 0  # of the other clock, as far as they were logged
         self._last_sample: MocapSample | None = None
         self._last_timestamp_ns = -1  # of the newest pose that was returned, in robot time
-        self.refused: Counter[str] = Counter()  # datagrams, by reason
+        self.rejected_count_by_reason: Counter[str] = Counter()  # datagrams, by reason
 
     @property
     def address(self) -> str:
@@ -112,11 +116,15 @@ class MocapReceiver:
         return f"{host}:{port}"
 
     def read_newest(self, tick: int, timestamp_ns: int) -> Pose | None:
-        """Return the newest pose since the last call, with the robot time of its capture; None without a valid one.
+        """Return the newest pose that has arrived since the last call, with the robot time of its capture.
 
         Args:
-            tick: Number of the control cycle, which the pose carries.
-            timestamp_ns: The present robot time.
+            tick: Number of the control cycle, which is stored in the pose.
+            timestamp_ns: Current robot time.
+
+        Returns:
+            The pose; None if no valid pose has arrived, its velocity is unknown, or it was captured before the robot's
+            time began.
 
         Raises:
             BackendError: The socket has failed.
@@ -127,10 +135,10 @@ class MocapReceiver:
             return None
         previous = self._last_sample
         self._last_sample = sample
-        velocities = self._find_velocities(previous, sample)
+        velocities = self._find_or_derive_velocities(previous, sample)
         if velocities is None:
             return None
-        age_ns = self._times.lateness_ns(sample.timestamp_ns, now_ns) + self._delay_ns
+        age_ns = self._times.compute_lateness_ns(sample.timestamp_ns, now_ns) + self._delay_ns
         if age_ns > timestamp_ns:  # captured before the robot's time began
             return None
         # A late control cycle makes poses that arrived meanwhile seem older. Each was captured after the one before.
@@ -147,25 +155,29 @@ class MocapReceiver:
 
     def close(self) -> None:
         """Stop listening, and log the rejected datagrams."""
-        if self.refused:
-            counts = ", ".join(f"{count} {reason}" for reason, count in self.refused.most_common())
-            _log.warning("pose: datagrams rejected: %s; its clock jumped %d times", counts, self._times.jumps)
+        if self.rejected_count_by_reason:
+            counts = ", ".join(f"{count} {reason}" for reason, count in self.rejected_count_by_reason.most_common())
+            _log.warning("pose: datagrams rejected: %s; its clock jumped %d times", counts, self._times.jump_count)
         self._socket.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _find_newest_sample(self, now_ns: int) -> MocapSample | None:
-        """Return the newest valid sample of those that have arrived."""
+        """Return the newest valid sample of those that have arrived; None if there is none.
+
+        All rejected samples are counted. After a jump of the other clock the last sample is forgotten, because a
+        velocity cannot be derived across the jump.
+        """
         samples = self._read_samples()
         newest: MocapSample | None = None
-        refusals = self._times.find_refusals([sample.timestamp_ns for sample in samples], now_ns)
-        for sample, refusal in zip(samples, refusals, strict=True):
-            if refusal is None:
+        rejections = self._times.check_timestamps([sample.timestamp_ns for sample in samples], now_ns)
+        for sample, rejection in zip(samples, rejections, strict=True):
+            if rejection is None:
                 newest = sample
             else:
-                self._refuse(refusal, f"timestamp_ns = {sample.timestamp_ns}")
-        if self._times.jumps != self._known_jumps:
-            self._known_jumps = self._times.jumps
+                self._count_rejection(rejection, f"timestamp_ns = {sample.timestamp_ns}")
+        if self._times.jump_count != self._logged_jump_count:
+            self._logged_jump_count = self._times.jump_count
             self._last_sample = None
             _log.warning("pose: the clock of the motion-capture system has jumped; its new time is accepted")
         return newest
@@ -173,9 +185,9 @@ class MocapReceiver:
     def _read_samples(self) -> list[MocapSample]:
         """Return well-formed samples in their order of arrival; read at most `MAX_AT_ONCE` datagrams."""
         samples: list[MocapSample] = []
-        for _ in range(MAX_AT_ONCE):
+        for _ in range(MAX_DATAGRAMS_PER_CYCLE):
             try:
-                datagram = self._socket.recv(MAX_BYTES)
+                datagram = self._socket.recv(MAX_DATAGRAM_BYTES)
             except BlockingIOError:
                 break
             except OSError as error:
@@ -192,29 +204,31 @@ class MocapReceiver:
         try:
             sample = self._decoder.decode(datagram)
         except UNDECODABLE as error:
-            self._refuse("malformed", str(error)[:MAX_DETAIL_CHARACTERS])
+            self._count_rejection("malformed", str(error)[:MAX_DETAIL_CHARACTERS])
             return None
         norm = math.hypot(*sample.orientation_wxyz)
         if abs(norm - 1.0) > MAX_NORM_ERROR:
-            self._refuse("malformed", f"orientation_wxyz = {sample.orientation_wxyz} is not a unit quaternion")
+            self._count_rejection("malformed", f"orientation_wxyz = {sample.orientation_wxyz} is not a unit quaternion")
             return None
         return sample
 
-    def _refuse(self, reason: str, detail: str) -> None:
+    def _count_rejection(self, reason: str, detail: str) -> None:
         """Count a rejected datagram. The first of each reason is logged, and `close` logs the totals."""
-        self.refused[reason] += 1
-        if self.refused[reason] == 1:
+        self.rejected_count_by_reason[reason] += 1
+        if self.rejected_count_by_reason[reason] == 1:
             _log.warning("pose: first %s datagram: %s; more are only counted", reason, detail)
 
-    def _find_velocities(self, previous: MocapSample | None, sample: MocapSample) -> tuple[q.Vector, q.Vector] | None:
-        """Return linear and angular velocity in the world; None if they are neither sent nor derived from two poses."""
+    def _find_or_derive_velocities(
+        self, previous: MocapSample | None, sample: MocapSample
+    ) -> tuple[q.Vector, q.Vector] | None:
+        """Return linear and angular velocity in the world, as sent or as derived from two poses; None if impossible."""
         if sample.velocity_w is not None and sample.angular_velocity_w is not None:
             return sample.velocity_w, sample.angular_velocity_w
-        if previous is None or sample.timestamp_ns - previous.timestamp_ns > MAX_GAP_NS:
+        if previous is None or sample.timestamp_ns - previous.timestamp_ns > MAX_VELOCITY_INTERVAL_NS:
             return None
         duration_s = (sample.timestamp_ns - previous.timestamp_ns) * 1e-9
         if math.dist(previous.position_w, sample.position_w) > MAX_SPEED_M_S * duration_s:
-            self._refuse("leap", f"from {previous.position_w} to {sample.position_w} m in {duration_s:.3g} s")
+            self._count_rejection("leap", f"from {previous.position_w} to {sample.position_w} m in {duration_s:.3g} s")
             return None
         velocity_w = sample.velocity_w or _derive_velocity(previous, sample, duration_s)
         angular_velocity_w = sample.angular_velocity_w or _derive_angular_velocity(previous, sample, duration_s)
@@ -253,17 +267,17 @@ def _derive_angular_velocity(previous: MocapSample, sample: MocapSample, duratio
     The sign is that of the shorter rotation, because q and -q are the same orientation.
 
     Args:
-        previous: The earlier pose.
-        sample: The later pose.
-        duration_s: Time between the two.
+        previous: Sample with the earlier orientation.
+        sample: Sample with the later orientation.
+        duration_s: Time from the earlier to the later sample.
 
     Returns:
-        (3,) in rad/s, in the world frame.
+        Angular velocity in rad/s in the world frame, (x, y, z).
     """
     w1, x1, y1, z1 = previous.orientation_wxyz
     w2, x2, y2, z2 = sample.orientation_wxyz
-    cosine = sum(i * j for i, j in zip(previous.orientation_wxyz, sample.orientation_wxyz, strict=True))
-    factor = math.copysign(2.0 / duration_s, cosine)
+    quaternion_dot = sum(i * j for i, j in zip(previous.orientation_wxyz, sample.orientation_wxyz, strict=True))
+    factor = math.copysign(2.0 / duration_s, quaternion_dot)
     return (
         factor * (x2 * w1 - w2 * x1 - y2 * z1 + z2 * y1),
         factor * (y2 * w1 - w2 * y1 - z2 * x1 + x2 * z1),

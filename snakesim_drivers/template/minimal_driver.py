@@ -14,7 +14,7 @@ from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_settings import DriveSettings
 from snakesim_drivers.kit.drive_states import DriveStates
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, group_by_port
+from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
@@ -64,7 +64,7 @@ class EmulatedDrive:
     enabled: bool = False
     error: str = ""  # stays until it is cleared, and keeps the drive off
     setpoint: Setpoint = NO_SETPOINT
-    fed_us: float = 0.0  # when the last setpoint came
+    watchdog_fed_us: float = 0.0  # when the last setpoint came
 
 
 class MinimalEmulator(DriveEmulator[BusEnd]):
@@ -77,10 +77,10 @@ class MinimalEmulator(DriveEmulator[BusEnd]):
         super().__init__(body, [], clock_ns)
 
     def __call__(self) -> None:
-        """Simulate up to the present time."""
+        """Simulate up to the current time."""
         with self.body.lock:
             self.catch_up()
-            self.pass_time()
+            self.simulate_to_now()
 
     def request_reports(self, i: int) -> list[Report]:
         """Return the answers to a request: none of a silent drive, and two if two drives have the same id."""
@@ -99,7 +99,7 @@ class MinimalEmulator(DriveEmulator[BusEnd]):
         return [report]
 
     def handle_message(self, i: int, message: Message) -> None:
-        """Let a drive act on a message, unless the message does not reach it."""
+        """Execute a message in a drive, unless the bus is cut or the drive is booting."""
         if self.is_cut or self.body.is_booting(i):
             return
         with self.body.lock:
@@ -114,19 +114,19 @@ class MinimalEmulator(DriveEmulator[BusEnd]):
                     drive.error = ""
                 case Setpoint():
                     drive.setpoint = message
-                    drive.fed_us = self.body.now_us
+                    drive.watchdog_fed_us = self.body.now_us
             self._drive_motor(i)
 
     def on_step(self, now_us: float) -> None:
         """Stop the drives whose watchdog has expired or whose motor is too hot."""
         for i, drive in enumerate(self.drives):
-            if drive.enabled and now_us - drive.fed_us > self._watchdog_us:
-                self._stop(i, "an expired watchdog")
+            if drive.enabled and now_us - drive.watchdog_fed_us > self._watchdog_us:
+                self._latch_error(i, "an expired watchdog")
             if not drive.error and self.body.is_too_hot(i):
-                self._stop(i, "an overheated motor")
+                self._latch_error(i, "an overheated motor")
 
     def restart(self, i: int) -> None:
-        """Put a drive into the state in which it is switched on."""
+        """Put a drive into its state after power-on."""
         self.drives[i] = EmulatedDrive()
         self._drive_motor(i)
 
@@ -134,7 +134,8 @@ class MinimalEmulator(DriveEmulator[BusEnd]):
         """Return for each drive whether its motor is on."""
         return [drive.enabled for drive in self.drives]
 
-    def _stop(self, i: int, error: str) -> None:
+    def _latch_error(self, i: int, error: str) -> None:
+        """Switch a drive off with an error that stays until it is cleared."""
         self.drives[i].error = error
         self.drives[i].enabled = False
         self._drive_motor(i)
@@ -177,7 +178,7 @@ class MinimalDrives(Drives):
 
     def bring_up(self) -> None:
         self.read()
-        missing = [self.labels[i] for i in self.all_drives if not self.readings.is_known(i)]
+        missing = [self.labels[i] for i in self.all_drives if not self.readings.has_reported(i)]
         if missing:
             lines = [f"  {label} does not answer" for label in missing]
             raise BackendError("the robot is not complete; nothing was enabled:", *lines, code="drive/not-complete")
@@ -192,10 +193,10 @@ class MinimalDrives(Drives):
                 self._store_report(i, report)
 
     def send_setpoints(self, command: BusCommand) -> None:
-        for i in sorted(command.following):
+        for i in sorted(command.enabled_drives):
             setpoint = Setpoint(command.modes[i], float(command.targets[i]), float(command.limits_nm[i]))
             self.emulator.handle_message(i, setpoint)
-        for i, drive_command in self.states.next_commands(command.following, emergency=command.emergency):
+        for i, drive_command in self.states.update_commands(command.enabled_drives, emergency=command.emergency):
             match drive_command:
                 case "follow":
                     self.emulator.handle_message(i, "enable")
@@ -243,7 +244,7 @@ class MinimalDrives(Drives):
         self.readings.set_supply(i, report.voltage_v, report.current_a)
         self.readings.set_temperatures(i, report.motor_c, report.board_c)
         self.readings.mark_checked(i)
-        self.states.note_report(i, enabled=report.enabled, state="disabled")
+        self.states.record_report(i, enabled=report.enabled, state="disabled")
         self.states.drives[i].errors = report.error
 
 
@@ -274,4 +275,4 @@ class MinimalBackend(DriverTypeBackend):
             emulator = MinimalEmulator(context.body, clock_ns, context.settings.watchdog_s)
             return MinimalDrives(emulator, joints, readings, clock_ns, context.config.period_ns)
 
-        return group_by_port(context.joints, context.settings, ["memory"], open_drives)
+        return make_bus_specs_by_port(context.joints, context.settings, ["memory"], open_drives)

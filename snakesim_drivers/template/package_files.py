@@ -5,7 +5,7 @@ from pathlib import Path
 
 DRIVER = Path(__file__).with_name("minimal_driver.py")
 
-PYPROJECT = """\
+PYPROJECT_TEMPLATE = """\
 [build-system]
 requires = ["setuptools>=77"]
 build-backend = "setuptools.build_meta"
@@ -29,7 +29,7 @@ pythonpath = ["."]
 addopts = ["--import-mode=importlib", "-p", "snakesim_testing"]
 """
 
-README = """\
+README_TEMPLATE = """\
 # {title} drives for SnakeSIM
 
 `{package}/driver.py` has the protocol, emulated drives and the driver. Replace the protocol by that of your drives.
@@ -43,10 +43,10 @@ pip install --editable .                          # then `--backend {name}` is e
 Not tested on hardware.
 """
 
-INIT = '''"""{title} drives for SnakeSIM."""
+INIT_TEMPLATE = '''"""{title} drives for SnakeSIM."""
 '''
 
-CONFTEST = '''"""The bench on which the contract suite of SnakeSIM tests this driver type."""
+CONFTEST_TEMPLATE = '''"""The bench on which the contract suite of SnakeSIM tests this driver type."""
 
 import pytest
 
@@ -58,10 +58,10 @@ from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
 @pytest.hookimpl(optionalhook=True)
 def pytest_snakesim_benches():
     """Return the driver type with its emulated drives."""
-    return [Bench("{name}", {title}Backend, mute=mute_joint, drives=KitDrives)]
+    return [Bench("{name}", {title}Backend, mute_joint=mute_joint, make_emulated_drives=KitDrives)]
 '''
 
-TEST = '''"""The contract suite of SnakeSIM; see its page docs/hardware/contract-suite.md."""
+CONTRACT_TEST_TEMPLATE = '''"""The contract suite of SnakeSIM; see its page docs/hardware/contract-suite.md."""
 
 {imports}'''
 
@@ -81,27 +81,33 @@ SUBJECTS = (
 
 
 def make_package_files(name: str) -> dict[str, str]:
-    """Return the text of every file of a package, by its path in the package's folder.
+    """Return the text of every file of a new driver package, by its path in the folder of the package.
 
     Args:
-        name: Of the driver type: lower-case words, joined by underscores.
+        name: Name of the driver type: lower-case words, joined by underscores.
     """
     package = f"{name}_driver"
     title = "".join(word.capitalize() for word in name.split("_"))
     imports = "".join(f"from snakesim_testing.contract.test_{subject} import *  # noqa: F403\n" for subject in SUBJECTS)
     values = {"name": name, "dashed": name.replace("_", "-"), "package": package, "title": title, "imports": imports}
     return {
-        "pyproject.toml": PYPROJECT.format(**values),
-        "README.md": README.format(**values),
-        f"{package}/__init__.py": INIT.format(**values),
-        f"{package}/driver.py": _rename_driver(name, title, package),
-        "tests/conftest.py": CONFTEST.format(**values),
-        "tests/test_contract.py": TEST.format(**values),
+        "pyproject.toml": PYPROJECT_TEMPLATE.format(**values),
+        "README.md": README_TEMPLATE.format(**values),
+        f"{package}/__init__.py": INIT_TEMPLATE.format(**values),
+        f"{package}/driver.py": _render_driver_module(name, title, package),
+        "tests/conftest.py": CONFTEST_TEMPLATE.format(**values),
+        "tests/test_contract.py": CONTRACT_TEST_TEMPLATE.format(**values),
     }
 
 
-def _rename_driver(name: str, title: str, package: str) -> str:
-    """Return the minimal driver with the names of another driver type."""
+def _render_driver_module(name: str, title: str, package: str) -> str:
+    """Return the source text of the minimal driver, renamed to another driver type.
+
+    Args:
+        name: Name of the driver type, such as "acme_servo".
+        title: Prefix of its classes, such as "AcmeServo".
+        package: Name of its Python package, such as "acme_servo_driver".
+    """
     text = DRIVER.read_text(encoding="utf-8")
     text = text.replace("./examples/minimal_driver.py", f"./{package}/driver.py")
     text = re.sub(r"\bMinimal(?=[A-Z])", title, text)

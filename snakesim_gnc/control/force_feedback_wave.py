@@ -23,7 +23,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.undulation import LateralUndulation, LateralUndulationParameters, aside_rad
+from snakesim_gnc.control.undulation import LateralUndulation, LateralUndulationParameters, compute_direction_angle_rad
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import Description
@@ -52,7 +52,7 @@ TRAINED_SPACING_M = 0.11
 TRAINED_TORQUE_NM = 7.0
 
 
-def spacing_ratio(robot: Description) -> float:
+def compute_joint_spacing_ratio(robot: Description) -> float:
     """Return the distance between a robot's joints, divided by that of the robot that the waves were trained on."""
     return PlanarBody(robot).spacing_m / TRAINED_SPACING_M
 
@@ -64,66 +64,79 @@ class ForceFeedbackWave(LateralUndulation):
         """Scale a wave that was trained on one robot to the size and torque of another.
 
         Args:
-            robot: description of the robot.
-            time_scale: factor on all times; 2 moves at half the speed.
+            robot: Description of the robot.
+            time_scale: Factor on all times; 2 moves at half the speed.
         """
-        scale = spacing_ratio(robot)
+        scale = compute_joint_spacing_ratio(robot)
         super().__init__(robot, LateralUndulationParameters(period_s=time_scale * PERIOD_S, lag_rad=scale * LAG_RAD))
-        count = len(self._body.bends)
-        x = np.arange(count)[::-1] / max(count - 1, 1)  # 0 at the head, 1 at the tail
+        joint_count = len(self._body.yaw_joints)
+        x = np.arange(joint_count)[::-1] / max(joint_count - 1, 1)  # 0 at the head, 1 at the tail
         self._base_amplitude_rad = scale * (AMPLITUDE_RAD + GROWTH_RAD * x)
-        self._steering_rad = (STEERING_RAD + HEAD_STEERING_RAD * (1.0 - x)) / count
+        self._steering_rad = (STEERING_RAD + HEAD_STEERING_RAD * (1.0 - x)) / joint_count
         # Feedback.
-        self._gains = (ANGLE_GAINS / scale, VELOCITY_GAINS / scale, TORQUE_GAINS)
+        self._feedback_gains = (ANGLE_GAINS / scale, VELOCITY_GAINS / scale, TORQUE_GAINS)
         self._torque_scale = np.array(self._body.torque_limit_nm) / TRAINED_TORQUE_NM
         self._max_feedback_rad = scale * MAX_FEEDBACK_RAD
         self._max_feedback_rad_s = scale * MAX_FEEDBACK_RAD_S / time_scale
-        self._feedback_rad: NDArray[np.float64] | None = None  # of the last tick; None: the next is not limited
+        self._feedback_rad: NDArray[np.float64] | None = None  # of the last tick; None if the next is not limited
 
-    def start_from(self, angles_rad: NDArray[np.float64]) -> None:
-        """Choose the phase, and apply the feedback at once: the change to a wave is smooth anyway."""
-        super().start_from(angles_rad)
+    def match_phase_to_angles(self, angles_rad: NDArray[np.float64]) -> None:
+        """Set the phase at which the wave is most similar to measured joint angles, (n_joints,) in rad.
+
+        The feedback of the next tick is applied without a rate limit, because the change to a wave is smooth anyway.
+        """
+        super().match_phase_to_angles(angles_rad)
         self._feedback_rad = None
 
-    def reference_rad(self, observation: Observation, passed_s: float) -> NDArray[np.float64]:
-        """Return the angles of all joints, (n_joints,), `passed_s` later than in the last call."""
-        reference = super().reference_rad(observation, passed_s)
-        feedback_rad = self._measure_feedback(observation)
+    def compute_reference_rad(self, observation: Observation, elapsed_s: float) -> NDArray[np.float64]:
+        """Advance the wave, and compute the reference angles of all joints with the feedback of the measurements.
+
+        Args:
+            observation: The inputs of this tick.
+            elapsed_s: Time since the last call, which limits the change of the feedback.
+
+        Returns:
+            (n_joints,) angles in rad, tail to head.
+        """
+        reference = super().compute_reference_rad(observation, elapsed_s)
+        feedback_rad = self._compute_feedback_rad(observation)
         if self._feedback_rad is not None:
-            max_change_rad = self._max_feedback_rad_s * passed_s
+            max_change_rad = self._max_feedback_rad_s * elapsed_s
             change_rad = np.clip(feedback_rad - self._feedback_rad, -max_change_rad, max_change_rad)
             feedback_rad = self._feedback_rad + change_rad
         self._feedback_rad = feedback_rad
-        reference[self._body.bends] += feedback_rad
+        reference[self._body.yaw_joints] += feedback_rad
         return reference
 
-    def _measure_feedback(self, observation: Observation) -> NDArray[np.float64]:
+    def _compute_feedback_rad(self, observation: Observation) -> NDArray[np.float64]:
         """Return MAX_FEEDBACK_RAD tanh(sum of gains x measurements), (n_bends,)."""
-        bends = self._body.bends
+        bends = self._body.yaw_joints
         joints = observation.joints
         scaled_torque_nm = np.array(joints.torque_nm) / self._torque_scale
-        total = np.zeros(len(bends))
-        for values, gains in zip((joints.angle_rad, joints.velocity_rad_s, scaled_torque_nm), self._gains, strict=True):
+        weighted_sum = np.zeros(len(bends))
+        for values, gains in zip(
+            (joints.angle_rad, joints.velocity_rad_s, scaled_torque_nm), self._feedback_gains, strict=True
+        ):
             padded = np.pad(np.array(values)[bends], 1)  # the first and the last joint have one neighbor
-            total += gains[0] * padded[:-2] + gains[1] * padded[1:-1] + gains[2] * padded[2:]
-        return self._max_feedback_rad * np.tanh(total)
+            weighted_sum += gains[0] * padded[:-2] + gains[1] * padded[1:-1] + gains[2] * padded[2:]
+        return self._max_feedback_rad * np.tanh(weighted_sum)
 
-    def _bend_rad(self, observation: Observation) -> float | NDArray[np.float64]:
+    def _compute_bend_rad(self, observation: Observation) -> float | NDArray[np.float64]:
         """Return the bend towards the goal. It ignores the path, which a body pushed by obstacles does not follow."""
         if observation.world is None or observation.trajectory is None:
             return 0.0
-        nodes_w = self._body.nodes_w(observation.world, observation.joints.angle_rad).T
+        body_points_w = self._body.compute_body_points_w(observation.world, observation.joints.angle_rad).T
         goal_w = observation.trajectory.goal_w or observation.trajectory.path_w[-1]
-        return self._steering_rad * math.sin(aside_rad(nodes_w, goal_w - nodes_w[-1]))
+        return self._steering_rad * math.sin(compute_direction_angle_rad(body_points_w, goal_w - body_points_w[-1]))
 
-    def _amplitude_rad(
-        self, observation: Observation, _waves: NDArray[np.float64], _passed_s: float
+    def _compute_amplitude_rad(
+        self, observation: Observation, _waves: NDArray[np.float64], _elapsed_s: float
     ) -> NDArray[np.float64]:
         """Return A_i + sum of gains x contact forces, (n_bends,)."""
         forces_n = np.zeros(len(self.robot.links))
         if observation.world is not None:
             for contact in observation.world.contacts:
                 forces_n[contact.link] += math.hypot(*contact.force_w)
-        behind_n = forces_n[:-1][self._body.bends]
-        ahead_n = forces_n[1:][self._body.bends]
+        behind_n = forces_n[:-1][self._body.yaw_joints]
+        ahead_n = forces_n[1:][self._body.yaw_joints]
         return self._base_amplitude_rad + CONTACT_GAINS[0] * behind_n + CONTACT_GAINS[1] * ahead_n

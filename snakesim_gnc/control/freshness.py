@@ -21,12 +21,12 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.freshness import max_state_age_ns
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
-MISSED_SAMPLES = 3  # in a row that are tolerated; the fourth means that the publisher has stopped
+MAX_MISSED_SAMPLES = 3  # in a row that are tolerated; the fourth means that the publisher has stopped
 MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer delays them
 
 # Sensors that a map is made from: the beginnings of their keys, and their name in messages.
 DEPTH_PREFIXES = (keys.DEPTH_ALL.rstrip("*"), keys.RANGE_ALL.rstrip("*"))
-DEPTH = "sensor/depth or sensor/range"
+DEPTH_SENSORS = "sensor/depth or sensor/range"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class AgeLimits:
 
     @staticmethod
     def from_config(config: RunConfig, robot: Description) -> "AgeLimits":
-        """Return the limits of a run: those in its scenario, or else the defaults."""
+        """Compute the age limits of a run: those in its scenario, or else defaults from the rates of the streams."""
         max_age = config.max_age
         period_s = robot.period_ns * 1e-9
         guidance = config.services.get("guidance", ServiceSchedule())
@@ -48,12 +48,12 @@ class AgeLimits:
         guidance_cycle_s = guidance.decimation * period_s
         guidance_latency_s = guidance.latency_ticks * period_s
         navigation_cycle_s = navigation.decimation * period_s
-        planned_s = guidance_cycle_s + guidance_latency_s + navigation.latency_ticks * period_s
+        plan_age_s = guidance_cycle_s + guidance_latency_s + navigation.latency_ticks * period_s
         return AgeLimits(
             joints_s=max_age.joints_s or max_state_age_ns(robot) * 1e-9,
-            world_s=max_age.world_s or guidance_latency_s + _margin_s(guidance_cycle_s),
-            trajectory_s=max_age.trajectory_s or planned_s + _margin_s(navigation_cycle_s),
-            sensors_s=_sensor_limits_s(config, robot, guidance_cycle_s, guidance_latency_s),
+            world_s=max_age.world_s or guidance_latency_s + _compute_silence_margin_s(guidance_cycle_s),
+            trajectory_s=max_age.trajectory_s or plan_age_s + _compute_silence_margin_s(navigation_cycle_s),
+            sensors_s=_compute_sensor_limits_s(config, robot, guidance_cycle_s, guidance_latency_s),
         )
 
     def check_joints(self, joints: JointState, now_ns: int) -> str:
@@ -62,23 +62,23 @@ class AgeLimits:
 
     def check_world(self, world: World, now_ns: int) -> str:
         """Return why a world model is rejected at a robot time; empty if it and the samples in it are fresh."""
-        why = _check_age(keys.WORLD, world.timestamp_ns, now_ns, self.world_s)
-        if why:
-            return why
+        world_reason = _check_age(keys.WORLD, world.timestamp_ns, now_ns, self.world_s)
+        if world_reason:
+            return world_reason
         timestamps_ns = {
             keys.POSE: world.pose_timestamp_ns,
             keys.CONTACTS: world.contacts_timestamp_ns,
-            DEPTH: world.depth_timestamp_ns,
+            DEPTH_SENSORS: world.depth_timestamp_ns,
         }
-        reasons = [_check_age(key, timestamps_ns[key], now_ns, limit_s) for key, limit_s in self.sensors_s.items()]
+        reasons = [_check_age(key, timestamps_ns[key], now_ns, max_age_s) for key, max_age_s in self.sensors_s.items()]
         return "; ".join(filter(None, reasons))
 
     def check_sensors(self, timestamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
         """Find the sensor samples that are too old for the controller.
 
         Args:
-            timestamps_ns: timestamp of the newest sample by key, for every key that has had one.
-            now_ns: robot time.
+            timestamps_ns: Timestamp of the newest sample by key, for every key that has had one.
+            now_ns: Robot time.
 
         Returns:
             The reason for each rejected sample, by key; fresh samples are left out.
@@ -99,29 +99,31 @@ class AgeLimits:
         return _check_age(keys.TRAJECTORY, trajectory.timestamp_ns, now_ns, self.trajectory_s)
 
 
-def _sensor_limits_s(
+def _compute_sensor_limits_s(
     config: RunConfig, robot: Description, guidance_cycle_s: float, guidance_latency_s: float
 ) -> dict[str, float]:
-    """Return the maximum age of the pose, contact and depth samples that a world model is made from.
+    """Compute the maximum age of the pose, contact and depth samples that a world model is made from.
 
     A sample waits for the next cycle of guidance, and the world model is published after guidance's latency. Limits in
     the configuration override these defaults.
 
     Args:
-        config: configuration of the run.
-        robot: description of the robot, with its sensors.
-        guidance_cycle_s: period of guidance.
-        guidance_latency_s: time from a cycle of guidance to the publication of its world model.
+        config: Configuration of the run.
+        robot: Description of the robot, with its sensors.
+        guidance_cycle_s: Period of guidance.
+        guidance_latency_s: Time from a cycle of guidance to the publication of its world model.
 
     Returns:
-        The maximum age in s by key; DEPTH stands for all depth sensors.
+        Maximum age in s by key. A sensor that is absent has no entry. DEPTH_SENSORS is the key for all depth sensors.
     """
     max_age = config.max_age
     configured_s = {keys.POSE: max_age.pose_s, keys.CONTACTS: max_age.contacts_s}
     limits_s: dict[str, float] = {}
     for sensor in robot.sensors:
         if sensor.key in configured_s:
-            default_s = sensor.delay_s + guidance_cycle_s + guidance_latency_s + _margin_s(1.0 / sensor.rate_hz)
+            default_s = (
+                sensor.delay_s + guidance_cycle_s + guidance_latency_s + _compute_silence_margin_s(1.0 / sensor.rate_hz)
+            )
             limits_s[sensor.key] = configured_s[sensor.key] or default_s
 
     if config.uses_dead_reckoning(robot):
@@ -130,39 +132,41 @@ def _sensor_limits_s(
         # The robot's description does not list what this service publishes.
         publisher = config.services[SENSOR]
         period_s = robot.period_ns * 1e-9
-        published_s = publisher.latency_ticks * period_s + _margin_s(publisher.decimation * period_s)
-        limits_s[keys.POSE] = max_age.pose_s or guidance_cycle_s + guidance_latency_s + published_s
+        publication_delay_s = publisher.latency_ticks * period_s + _compute_silence_margin_s(
+            publisher.decimation * period_s
+        )
+        limits_s[keys.POSE] = max_age.pose_s or guidance_cycle_s + guidance_latency_s + publication_delay_s
 
     if config.mission.map == "perceived":
         depth_sensors = [sensor for sensor in robot.sensors if sensor.key.startswith(DEPTH_PREFIXES)]
         if depth_sensors:
             ages_s = [
-                sensor.delay_s + guidance_cycle_s + guidance_latency_s + _margin_s(1.0 / sensor.rate_hz)
+                sensor.delay_s + guidance_cycle_s + guidance_latency_s + _compute_silence_margin_s(1.0 / sensor.rate_hz)
                 for sensor in depth_sensors
             ]
-            limits_s[DEPTH] = max_age.depth_s or min(ages_s)
+            limits_s[DEPTH_SENSORS] = max_age.depth_s or min(ages_s)
     return limits_s
 
 
-def _margin_s(cycle_s: float) -> float:
-    """Return how long a publisher with this cycle may be silent beyond its normal delays."""
-    return max(MISSED_SAMPLES * cycle_s, MIN_MARGIN_S)
+def _compute_silence_margin_s(cycle_s: float) -> float:
+    """Return the time in s for which a publisher with this cycle may be silent beyond its normal delays."""
+    return max(MAX_MISSED_SAMPLES * cycle_s, MIN_MARGIN_S)
 
 
-def _check_age(key: str, timestamp_ns: int | None, now_ns: int, limit_s: float) -> str:
-    """Return why a sample is rejected; empty if its age is within the limit.
+def _check_age(key: str, timestamp_ns: int | None, now_ns: int, max_age_s: float) -> str:
+    """Return why a sample is rejected because of its age; an empty text if its age is within the limit.
 
     Args:
-        key: of the sample.
-        timestamp_ns: of the sample; None: the world model has no such sample.
-        now_ns: robot time.
-        limit_s: maximum age.
+        key: Key of the sample's stream.
+        timestamp_ns: Timestamp of the sample; None if the world model was made without such a sample.
+        now_ns: Robot time.
+        max_age_s: Maximum age.
     """
     if timestamp_ns is None:
         return f"{keys.WORLD} was made without {key}"
     age_s = (now_ns - timestamp_ns) * 1e-9
-    if age_s > limit_s:
-        return f"{key} is {age_s:.3g} s old, at most {limit_s:.3g} s"
-    if age_s < -limit_s:
+    if age_s > max_age_s:
+        return f"{key} is {age_s:.3g} s old, at most {max_age_s:.3g} s"
+    if age_s < -max_age_s:
         return f"{key} is stamped {-age_s:.3g} s ahead of the robot's clock"
     return ""

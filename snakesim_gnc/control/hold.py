@@ -1,6 +1,13 @@
 """Holds every joint at its angle at arming. This is the control condition of experiments, and the safest controller."""
 
-from snakesim_hal.controller import Controller, ControllerCommand, NoParameters, Observation, Telemetry, positions
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    NoParameters,
+    Observation,
+    Telemetry,
+    make_position_setpoints,
+)
 from snakesim_hal.wire.messages import Description
 
 
@@ -11,12 +18,13 @@ class Hold(Controller[NoParameters]):
 
     def __init__(self, robot: Description, parameters: NoParameters) -> None:
         super().__init__(robot, parameters)
-        self._angles_rad: list[float] | None = None  # None: there has been no observation yet
+        self._start_angles_rad: list[float] | None = None  # None if there has been no observation yet
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Return the angles of the first observation."""
-        if self._angles_rad is None:
-            self._angles_rad = list(observation.joints.angle_rad)
+        if self._start_angles_rad is None:
+            self._start_angles_rad = list(observation.joints.angle_rad)
         return ControllerCommand(
-            positions(self.robot, self._angles_rad), Telemetry(reason="holding", reference_rad=self._angles_rad)
+            make_position_setpoints(self.robot, self._start_angles_rad),
+            Telemetry(reason="holding", reference_rad=self._start_angles_rad),
         )

@@ -11,24 +11,26 @@ import random
 from dataclasses import dataclass
 from typing import Annotated
 
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import bounded
 
-MARGIN_RAD = 0.02  # between a target and the joint's limit
-SPEED_RATIO = 0.8  # of a target's maximum speed to the joint's limit, so that the drive never limits the motion itself
+JOINT_LIMIT_MARGIN_RAD = 0.02  # between a target and the joint's limit
+MAX_SPEED_RATIO = (
+    0.8  # of a target's maximum speed to the joint's limit, so that the drive never limits the motion itself
+)
 TONES_PER_JOINT = 4  # one in each quarter of the band
-BAND_RATIO = 10  # of the highest to the lowest frequency
-SEED = 25  # of the phases, so that every run moves alike
+MAX_TO_MIN_FREQUENCY_RATIO = 10  # of the highest to the lowest frequency
+PHASE_SEED = 25  # of the phases, so that every run moves alike
 
 
 @dataclass(frozen=True)
-class Tone:
-    """One of the sine waves that a joint shakes with."""
+class SineTone:
+    """One of the sine waves whose sum is the fast motion of a joint."""
 
     frequency_hz: float
-    amplitude: float  # as a fraction of the joint's whole shaking
+    amplitude: float  # fraction of the sum of all amplitudes of the joint
     phase_rad: float
 
 
@@ -71,90 +73,108 @@ class Identify(Controller[IdentifyParameters]):
 
     def __init__(self, robot: Description, parameters: IdentifyParameters) -> None:
         super().__init__(robot, parameters)
-        self._tones = make_tones(len(robot.joints), parameters.shake_to_hz)
-        self._start_rad: list[float] = []  # empty: there has been no observation yet
-        self._last_rad: list[float] = []  # targets of the tick before
+        self._tones = make_multisine_tones(len(robot.joints), parameters.shake_to_hz)
+        self._start_angles_rad: list[float] = []  # empty if there has been no observation yet
+        self._last_targets_rad: list[float] = []  # targets of the tick before
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return position targets that swing and shake every joint about its start angle, within its limits.
+        """Return position targets that excite every joint about its start angle, for system identification.
 
-        System identification uses the response of the joints. Amplitudes fade in, and the speed is limited.
+        The excitation of a joint is a slow triangle wave, to which a multisine (a sum of sine tones) is added after
+        `shake_after_s`. Amplitudes fade in. Targets are kept within the joint's limits of angle and speed.
 
         Args:
-            observation: the inputs of this tick; the first one sets the start angles.
+            observation: The inputs of this tick; the first one sets the start angles.
 
         Returns:
-            Position setpoints of all joints, with a telemetry that names the present motion.
+            Position setpoints of all joints, with telemetry that names the current phase.
         """
-        if not self._start_rad:
-            self._start_rad = list(observation.joints.angle_rad)
-        swing_rad = self.parameters.swing_rad * self._fade_in(observation.time_s)
-        shaking_s = observation.time_s - self.parameters.shake_after_s
-        shake_rad = self.parameters.shake_rad * self._fade_in(shaking_s)
+        if not self._start_angles_rad:
+            self._start_angles_rad = list(observation.joints.angle_rad)
+        triangle_amplitude_rad = self.parameters.swing_rad * self._compute_fade_in_fraction(observation.time_s)
+        multisine_time_s = observation.time_s - self.parameters.shake_after_s
+        multisine_amplitude_rad = self.parameters.shake_rad * self._compute_fade_in_fraction(multisine_time_s)
         targets_rad: list[float] = []
         for i, joint in enumerate(self.robot.joints):
-            offset_rad = self._swing(i, observation.time_s, swing_rad) + self._shake(i, shaking_s, shake_rad)
-            min_rad = joint.angle_min_rad + MARGIN_RAD
-            max_rad = joint.angle_max_rad - MARGIN_RAD
-            targets_rad.append(min(max(self._start_rad[i] + offset_rad, min_rad), max_rad))
-        if self._last_rad:
-            targets_rad = self._limit_speed(targets_rad, observation.period_s)
-        self._last_rad = targets_rad
-        phase = "shaking every joint" if shake_rad else "slowly back and forth, every joint"
-        return ControllerCommand(positions(self.robot, targets_rad), Telemetry(reason=phase, reference_rad=targets_rad))
+            triangle_rad = self._compute_triangle_offset_rad(i, observation.time_s, triangle_amplitude_rad)
+            multisine_rad = self._compute_multisine_offset_rad(i, multisine_time_s, multisine_amplitude_rad)
+            offset_rad = triangle_rad + multisine_rad
+            min_rad = joint.angle_min_rad + JOINT_LIMIT_MARGIN_RAD
+            max_rad = joint.angle_max_rad - JOINT_LIMIT_MARGIN_RAD
+            targets_rad.append(min(max(self._start_angles_rad[i] + offset_rad, min_rad), max_rad))
+        if self._last_targets_rad:
+            targets_rad = self._limit_target_speed(targets_rad, observation.period_s)
+        self._last_targets_rad = targets_rad
+        phase = "shaking every joint" if multisine_amplitude_rad else "slowly back and forth, every joint"
+        return ControllerCommand(
+            make_position_setpoints(self.robot, targets_rad), Telemetry(reason=phase, reference_rad=targets_rad)
+        )
 
-    def _fade_in(self, time_s: float) -> float:
-        """Return the fraction of the full size at a time after the beginning of a motion, 0 to 1."""
+    def _compute_fade_in_fraction(self, time_s: float) -> float:
+        """Return the fraction of the full amplitude, 0 to 1, at a time after the start of a motion."""
         return min(max(time_s / self.parameters.fade_s, 0.0), 1.0)
 
-    def _swing(self, i: int, time_s: float, swing_rad: float) -> float:
-        """Return the slow motion of a joint. The period grows towards the head, to one and a half times the first."""
-        period_s = self.parameters.swing_s * (1 + i / (2 * len(self.robot.joints)))
-        sign = (-1) ** (i // 2 + i)
-        return sign * swing_rad * triangle_wave(time_s / period_s)
+    def _compute_triangle_offset_rad(self, joint_index: int, time_s: float, amplitude_rad: float) -> float:
+        """Return the offset of the slow triangle wave from the start angle of a joint, in rad.
 
-    def _shake(self, i: int, shaking_s: float, shake_rad: float) -> float:
-        """Return the shaking of a joint."""
-        total = sum(
-            tone.amplitude * math.sin(math.tau * tone.frequency_hz * shaking_s + tone.phase_rad)
-            for tone in self._tones[i]
+        The period grows towards the head, from `swing_s` to nearly one and a half times as much. The start directions
+        repeat as +, -, -, + from the tail, so that the body stays near the vertical.
+        """
+        period_s = self.parameters.swing_s * (1 + joint_index / (2 * len(self.robot.joints)))
+        sign = (-1) ** (joint_index // 2 + joint_index)
+        return sign * amplitude_rad * compute_triangle_wave(time_s / period_s)
+
+    def _compute_multisine_offset_rad(self, joint_index: int, multisine_time_s: float, amplitude_rad: float) -> float:
+        """Return the offset of the multisine from the start angle of a joint, in rad."""
+        unit_sum = sum(
+            tone.amplitude * math.sin(math.tau * tone.frequency_hz * multisine_time_s + tone.phase_rad)
+            for tone in self._tones[joint_index]
         )
-        return shake_rad * total
+        return amplitude_rad * unit_sum
 
-    def _limit_speed(self, targets_rad: list[float], period_s: float) -> list[float]:
-        """Return targets that no joint has to move too fast for."""
+    def _limit_target_speed(self, targets_rad: list[float], period_s: float) -> list[float]:
+        """Return the targets, bounded so that each joint moves at most at MAX_SPEED_RATIO times its speed limit."""
         limited_rad: list[float] = []
-        for joint, target_rad, last_rad in zip(self.robot.joints, targets_rad, self._last_rad, strict=True):
-            max_step_rad = SPEED_RATIO * joint.speed_limit_rad_s * period_s
+        for joint, target_rad, last_rad in zip(self.robot.joints, targets_rad, self._last_targets_rad, strict=True):
+            max_step_rad = MAX_SPEED_RATIO * joint.speed_limit_rad_s * period_s
             limited_rad.append(min(max(target_rad, last_rad - max_step_rad), last_rad + max_step_rad))
         return limited_rad
 
 
-def triangle_wave(cycles: float) -> float:
+def compute_triangle_wave(cycles: float) -> float:
     """Return a triangle wave after a number of cycles: from 0 up to 1, down to -1, and back to 0 in one cycle."""
     return 4 * abs((cycles - 0.25) % 1.0 - 0.5) - 1.0
 
 
-def make_tones(joint_count: int, max_hz: float) -> list[list[Tone]]:
-    """Make the sine tones with which system identification shakes each joint.
+def make_multisine_tones(joint_count: int, max_frequency_hz: float) -> list[list[SineTone]]:
+    """Make the sine tones whose sum (a multisine) excites each joint in system identification.
 
-    The frequencies are in geometric progression from max_hz / BAND_RATIO to max_hz, and no two joints have one in
-    common. Amplitudes are proportional to 1 / sqrt(frequency), and those of a joint sum to 1.
+    The frequencies are in geometric progression from max_frequency_hz / MAX_TO_MIN_FREQUENCY_RATIO to max_frequency_hz,
+    and no two joints have one in common. Amplitudes are proportional to 1 / sqrt(frequency), and those of a joint sum
+    to 1.
 
     Args:
-        joint_count: number of joints.
-        max_hz: highest frequency.
+        joint_count: Number of joints.
+        max_frequency_hz: Highest frequency of any tone.
 
     Returns:
         TONES_PER_JOINT tones of each joint, tail to head.
     """
-    rng = random.Random(SEED)
-    min_hz = max_hz / BAND_RATIO
-    count = TONES_PER_JOINT * joint_count
-    frequencies_hz = [min_hz * (max_hz / min_hz) ** (k / max(count - 1, 1)) for k in range(count)]
-    tones: list[list[Tone]] = []
+    rng = random.Random(PHASE_SEED)
+    min_frequency_hz = max_frequency_hz / MAX_TO_MIN_FREQUENCY_RATIO
+    tone_count = TONES_PER_JOINT * joint_count
+    frequencies_hz = [
+        min_frequency_hz * (max_frequency_hz / min_frequency_hz) ** (k / max(tone_count - 1, 1))
+        for k in range(tone_count)
+    ]
+    tones: list[list[SineTone]] = []
     for i in range(joint_count):
-        joint_hz = [frequencies_hz[i + joint_count * k] for k in range(TONES_PER_JOINT)]
-        total = sum(hz**-0.5 for hz in joint_hz)
-        tones.append([Tone(hz, hz**-0.5 / total, rng.uniform(0, math.tau)) for hz in joint_hz])
+        joint_frequencies_hz = [frequencies_hz[i + joint_count * k] for k in range(TONES_PER_JOINT)]
+        total_weight = sum(frequency_hz**-0.5 for frequency_hz in joint_frequencies_hz)
+        tones.append(
+            [
+                SineTone(frequency_hz, frequency_hz**-0.5 / total_weight, rng.uniform(0, math.tau))
+                for frequency_hz in joint_frequencies_hz
+            ]
+        )
     return tones

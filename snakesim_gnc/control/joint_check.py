@@ -7,20 +7,20 @@ evaluates afterwards what the motors, the encoders and the IMUs measured.
 from enum import Enum, auto
 from typing import Annotated
 
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import bounded
 
-MARGIN_RAD = 0.02  # between a target and the joint's limit
+JOINT_LIMIT_MARGIN_RAD = 0.02  # between a target and the joint's limit
 
 
-class _Phase(Enum):
-    """What the joint that is under test does."""
+class _MotionPhase(Enum):
+    """Phases of the motion of the joint under test."""
 
     REST = auto()
-    OUT = auto()
-    BACK = auto()
+    MOVE_OUT = auto()
+    MOVE_BACK = auto()
 
 
 class JointCheckParameters(FileStruct, frozen=True):
@@ -49,21 +49,21 @@ class JointCheck(Controller[JointCheckParameters]):
         """Create a controller that tests one joint after the other, beginning at the tail.
 
         Args:
-            robot: description of the robot, with the limits of the joints.
-            parameters: how far and how fast each joint is moved.
+            robot: Description of the robot, with the limits of the joints.
+            parameters: How far and how fast each joint is moved.
         """
         super().__init__(robot, parameters)
-        self._start_rad: list[float] = []  # empty: there has been no observation yet
+        self._start_angles_rad: list[float] = []  # empty if there has been no observation yet
 
         # The joint under test.
-        self._joint = 0
-        self._sides: list[int] = []  # the sides to which it still has to move: +1, -1
-        self._before_rad = 0.0  # measured before the motion; a drive without current may have let it sink
+        self._joint_index = 0
+        self._remaining_sides: list[int] = []  # the sides to which it still has to move: +1, -1
+        self._angle_before_motion_rad = 0.0  # measured before the motion; a drive without current may have let it sink
 
-        # Its present motion.
-        self._phase = _Phase.REST
-        self._rested_s = 0.0
-        self._offset_rad = 0.0  # between its target and its start angle
+        # Its current motion.
+        self._phase = _MotionPhase.REST
+        self._rest_elapsed_s = 0.0
+        self._target_offset_rad = 0.0  # between its target and its start angle
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Return position targets that move the joint under test, while all others hold their start angles.
@@ -72,89 +72,102 @@ class JointCheck(Controller[JointCheckParameters]):
         other side. After the last joint, all joints hold.
 
         Args:
-            observation: the inputs of this tick; the first one sets the start angles.
+            observation: The inputs of this tick; the first one sets the start angles.
 
         Returns:
-            Position setpoints of all joints, with a telemetry that names the joint under test.
+            Position setpoints of all joints, with telemetry that names the joint under test.
         """
-        if not self._start_rad:
-            self._start_rad = list(observation.joints.angle_rad)
-            self._sides = self._plan_sides(self._joint)
-        if self._joint == len(self.robot.joints):
+        if not self._start_angles_rad:
+            self._start_angles_rad = list(observation.joints.angle_rad)
+            self._remaining_sides = self._plan_sides(self._joint_index)
+        if self._joint_index == len(self.robot.joints):
             return self._hold_pose("every joint was moved")
-        name = self.robot.joints[self._joint].name
+        name = self.robot.joints[self._joint_index].name
         match self._phase:
-            case _Phase.REST:
+            case _MotionPhase.REST:
                 self._update_rest(observation)
                 return self._hold_pose(f"resting beside the motion of {name}")
-            case _Phase.OUT:
+            case _MotionPhase.MOVE_OUT:
                 self._move_out(observation)
-            case _Phase.BACK:
+            case _MotionPhase.MOVE_BACK:
                 self._move_back(observation)
-        targets = list(self._start_rad)
-        if self._joint < len(targets) and self._sides:
-            targets[self._joint] += self._sides[0] * self._offset_rad
+        targets_rad = list(self._start_angles_rad)
+        if self._joint_index < len(targets_rad) and self._remaining_sides:
+            targets_rad[self._joint_index] += self._remaining_sides[0] * self._target_offset_rad
         return ControllerCommand(
-            positions(self.robot, targets), Telemetry(reason=f"moving {name}", reference_rad=targets)
+            make_position_setpoints(self.robot, targets_rad),
+            Telemetry(reason=f"moving {name}", reference_rad=targets_rad),
         )
 
-    def _hold_pose(self, why: str) -> ControllerCommand:
-        return ControllerCommand(positions(self.robot, self._start_rad), Telemetry(reason=why))
+    def _hold_pose(self, reason: str) -> ControllerCommand:
+        """Return setpoints that hold every joint at its start angle. The reason is reported as telemetry."""
+        return ControllerCommand(make_position_setpoints(self.robot, self._start_angles_rad), Telemetry(reason=reason))
 
     def _update_rest(self, observation: Observation) -> None:
-        """Wait before a motion, and after the last one of a joint."""
-        self._rested_s += observation.period_s
-        if self._rested_s < self.parameters.rest_s:
+        """Advance the rest before a motion; when the rest is over, start the next motion or select the next joint."""
+        self._rest_elapsed_s += observation.period_s
+        if self._rest_elapsed_s < self.parameters.rest_s:
             return
-        self._rested_s = 0.0
-        if not self._sides:
-            self._begin_joint(self._joint + 1)
-            if self._joint == len(self.robot.joints):
+        self._rest_elapsed_s = 0.0
+        if not self._remaining_sides:
+            self._start_joint(self._joint_index + 1)
+            if self._joint_index == len(self.robot.joints):
                 return
-        self._before_rad = observation.joints.angle_rad[self._joint]
-        self._phase = _Phase.OUT
+        self._angle_before_motion_rad = observation.joints.angle_rad[self._joint_index]
+        self._phase = _MotionPhase.MOVE_OUT
 
-    def _begin_joint(self, joint: int) -> None:
-        """Test another joint; the number of joints means that all have been tested."""
-        self._joint = joint
-        if joint < len(self.robot.joints):
-            self._sides = self._plan_sides(joint)
+    def _start_joint(self, joint_index: int) -> None:
+        """Select the joint to test next. An index equal to the number of joints means that all have been tested."""
+        self._joint_index = joint_index
+        if joint_index < len(self.robot.joints):
+            self._remaining_sides = self._plan_sides(joint_index)
 
     def _move_out(self, observation: Observation) -> None:
-        """Move the target further until the joint has moved as far as it should, or does not follow."""
+        """Move the target away from the start angle, and decide whether the joint has moved far enough or is stuck.
+
+        A joint that has moved by `move_rad` moves back next. A joint whose target has reached the maximum offset
+        without that counts as stuck: its target moves back, and it is not moved to the other side.
+        """
         parameters = self.parameters
-        self._offset_rad += parameters.speed_rad_s * observation.period_s
-        moved_rad = abs(observation.joints.angle_rad[self._joint] - self._before_rad)
-        furthest_rad = min(parameters.give_up_rad, self._room_rad(self._joint, self._sides[0]))
+        self._target_offset_rad += parameters.speed_rad_s * observation.period_s
+        moved_rad = abs(observation.joints.angle_rad[self._joint_index] - self._angle_before_motion_rad)
+        max_offset_rad = min(
+            parameters.give_up_rad, self._compute_free_range_rad(self._joint_index, self._remaining_sides[0])
+        )
         if moved_rad >= parameters.move_rad:
-            self._phase = _Phase.BACK
-        elif self._offset_rad >= furthest_rad:
+            self._phase = _MotionPhase.MOVE_BACK
+        elif self._target_offset_rad >= max_offset_rad:
             # A joint that does not follow is not moved to the other side.
-            del self._sides[1:]
-            self._phase = _Phase.BACK
+            del self._remaining_sides[1:]
+            self._phase = _MotionPhase.MOVE_BACK
 
     def _move_back(self, observation: Observation) -> None:
-        """Move the target back to the start angle."""
-        self._offset_rad -= self.parameters.speed_rad_s * observation.period_s
-        if self._offset_rad <= 0:
-            self._offset_rad = 0.0
-            del self._sides[0]
-            self._phase = _Phase.REST
+        """Move the target back towards the start angle; there, the motion to this side is complete."""
+        self._target_offset_rad -= self.parameters.speed_rad_s * observation.period_s
+        if self._target_offset_rad <= 0:
+            self._target_offset_rad = 0.0
+            del self._remaining_sides[0]
+            self._phase = _MotionPhase.REST
 
-    def _plan_sides(self, joint: int) -> list[int]:
-        """Return the sides to which a joint moves: first away from the nearer limit, then back if there is room."""
-        limits = self.robot.joints[joint]
-        is_nearer_to_minimum = 2 * self._start_rad[joint] <= limits.angle_min_rad + limits.angle_max_rad
-        away = 1 if is_nearer_to_minimum else -1
-        has_room = self._room_rad(joint, -away) > self.parameters.move_rad + MARGIN_RAD
+    def _plan_sides(self, joint_index: int) -> list[int]:
+        """Return the sides to which a joint is moved in order, +1 or -1: first away from its nearer limit.
+
+        The other side is left out if the joint has too little range there.
+        """
+        limits = self.robot.joints[joint_index]
+        is_nearer_to_minimum = 2 * self._start_angles_rad[joint_index] <= limits.angle_min_rad + limits.angle_max_rad
+        away_side = 1 if is_nearer_to_minimum else -1
+        has_room = (
+            self._compute_free_range_rad(joint_index, -away_side) > self.parameters.move_rad + JOINT_LIMIT_MARGIN_RAD
+        )
         if has_room:
-            return [away, -away]
-        return [away]
+            return [away_side, -away_side]
+        return [away_side]
 
-    def _room_rad(self, joint: int, side: int) -> float:
-        """Return how far a joint's target may move from its start angle to a side."""
-        limits = self.robot.joints[joint]
-        start_rad = self._start_rad[joint]
+    def _compute_free_range_rad(self, joint_index: int, side: int) -> float:
+        """Return the angle in rad by which a joint's target may move from its start angle to a side, +1 or -1."""
+        limits = self.robot.joints[joint_index]
+        start_rad = self._start_angles_rad[joint_index]
         if side > 0:
-            return limits.angle_max_rad - start_rad - MARGIN_RAD
-        return start_rad - limits.angle_min_rad - MARGIN_RAD
+            return limits.angle_max_rad - start_rad - JOINT_LIMIT_MARGIN_RAD
+        return start_rad - limits.angle_min_rad - JOINT_LIMIT_MARGIN_RAD

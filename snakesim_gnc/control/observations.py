@@ -21,14 +21,14 @@ MAX_ANGLE_RAD = 2 * math.pi
 MAX_FORCE_N = 1000.0
 MAX_DISTANCE_M = 1000.0
 MAX_SPEED_M_S = 10.0
-MAX_TURN_RAD_S = 100.0
+MAX_ANGULAR_VELOCITY_RAD_S = 100.0
 MAX_TIME_S = 1e5
 
 # Ratios of these bounds to the limits of the motors.
-SPEED_MARGIN = 3.0  # loads turn joints faster than motors do
-TORQUE_MARGIN = 1.5  # torque sensors have noise
+MAX_SPEED_RATIO = 3.0  # loads turn joints faster than motors do
+MAX_TORQUE_RATIO = 1.5  # torque sensors have noise
 
-Read = Callable[[Observation, GoalProgress], Sequence[float]]
+ReadValues = Callable[[Observation, GoalProgress], Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -39,98 +39,116 @@ class ObservationPart:
     unit: str
     low: Sequence[float]
     high: Sequence[float]
-    read: Read
+    read: ReadValues
     sensor: str | None = None  # key of the sensor that it needs besides the joints
 
 
-def _symmetric(
-    names: Sequence[str], unit: str, maximum: float | Sequence[float], read: Read, sensor: str | None = None
+def _make_symmetric_part(
+    names: Sequence[str], unit: str, maximum: float | Sequence[float], read: ReadValues, sensor: str | None = None
 ) -> ObservationPart:
-    """Return a part whose numbers are bounded by -maximum and maximum; one maximum for all numbers, or one for each."""
+    """Make a part of the observation whose values are bounded symmetrically, by -maximum and maximum.
+
+    Args:
+        names: Names of the values.
+        unit: Unit of the values.
+        maximum: One bound for all values, or one for each.
+        read: Reads the values from an observation and the progress towards the goal.
+        sensor: Key of the sensor that the part needs besides the joints; None if it needs none.
+    """
     high = [maximum] * len(names) if isinstance(maximum, int | float) else list(maximum)
     low = [-value for value in high]
     return ObservationPart(names, unit, low, high, read, sensor)
 
 
-def make_parts(robot: Description) -> dict[str, ObservationPart]:
-    """Return all parts that a robot with every sensor can observe, by name."""
-    return _joint_parts(robot) | _goal_parts() | _contact_parts(robot) | _pose_parts()
+def make_observation_parts(robot: Description) -> dict[str, ObservationPart]:
+    """Return all parts of an observation that a robot with every sensor can have, by name."""
+    return _make_joint_parts(robot) | _make_goal_parts() | _make_contact_parts(robot) | _make_pose_parts()
 
 
-def _joint_parts(robot: Description) -> dict[str, ObservationPart]:
-    """Return the time and what the joints measure."""
+def _make_joint_parts(robot: Description) -> dict[str, ObservationPart]:
+    """Make the parts for the time since arming and for the measurements of the joints."""
     joints = robot.joints
     names = [joint.name for joint in joints]
     angles_rad = [max(MAX_ANGLE_RAD, -joint.angle_min_rad, joint.angle_max_rad) for joint in joints]
-    speeds_rad_s = [SPEED_MARGIN * joint.speed_limit_rad_s for joint in joints]
-    torques_nm = [TORQUE_MARGIN * joint.torque_limit_nm for joint in joints]
+    speeds_rad_s = [MAX_SPEED_RATIO * joint.speed_limit_rad_s for joint in joints]
+    torques_nm = [MAX_TORQUE_RATIO * joint.torque_limit_nm for joint in joints]
     return {
         "time_s": ObservationPart(
             ["since_arming"], "s", [0.0], [MAX_TIME_S], lambda observation, _: [observation.time_s]
         ),
-        "angle_rad": _symmetric(names, "rad", angles_rad, lambda observation, _: observation.joints.angle_rad),
-        "velocity_rad_s": _symmetric(
+        "angle_rad": _make_symmetric_part(
+            names, "rad", angles_rad, lambda observation, _: observation.joints.angle_rad
+        ),
+        "velocity_rad_s": _make_symmetric_part(
             names, "rad/s", speeds_rad_s, lambda observation, _: observation.joints.velocity_rad_s
         ),
-        "torque_nm": _symmetric(names, "N·m", torques_nm, lambda observation, _: observation.joints.torque_nm),
-    }
-
-
-def _goal_parts() -> dict[str, ObservationPart]:
-    """Return the bearing of the goal from the body's heading, and the distance that is left."""
-    return {
-        "goal_bearing": _symmetric(["cos", "sin"], "1", 1.0, _read_bearing, keys.POSE),
-        "goal_m": ObservationPart(
-            ["left"], "m", [0.0], [MAX_DISTANCE_M], lambda _, progress: [progress.left_m], keys.POSE
+        "torque_nm": _make_symmetric_part(
+            names, "N·m", torques_nm, lambda observation, _: observation.joints.torque_nm
         ),
     }
 
 
-def _contact_parts(robot: Description) -> dict[str, ObservationPart]:
-    """Return the size of the contact force on every link."""
+def _make_goal_parts() -> dict[str, ObservationPart]:
+    """Make the parts for the bearing of the goal relative to the body's heading, and for the remaining distance."""
+    return {
+        "goal_bearing": _make_symmetric_part(["cos", "sin"], "1", 1.0, _read_goal_bearing, keys.POSE),
+        "goal_m": ObservationPart(
+            ["left"], "m", [0.0], [MAX_DISTANCE_M], lambda _, progress: [progress.remaining_distance_m], keys.POSE
+        ),
+    }
+
+
+def _make_contact_parts(robot: Description) -> dict[str, ObservationPart]:
+    """Make the part for the magnitude of the contact force on every link."""
     names = [link.name for link in robot.links]
-    count = len(names)
-    low = [0.0] * count
-    high = [MAX_FORCE_N] * count
+    link_count = len(names)
+    low = [0.0] * link_count
+    high = [MAX_FORCE_N] * link_count
     return {
         "contact_n": ObservationPart(
-            names, "N", low, high, lambda observation, _: _read_forces(observation, count), keys.CONTACTS
+            names, "N", low, high, lambda observation, _: _read_contact_forces(observation, link_count), keys.CONTACTS
         )
     }
 
 
-def _pose_parts() -> dict[str, ObservationPart]:
-    """Return what the pose sensor measures, in the world frame."""
+def _make_pose_parts() -> dict[str, ObservationPart]:
+    """Make the parts for the measurements of the pose sensor, in the world frame."""
     axes = ["x", "y", "z"]
     return {
-        "position_w_m": _symmetric(axes, "m", MAX_DISTANCE_M, lambda _, progress: progress.pose[0], keys.POSE),
-        "orientation_wxyz": _symmetric(["w", "x", "y", "z"], "1", 1.0, lambda _, progress: progress.pose[1], keys.POSE),
-        "velocity_w_m_s": _symmetric(axes, "m/s", MAX_SPEED_M_S, _read_velocity, keys.POSE),
-        "angular_velocity_w_rad_s": _symmetric(axes, "rad/s", MAX_TURN_RAD_S, _read_angular_velocity, keys.POSE),
+        "position_w_m": _make_symmetric_part(
+            axes, "m", MAX_DISTANCE_M, lambda _, progress: progress.pose[0], keys.POSE
+        ),
+        "orientation_wxyz": _make_symmetric_part(
+            ["w", "x", "y", "z"], "1", 1.0, lambda _, progress: progress.pose[1], keys.POSE
+        ),
+        "velocity_w_m_s": _make_symmetric_part(axes, "m/s", MAX_SPEED_M_S, _read_velocity, keys.POSE),
+        "angular_velocity_w_rad_s": _make_symmetric_part(
+            axes, "rad/s", MAX_ANGULAR_VELOCITY_RAD_S, _read_angular_velocity, keys.POSE
+        ),
     }
 
 
-DEFAULT = ("angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m", "contact_n")
+DEFAULT_PARTS = ("angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m", "contact_n")
 
 
-def select_parts(robot: Description, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
+def select_observation_parts(robot: Description, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
     """Return the parts that make up the observation of a policy, by their names.
 
     Args:
-        robot: the robot that observes.
-        observe: names of the parts, in their order; None: those in DEFAULT that the robot has sensors for.
+        robot: The robot that observes.
+        observe: Names of the parts, in their order. None selects those in DEFAULT_PARTS that the robot has sensors for.
 
     Returns:
         The parts by name, in the order of `observe`.
 
     Raises:
-        ConfigError: there is no part of that name, or the robot does not have its sensor.
+        ConfigError: There is no part with one of the names, or the robot does not have the sensor of a part.
     """
-    parts = make_parts(robot)
+    parts = make_observation_parts(robot)
     sensors = {sensor.key for sensor in robot.sensors}
     observable = {name: part for name, part in parts.items() if part.sensor is None or part.sensor in sensors}
     if observe is None:
-        return {name: observable[name] for name in DEFAULT if name in observable}
+        return {name: observable[name] for name in DEFAULT_PARTS if name in observable}
     if isinstance(observe, str) or not observe:
         raise ConfigError(
             f"observe={observe!r:.60}: give a sequence of names, such as ('angle_rad', 'contact_n')",
@@ -150,19 +168,19 @@ def select_parts(robot: Description, observe: Sequence[str] | None) -> dict[str,
     return {name: parts[name] for name in observe}
 
 
-class Observer:
+class ObservationBuilder:
     """Makes the observation of an episode, tick by tick."""
 
     def __init__(self, robot: Description, parts: Mapping[str, ObservationPart]) -> None:
-        """Start an episode.
+        """Prepare to build the observations of one episode.
 
         Args:
-            robot: the robot that observes.
-            parts: the parts of the observation as `chosen` returns them.
+            robot: The robot that observes.
+            parts: The parts of the observation, as `select_observation_parts` returns them.
         """
         self._robot = robot
         self._parts = parts
-        self._progress: GoalProgress | None = None  # None: there has been no observation yet
+        self._progress: GoalProgress | None = None  # None if there has been no observation yet
 
         # Sensors that the parts need, by key, and the bounds of the observation.
         self.sensors = {part.sensor for part in parts.values() if part.sensor is not None}
@@ -171,19 +189,22 @@ class Observer:
         self.low: NDArray[np.float32] = np.array(low, np.float32)
         self.high: NDArray[np.float32] = np.array(high, np.float32)
 
-    def update(self, observation: Observation) -> NDArray[np.float32]:
-        """Return the numbers of all parts, clipped to their bounds. The advance counts from the first call on."""
+    def build_observation(self, observation: Observation) -> NDArray[np.float32]:
+        """Return the values of all parts as one vector, clipped to their bounds.
+
+        The progress towards the goal is measured from the first call on.
+        """
         assert observation.sensor_samples is not None, "a controller with an Observer declares uses_sensors = True"
         progress = self._progress
         if progress is None:
             progress = GoalProgress(self._robot, observation.sensor_samples.task)
             self._progress = progress
-        progress.update(observation.joints, _newest_pose(observation))
+        progress.update(observation.joints, _get_newest_pose(observation))
         values: list[float] = []
         for part in self._parts.values():
             values.extend(part.read(observation, progress))
-        numbers = np.array(values, dtype=np.float32)
-        return np.minimum(np.maximum(numbers, self.low), self.high)
+        all_values = np.array(values, dtype=np.float32)
+        return np.minimum(np.maximum(all_values, self.low), self.high)
 
     @property
     def progress(self) -> GoalProgress:
@@ -192,21 +213,24 @@ class Observer:
         return self._progress
 
 
-def _read_bearing(_observation: Observation, progress: GoalProgress) -> Sequence[float]:
-    return math.cos(progress.bearing_rad), math.sin(progress.bearing_rad)
+def _read_goal_bearing(_observation: Observation, progress: GoalProgress) -> Sequence[float]:
+    return math.cos(progress.goal_bearing_rad), math.sin(progress.goal_bearing_rad)
 
 
-def _read_forces(observation: Observation, link_count: int) -> Sequence[float]:
-    sample = _newest_sample(observation, keys.CONTACTS)
+def _read_contact_forces(observation: Observation, link_count: int) -> Sequence[float]:
+    sample = _get_newest_sample(observation, keys.CONTACTS)
     return sum_contact_forces_n(sample if isinstance(sample, Contacts) else None, link_count)
 
 
 def sum_contact_forces_n(sample: Contacts | None, link_count: int) -> list[float]:
-    """Return the sum of the sizes of all contact forces on every link, (link_count,) in N.
+    """Sum the magnitudes of all contact forces on every link.
 
     Args:
-        sample: the newest contacts; None: there are none yet.
-        link_count: number of links.
+        sample: The newest contacts; None if there are none yet.
+        link_count: Number of links.
+
+    Returns:
+        (link_count,) sums in N.
     """
     forces_n = [0.0] * link_count
     if sample is None:
@@ -218,27 +242,27 @@ def sum_contact_forces_n(sample: Contacts | None, link_count: int) -> list[float
 
 
 def _read_velocity(observation: Observation, _progress: GoalProgress) -> Sequence[float]:
-    pose = _newest_pose(observation)
+    pose = _get_newest_pose(observation)
     if pose is None:
         return 0.0, 0.0, 0.0
     return pose.velocity_w
 
 
 def _read_angular_velocity(observation: Observation, _progress: GoalProgress) -> Sequence[float]:
-    pose = _newest_pose(observation)
+    pose = _get_newest_pose(observation)
     if pose is None:
         return 0.0, 0.0, 0.0
     return pose.angular_velocity_w
 
 
-def _newest_pose(observation: Observation) -> Pose | None:
-    sample = _newest_sample(observation, keys.POSE)
+def _get_newest_pose(observation: Observation) -> Pose | None:
+    sample = _get_newest_sample(observation, keys.POSE)
     if isinstance(sample, Pose):
         return sample
     return None
 
 
-def _newest_sample(observation: Observation, key: str) -> Message | None:
+def _get_newest_sample(observation: Observation, key: str) -> Message | None:
     if observation.sensor_samples is None:
         return None
     return observation.sensor_samples.newest.get(key)

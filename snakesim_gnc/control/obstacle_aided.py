@@ -28,13 +28,13 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from snakesim_gnc.control.bumpless import Blend, BumplessReference
-from snakesim_gnc.control.climb import Climb
+from snakesim_gnc.control.bumpless import Blend, BumplessFollower
+from snakesim_gnc.control.climb import PlatformClimb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.contact_search import ContactSearch
-from snakesim_gnc.control.progress import Located, PathProgress, SpeedFilter
-from snakesim_gnc.control.push import PushFilter, Touches, UnitPush, find_touches, push_forward
-from snakesim_gnc.control.push_report import explain_push_standstill, push_points
+from snakesim_gnc.control.progress import BodyLocation, PathProgress, SpeedFilter
+from snakesim_gnc.control.push import BodyContacts, NormalizedPush, PushLowPassFilter, find_body_contacts, solve_push
+from snakesim_gnc.control.push_report import explain_push_standstill, make_push_point_messages
 from snakesim_gnc.control.undulation import LateralUndulation
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
@@ -44,25 +44,27 @@ from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, Mode, World, WorldContact
 from snakesim_hal.wire.quantities import above, from_zero
 
-OTHER_SHAPE_RAD = 0.1  # a new path whose reference differs more than this starts with a small look-ahead
-SLOPE_STEP_M = 0.02  # step of the finite difference for theta'
+MAX_CONTINUOUS_CHANGE_RAD = 0.1  # a new path whose reference differs more than this starts with a small look-ahead
+DERIVATIVE_STEP_M = 0.02  # step of the finite difference for theta'
 RANDOM_SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)  # the same in every run
 
 # Which contacts push, and how hard.
-MAX_UNBALANCED = 0.3  # fraction of a push; the rest turns the body a little, until it touches other obstacles
+MAX_UNBALANCED_RATIO = 0.3  # fraction of a push; the rest turns the body a little, until it touches other obstacles
 CONTACT_FORCE_SCALE_N = 0.5  # at this measured force, the extra cost of a contact without force has fallen to 1/e
 ACTUATION_DELAY_S = 0.03  # from a measurement until the motors act on it
-CREEP_SPEED_M_S = 0.05  # below it, the integral of the push grows CREEP_GAIN times as fast
-CREEP_GAIN = 2.0
+MAX_CREEP_SPEED_M_S = 0.05  # below it, the integral of the push grows CREEP_INTEGRAL_GAIN times as fast
+CREEP_INTEGRAL_GAIN = 2.0
 
 # Torque mode.
-MAX_UNBALANCED_SOFT = 0.03  # fraction of a push that may be unbalanced in torque mode
-SOFT_AFTER_S = 0.1  # how long contacts must have been able to balance a push before
+MAX_UNBALANCED_RATIO_IN_TORQUE_MODE = 0.03  # fraction of a push that may be unbalanced in torque mode
+MIN_BALANCED_DURATION_S = 0.1  # how long contacts must have been able to balance a push before
 MIN_SLOPE_SQUARED_PER_M2 = 20.0  # sum of theta'^2 below which the shape hardly depends on the place on the path
 
 # Reports.
-STANDSTILL_SPEED_M_S = 0.01  # a body that was slower than this for STANDSTILL_S is reported as stationary
-STANDSTILL_S = 0.5
+MAX_STANDSTILL_SPEED_M_S = (
+    0.01  # a body that was slower than this for MIN_STANDSTILL_DURATION_S is reported as stationary
+)
+MIN_STANDSTILL_DURATION_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,8 @@ class PushSnapshot:
     """The contacts of a world model, and the push that they allow."""
 
     world: World
-    touches: Touches
-    push: UnitPush
+    contacts: BodyContacts
+    push: NormalizedPush
 
 
 class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
@@ -155,35 +157,37 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         It starts with all integrals and forces at zero, before the first measurement.
 
         Args:
-            robot: description of the robot; the joints with a vertical axis bend the body.
-            parameters: gains, limits and time constants of this controller.
+            robot: Description of the robot; the joints with a vertical axis bend the body.
+            parameters: Gains, limits and time constants of this controller.
         """
         super().__init__(robot, parameters)
         # Models and estimators.
         self._body = PlanarBody(robot)
-        self._climb = Climb(robot)
+        self._platform_climb = PlatformClimb(robot)
         self._progress = PathProgress(self._body, speed_filter_s=parameters.speed_filter_s)
-        self._contacts = MeasuredContacts()
+        self._measured_contacts = MeasuredContacts()
         # Joints.
-        self._bends = self._body.bends  # indices of the joints that bend
+        self._yaw_joints = self._body.yaw_joints  # indices of the joints that bend
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._has_torque_mode = all(robot.joints[i].supports_mode(Mode.TORQUE) for i in self._bends)
-        self._bumpless = BumplessReference(robot, parameters.blend_s)
-        self._holding = False  # the joints hold a pose; the next reference may jump
+        self._has_torque_mode = all(robot.joints[i].supports_mode(Mode.TORQUE) for i in self._yaw_joints)
+        self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
+        self._is_holding = False  # the joints hold a pose; the next reference may jump
         # Look-ahead.
         self._look_ahead_integral_m = 0.0
         # Push along the path.
-        self._push_filter = PushFilter(parameters.push_filter_s)
-        self._snapshot: PushSnapshot | None = None
+        self._push_filter = PushLowPassFilter(parameters.push_filter_s)
+        self._push_snapshot: PushSnapshot | None = None
         self._unit_torques_nm = np.zeros(len(robot.joints))  # joint torques for 1 N along the path
-        self._torques_nm = np.zeros(len(robot.joints))  # filtered joint torques of the commanded push
+        self._push_torques_nm = np.zeros(len(robot.joints))  # filtered joint torques of the commanded push
         self._push_integral_n = 0.0
-        self._max_force_n = 0.0  # what contacts and torque limits allow
-        self._force_n = 0.0  # commanded push
-        self._unbalanced_at_s = 0.0  # when the contacts could last not balance a push
+        self._max_push_force_n = 0.0  # what contacts and torque limits allow
+        self._push_force_n = 0.0  # commanded push
+        self._last_unbalanced_time_s = 0.0  # when the contacts could last not balance a push
         # Supervision.
-        self._moved_at_s = 0.0  # when the body was last faster than STANDSTILL_SPEED_M_S
-        self._search = ContactSearch(robot, after_s=parameters.search_after_s, for_s=parameters.search_s)
+        self._last_motion_time_s = 0.0  # when the body was last faster than MAX_STANDSTILL_SPEED_M_S
+        self._contact_search = ContactSearch(
+            robot, standstill_duration_s=parameters.search_after_s, search_duration_s=parameters.search_s
+        )
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Return the joint setpoints that move the body along the path at the desired speed.
@@ -193,52 +197,55 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         moves it. While its position on the path is unknown, or no motion is desired, the joints hold their pose.
 
         Args:
-            observation: the inputs of this tick.
+            observation: The inputs of this tick.
 
         Returns:
             Setpoints of all joints, with telemetry about push and contacts.
         """
-        located = self._progress.update(observation)
-        if isinstance(located, str):
-            self._holding = True
-            return self._bumpless.hold_pose(observation, located)
-        self._contacts.add_world(located.world)
-        desired_m_s = located.trajectory.speed_m_s
+        location = self._progress.update(observation)
+        if isinstance(location, str):  # why the position is unknown
+            self._is_holding = True
+            return self._bumpless_follower.hold_pose(observation, location)
+        self._measured_contacts.add_world(location.world)
+        desired_m_s = location.trajectory.speed_m_s
         if desired_m_s == 0.0:  # whatever path is planned meanwhile
-            return self._rest_in_pose(observation)
-        lift_rad = self._climb.angles_rad(located.trajectory.rises, located.tail_s_m)
-        center_w = located.nodes_w.mean(axis=1)
-        wave = self._search.decide(
+            return self._command_rest(observation)
+        pitch_rad = self._platform_climb.compute_pitch_angles_rad(location.trajectory.rises, location.tail_s_m)
+        center_w = location.body_points_w.mean(axis=1)
+        wave = self._contact_search.choose_wave(
             observation, center_w, desired_m_s=desired_m_s, has_near_obstacles=self._has_near_obstacles()
         )
         if wave is not None:
-            return self._undulate(observation, wave, lift_rad)
+            return self._command_search_wave(observation, wave, pitch_rad)
 
-        scale = self.parameters.push_scale * self._push_sign(observation.time_s)
-        look_ahead_m = self._update_look_ahead(located, observation.period_s)
+        scale = self.parameters.push_scale * self._get_push_sign(observation.time_s)
+        look_ahead_m = self._update_look_ahead(location, observation.period_s)
         if scale < 0:
             look_ahead_m = abs(look_ahead_m)  # a negative scale always pushes backward
         look_ahead_m = scale * look_ahead_m
-        theta = self._angles_on_path(located, located.tail_s_m)  # joint angles, rad
-        theta_ahead = self._angles_on_path(located, located.tail_s_m + SLOPE_STEP_M)
-        theta_prime = (theta_ahead - theta) / SLOPE_STEP_M  # derivative by the arc length, rad/m
-        push_torques_nm = scale * self._update_push_torques(observation, located, theta_prime)
-        if self._can_be_soft(observation.time_s) and not lift_rad.any():
-            return self._command_torques(observation, located, theta, theta_prime, push_torques_nm)
-        reference = self._angles_on_path(located, located.tail_s_m + look_ahead_m)
-        reference = reference + push_torques_nm / self._stiffness + lift_rad
+        theta = self._compute_angles_on_path(location, location.tail_s_m)  # joint angles, rad
+        theta_ahead = self._compute_angles_on_path(location, location.tail_s_m + DERIVATIVE_STEP_M)
+        theta_prime = (theta_ahead - theta) / DERIVATIVE_STEP_M  # derivative by the arc length, rad/m
+        push_torques_nm = scale * self._update_push_torques(observation, location, theta_prime)
+        if self._can_use_torque_mode(observation.time_s) and not pitch_rad.any():
+            return self._command_torques(observation, location, theta, theta_prime, push_torques_nm)
+        reference = self._compute_angles_on_path(location, location.tail_s_m + look_ahead_m)
+        reference = reference + push_torques_nm / self._stiffness + pitch_rad
         look_ahead_n = look_ahead_m * float(self._stiffness @ theta_prime**2)
-        return self._command_positions(observation, located, reference, look_ahead_n)
+        return self._command_positions(observation, location, reference, look_ahead_n)
 
-    def _angles_on_path(self, located: Located, tail_s_m: float) -> Floats:
-        """Return theta(s): the angles of all joints, (n_joints,), with the tail at an arc length of the path."""
-        return self._body.all_angles(located.on_path.pose_at(tail_s_m))
+    def _compute_angles_on_path(self, location: BodyLocation, tail_s_m: float) -> Floats:
+        """Compute theta(s), (n_joints,) in rad: the angles of all joints with the tail at an arc length of the path."""
+        return self._body.expand_joint_angles(location.body_on_path.compute_pose_at(tail_s_m))
 
     def _has_near_obstacles(self) -> bool:
-        return self._snapshot is not None and len(self._snapshot.touches) > 0
+        return self._push_snapshot is not None and len(self._push_snapshot.contacts) > 0
 
-    def _push_sign(self, time_s: float) -> float:
-        """Return the sign of the push at a time; random signs are the same in every run."""
+    def _get_push_sign(self, time_s: float) -> float:
+        """Return the sign of the push at a time: 1, or -1 or 1 at random for control experiments.
+
+        Random signs are the same in every run.
+        """
         interval_s = self.parameters.push_sign_s
         if interval_s == 0.0:
             return 1.0
@@ -246,16 +253,28 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
 
     # --- commands ------------------------------------------------------------------------------------------------
 
-    def _can_be_soft(self, time_s: float) -> bool:
-        """Whether the joints can be in torque mode: obstacles have been able to balance a push for a while."""
+    def _can_use_torque_mode(self, time_s: float) -> bool:
+        """Return whether the joints can be in torque mode at this time.
+
+        They can if the drives have a torque mode, and obstacles have been able to balance a push for at least
+        MIN_BALANCED_DURATION_S.
+        """
         if not self._has_torque_mode or self.parameters.shape_nm_per_rad <= 0.0:
             return False
-        if self._snapshot is None or self._snapshot.push.residual > MAX_UNBALANCED_SOFT:
-            self._unbalanced_at_s = time_s
-        return time_s - self._unbalanced_at_s > SOFT_AFTER_S
+        if (
+            self._push_snapshot is None
+            or self._push_snapshot.push.balance_residual > MAX_UNBALANCED_RATIO_IN_TORQUE_MODE
+        ):
+            self._last_unbalanced_time_s = time_s
+        return time_s - self._last_unbalanced_time_s > MIN_BALANCED_DURATION_S
 
     def _command_torques(
-        self, observation: Observation, located: Located, theta: Floats, theta_prime: Floats, push_torques_nm: Floats
+        self,
+        observation: Observation,
+        location: BodyLocation,
+        theta: Floats,
+        theta_prime: Floats,
+        push_torques_nm: Floats,
     ) -> ControllerCommand:
         """Command the torques tau_push + tau_shape to the joints that bend.
 
@@ -263,8 +282,8 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         would move the body along the path, is removed.
 
         Args:
-            observation: the inputs of this tick, with the joint angles q and velocities q'.
-            located: position of the body on the path, and its speed v.
+            observation: The inputs of this tick, with the joint angles q and velocities q'.
+            location: Position of the body on the path, and its speed v.
             theta: (n_joints,) joint angles of the body on the path, rad.
             theta_prime: (n_joints,) their derivatives by the arc length, rad/m.
             push_torques_nm: (n_joints,) tau_push.
@@ -272,69 +291,93 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         k = self.parameters.shape_nm_per_rad
         d = self.parameters.shape_nm_s_per_rad
         angle_error_rad = theta - np.array(observation.joints.angle_rad)
-        velocity_error_rad_s = theta_prime * located.speed_m_s - np.array(observation.joints.velocity_rad_s)
+        velocity_error_rad_s = theta_prime * location.speed_m_s - np.array(observation.joints.velocity_rad_s)
         shape_nm = k * angle_error_rad + d * velocity_error_rad_s
-        slope = theta_prime[self._bends]
-        along_n = float(slope @ shape_nm[self._bends])  # force of tau_shape along the path, by virtual work
+        slope = theta_prime[self._yaw_joints]
+        along_n = float(slope @ shape_nm[self._yaw_joints])  # force of tau_shape along the path, by virtual work
         shape_nm = shape_nm - theta_prime * along_n / (slope @ slope + MIN_SLOPE_SQUARED_PER_M2)
 
-        setpoints = self._bumpless.follow(observation, theta)
-        self._bumpless.forget_reference()
+        setpoints = self._bumpless_follower.make_setpoints(observation, theta)
+        self._bumpless_follower.leave_position_mode()
         self._limit_look_ahead_integral()
-        self._holding = False
-        for i in self._bends:
+        self._is_holding = False
+        for i in self._yaw_joints:
             limit_nm = setpoints.torque_limit_nm[i]
             torque_nm = float(shape_nm[i] + push_torques_nm[i])
             setpoints.mode[i] = Mode.TORQUE
             setpoints.target[i] = min(max(torque_nm, -limit_nm), limit_nm)
-        return ControllerCommand(setpoints, self._make_telemetry(observation, located, 0.0, theta))
+        return ControllerCommand(setpoints, self._make_telemetry(observation, location, 0.0, theta))
 
     def _command_positions(
-        self, observation: Observation, located: Located, reference: Floats, look_ahead_n: float
+        self, observation: Observation, location: BodyLocation, reference: Floats, look_ahead_n: float
     ) -> ControllerCommand:
-        """Command a reference in position mode; look_ahead_n: the force of its look-ahead."""
-        restarted = located.restarted or self._holding or self._search.changed
-        last_reference = self._bumpless.reference_rad
-        if restarted and last_reference is not None and np.abs(reference - last_reference).max() > OTHER_SHAPE_RAD:
+        """Command reference angles in position mode, without a jump of the targets.
+
+        Args:
+            observation: The inputs of this tick.
+            location: Position of the body on the path.
+            reference: (n_joints,) reference angles, rad.
+            look_ahead_n: Force along the path that the look-ahead of the reference causes, for the telemetry.
+        """
+        may_have_jumped = location.may_have_jumped or self._is_holding or self._contact_search.has_changed_wave
+        last_reference = self._bumpless_follower.reference_rad
+        if (
+            may_have_jumped
+            and last_reference is not None
+            and np.abs(reference - last_reference).max() > MAX_CONTINUOUS_CHANGE_RAD
+        ):
             self._limit_look_ahead_integral()
-        setpoints = self._bumpless.follow(observation, reference, restarted=restarted)
-        self._holding = False
-        return ControllerCommand(setpoints, self._make_telemetry(observation, located, look_ahead_n, reference))
+        setpoints = self._bumpless_follower.make_setpoints(observation, reference, may_have_jumped=may_have_jumped)
+        self._is_holding = False
+        return ControllerCommand(setpoints, self._make_telemetry(observation, location, look_ahead_n, reference))
 
-    def _undulate(self, observation: Observation, wave: LateralUndulation, lift_rad: Floats) -> ControllerCommand:
-        """Move by a wave, in search of obstacles to push off."""
-        self._stop_pushing()
-        reference = wave.reference_rad(observation, observation.period_s) + lift_rad
-        setpoints = self._bumpless.follow(observation, reference, restarted=self._search.changed)
-        why = "it does not come on: it moves by a wave, in search of contacts"
-        return ControllerCommand(setpoints, Telemetry(reason=why, reference_rad=reference.tolist()))
+    def _command_search_wave(
+        self, observation: Observation, wave: LateralUndulation, pitch_rad: Floats
+    ) -> ControllerCommand:
+        """Command the next angles of a wave that searches for obstacles to push off.
 
-    def _rest_in_pose(self, observation: Observation) -> ControllerCommand:
-        """Keep every joint where it is, without a push: the desired speed is 0."""
-        self._stop_pushing()
+        Args:
+            observation: The inputs of this tick.
+            wave: The wave that moves the body.
+            pitch_rad: (n_joints,) pitch angles over platforms, which are added to the wave.
+        """
+        self._reset_push()
+        reference = wave.compute_reference_rad(observation, observation.period_s) + pitch_rad
+        setpoints = self._bumpless_follower.make_setpoints(
+            observation, reference, may_have_jumped=self._contact_search.has_changed_wave
+        )
+        reason = "it does not come on: it moves by a wave, in search of contacts"
+        return ControllerCommand(setpoints, Telemetry(reason=reason, reference_rad=reference.tolist()))
+
+    def _command_rest(self, observation: Observation) -> ControllerCommand:
+        """Command every joint to stay where it is, and reset push, look-ahead and search: the desired speed is 0."""
+        self._reset_push()
         self._look_ahead_integral_m = 0.0
-        self._moved_at_s = observation.time_s
-        self._search.stop()
-        if self._holding or self._bumpless.reference_rad is None:
-            command = self._bumpless.hold_pose(observation, "")
+        self._last_motion_time_s = observation.time_s
+        self._contact_search.stop()
+        if self._is_holding or self._bumpless_follower.reference_rad is None:
+            command = self._bumpless_follower.hold_pose(observation, "")
         else:
             reference = np.array(observation.joints.angle_rad)
-            setpoints = self._bumpless.follow(observation, reference, restarted=True)
+            setpoints = self._bumpless_follower.make_setpoints(observation, reference, may_have_jumped=True)
             command = ControllerCommand(setpoints, Telemetry(reference_rad=reference.tolist()))
-        self._holding = True
+        self._is_holding = True
         return command
 
-    def _stop_pushing(self) -> None:
-        self._torques_nm[:] = 0.0
+    def _reset_push(self) -> None:
+        self._push_torques_nm[:] = 0.0
         self._push_integral_n = 0.0
-        self._force_n = 0.0
+        self._push_force_n = 0.0
 
     # --- look-ahead and push -------------------------------------------------------------------------------------
 
-    def _update_look_ahead(self, located: Located, period_s: float) -> float:
-        """Return the look-ahead l = speed_kp e + integral_per_s integral e dt in m; both are bounded."""
+    def _update_look_ahead(self, location: BodyLocation, period_s: float) -> float:
+        """Update the integral of the look-ahead, and return l = speed_kp e + integral_per_s integral e dt in m.
+
+        e is the speed error. The integral and the sum are bounded by `max_look_ahead_m`.
+        """
         max_m = self.parameters.max_look_ahead_m
-        error_m_s = located.trajectory.speed_m_s - located.speed_m_s
+        error_m_s = location.trajectory.speed_m_s - location.speed_m_s
         self._look_ahead_integral_m += self.parameters.integral_per_s * error_m_s * period_s
         self._look_ahead_integral_m = min(max(self._look_ahead_integral_m, -max_m), max_m)
         return min(max(self._look_ahead_integral_m + self.parameters.speed_kp_s * error_m_s, -max_m), max_m)
@@ -342,94 +385,107 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _limit_look_ahead_integral(self) -> None:
         self._look_ahead_integral_m = min(self._look_ahead_integral_m, self.parameters.fresh_look_ahead_m)
 
-    def _update_push_torques(self, observation: Observation, located: Located, theta_prime: Floats) -> Floats:
+    def _update_push_torques(self, observation: Observation, location: BodyLocation, theta_prime: Floats) -> Floats:
         """Return the filtered joint torques tau_push of a force F along the path that controls the speed.
 
         F = lag_kp * integral of e dt + speed_kp * e, with the speed error e. F is limited to `max_push_n` and to what
         the contacts and the torque limits allow.
 
         Args:
-            observation: the inputs of this tick.
-            located: position and speed of the body on the path.
+            observation: The inputs of this tick.
+            location: Position and speed of the body on the path.
             theta_prime: (n_joints,) derivatives of the joint angles by the arc length, rad/m.
 
         Returns:
             (n_joints,) torques in N·m.
         """
         parameters = self.parameters
-        desired_m_s = located.trajectory.speed_m_s
+        desired_m_s = location.trajectory.speed_m_s
         if desired_m_s <= 0.0 or parameters.max_push_n == 0.0:
             self._push_integral_n = 0.0
-            self._force_n = 0.0
-            self._snapshot = None
+            self._push_force_n = 0.0
+            self._push_snapshot = None
             return np.zeros(len(self.robot.joints))
-        error_m_s = desired_m_s - located.speed_m_s
+        error_m_s = desired_m_s - location.speed_m_s
         integral_gain = 1.0
-        if abs(located.speed_m_s) < CREEP_SPEED_M_S:
-            integral_gain = CREEP_GAIN
+        if abs(location.speed_m_s) < MAX_CREEP_SPEED_M_S:
+            integral_gain = CREEP_INTEGRAL_GAIN
         self._push_integral_n += integral_gain * parameters.lag_kp_n_per_m * error_m_s * observation.period_s
         self._push_integral_n = min(max(self._push_integral_n, 0.0), parameters.max_push_n)
         force_n = self._push_integral_n + parameters.speed_kp_n_s_per_m * error_m_s
         force_n = min(max(force_n, 0.0), parameters.max_push_n)
-        if located.fresh:
-            self._update_contacts(observation.time_s, located, theta_prime)
+        if location.is_new_world:
+            self._update_contacts(observation.time_s, location, theta_prime)
         # Anti-windup: the integral stays within the force that the contacts allow.
-        self._push_integral_n = min(self._push_integral_n, self._max_force_n)
-        self._force_n = min(force_n, self._max_force_n)
-        last_gain = np.exp(-observation.period_s / parameters.torque_filter_s)  # of a low-pass filter
-        self._torques_nm = last_gain * self._torques_nm + (1 - last_gain) * self._force_n * self._unit_torques_nm
-        return np.clip(self._torques_nm, -parameters.max_torque_nm, parameters.max_torque_nm)
+        self._push_integral_n = min(self._push_integral_n, self._max_push_force_n)
+        self._push_force_n = min(force_n, self._max_push_force_n)
+        decay = np.exp(-observation.period_s / parameters.torque_filter_s)  # of a low-pass filter
+        self._push_torques_nm = decay * self._push_torques_nm + (1 - decay) * self._push_force_n * self._unit_torques_nm
+        return np.clip(self._push_torques_nm, -parameters.max_torque_nm, parameters.max_torque_nm)
 
-    def _update_contacts(self, time_s: float, located: Located, theta_prime: Floats) -> None:
+    def _update_contacts(self, time_s: float, location: BodyLocation, theta_prime: Floats) -> None:
         """Find the contacts of a new world model, the push that they allow, and the maximum force of that push.
 
         Args:
-            time_s: time of this tick.
-            located: position of the body, with the new world model.
+            time_s: Time of this tick.
+            location: Position of the body, with the new world model.
             theta_prime: (n_joints,) derivatives of the joint angles by the arc length, rad/m.
         """
         parameters = self.parameters
-        obstacles = located.world.obstacles
-        nodes_w = self._predict_nodes(located)
-        touches = find_touches(
-            nodes_w,
+        obstacles = location.world.obstacles
+        body_points_w = self._predict_body_points_w(location)
+        contacts = find_body_contacts(
+            body_points_w,
             self._body.radius_m,
             Outlines.from_obstacles(obstacles),
-            reach_m=parameters.reach_m,
-            friction=located.trajectory.assumed_obstacle_friction,
+            max_gap_m=parameters.reach_m,
+            friction=location.trajectory.assumed_obstacle_friction,
         )
-        names = [obstacles[k].name for k in touches.obstacle.tolist()]
-        push = push_forward(
-            nodes_w,
-            touches,
-            theta_prime[self._bends],
+        obstacle_names = [obstacles[k].name for k in contacts.obstacle_index.tolist()]
+        push = solve_push(
+            body_points_w,
+            contacts,
+            theta_prime[self._yaw_joints],
             contact_gap_scale_m=parameters.contact_gap_scale_m,
-            extra_cost=self._no_contact_costs(names),
+            extra_cost=self._compute_no_contact_costs(obstacle_names),
         )
-        push = self._push_filter.update(time_s, push, names)
-        self._snapshot = PushSnapshot(located.world, touches, push)
+        push = self._push_filter.update(time_s, push, obstacle_names)
+        self._push_snapshot = PushSnapshot(location.world, contacts, push)
         self._unit_torques_nm = np.zeros(len(self.robot.joints))
-        self._max_force_n = 0.0
-        max_lambda = float(push.lambdas.max(initial=0.0))
-        is_balanced = push.residual < MAX_UNBALANCED
+        self._max_push_force_n = 0.0
+        max_lambda = float(push.contact_forces.max(initial=0.0))
+        is_balanced = push.balance_residual < MAX_UNBALANCED_RATIO
         # All contact forces (lambdas) may be 0: a body bent into a U has hardly any drag, and needs no push.
         if is_balanced and max_lambda > 0.0:
-            self._unit_torques_nm[self._bends] = push.torques_nm
-            max_unit_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-            self._max_force_n = min(parameters.max_torque_nm / max_unit_nm, parameters.max_contact_n / max_lambda)
+            self._unit_torques_nm[self._yaw_joints] = push.joint_torques_nm
+            max_unit_nm = float(np.abs(push.joint_torques_nm).max(initial=0.0)) + 1e-9
+            self._max_push_force_n = min(parameters.max_torque_nm / max_unit_nm, parameters.max_contact_n / max_lambda)
 
-    def _predict_nodes(self, located: Located) -> Floats:
-        """Return the nodes of the body, (2, n_nodes), when the motors will act: moved on along the path."""
-        acting_s_m = located.tail_s_m + ACTUATION_DELAY_S * located.speed_m_s
-        on_path = located.on_path
-        return located.nodes_w + on_path.pose_at(acting_s_m).nodes_w - on_path.pose_at(located.measured_s_m).nodes_w
+    def _predict_body_points_w(self, location: BodyLocation) -> Floats:
+        """Predict the points of the body, (2, n_points) in m, at the time when the motors act on this tick's command.
 
-    def _no_contact_costs(self, obstacles: list[str]) -> Floats | float:
-        """Return the extra cost of each contact, (k,): no_contact_cost exp(-force / CONTACT_FORCE_SCALE_N).
-
-        Without a sensor of contact forces there is no extra cost.
+        The body is assumed to move on along its path at its speed for ACTUATION_DELAY_S.
         """
-        forces_w = self._contacts.mean_forces_w(obstacles)
+        acting_s_m = location.tail_s_m + ACTUATION_DELAY_S * location.speed_m_s
+        on_path = location.body_on_path
+        return (
+            location.body_points_w
+            + on_path.compute_pose_at(acting_s_m).body_points_w
+            - on_path.compute_pose_at(location.tail_s_at_pose_m).body_points_w
+        )
+
+    def _compute_no_contact_costs(self, obstacles: list[str]) -> Floats | float:
+        """Compute the extra costs of contacts that have little measured force.
+
+        The extra cost of a contact is no_contact_cost exp(-force / CONTACT_FORCE_SCALE_N).
+
+        Args:
+            obstacles: (k,) names of the obstacles of the contacts.
+
+        Returns:
+            (k,) extra costs, or 0.0 if no sensor measures contact forces.
+        """
+        forces_w = self._measured_contacts.compute_mean_forces_w(obstacles)
         if not forces_w:
             return 0.0
         forces_n = np.hypot(*np.array(forces_w).reshape(-1, 2).T)
@@ -438,50 +494,65 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     # --- reports -------------------------------------------------------------------------------------------------
 
     def _make_telemetry(
-        self, observation: Observation, located: Located, look_ahead_n: float, reference: Floats
+        self, observation: Observation, location: BodyLocation, look_ahead_n: float, reference: Floats
     ) -> Telemetry:
         """Report the push along the path, and why the body is stationary if it is.
 
         Args:
-            observation: the inputs of this tick.
-            located: position and speed of the body on the path.
-            look_ahead_n: force along the path that the look-ahead causes.
+            observation: The inputs of this tick.
+            location: Position and speed of the body on the path.
+            look_ahead_n: Force along the path that the look-ahead causes.
             reference: (n_joints,) reference angles, rad.
 
         Returns:
             The telemetry of this tick, with desired contact forces in N and joint torques in N·m.
         """
-        if abs(located.speed_m_s) > STANDSTILL_SPEED_M_S:
-            self._moved_at_s = observation.time_s
-        is_stationary = observation.time_s - self._moved_at_s > STANDSTILL_S and self._snapshot is not None
-        points = self._report_push_points()
-        jammed, reason = self._explain_standstill(located, points)
+        if abs(location.speed_m_s) > MAX_STANDSTILL_SPEED_M_S:
+            self._last_motion_time_s = observation.time_s
+        is_stationary = (
+            observation.time_s - self._last_motion_time_s > MIN_STANDSTILL_DURATION_S
+            and self._push_snapshot is not None
+        )
+        points = self._make_push_point_messages()
+        jammed, reason = self._explain_standstill(location, points)
         return Telemetry(
             reason=reason if is_stationary else "",
-            reason_if_stationary=reason if observation.time_s > STANDSTILL_S else "",
-            path_s_m=located.tail_s_m,
-            propulsion_n=look_ahead_n + self._force_n,
+            reason_if_stationary=reason if observation.time_s > MIN_STANDSTILL_DURATION_S else "",
+            path_s_m=location.tail_s_m,
+            propulsion_n=look_ahead_n + self._push_force_n,
             push_points=points,
             desired_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in points],
-            bending_torque_nm=self._torques_nm.tolist(),
+            bending_torque_nm=self._push_torques_nm.tolist(),
             reference_rad=reference.tolist(),
-            torque_headroom_nm=self.parameters.max_torque_nm - float(np.abs(self._torques_nm).max()),
-            saturated=0.0 < self._max_force_n <= self._force_n,
+            torque_headroom_nm=self.parameters.max_torque_nm - float(np.abs(self._push_torques_nm).max()),
+            saturated=0.0 < self._max_push_force_n <= self._push_force_n,
             jammed=is_stationary and jammed,
         )
 
-    def _report_push_points(self) -> list[WorldContact]:
-        found = self._snapshot
-        if found is None:
+    def _make_push_point_messages(self) -> list[WorldContact]:
+        snapshot = self._push_snapshot
+        if snapshot is None:
             return []
-        return push_points(self._body, found.world, found.touches, found.push, self._force_n)
+        return make_push_point_messages(
+            self._body, snapshot.world, snapshot.contacts, snapshot.push, self._push_force_n
+        )
 
-    def _explain_standstill(self, located: Located, points: list[WorldContact]) -> tuple[bool, str]:
-        """Return whether a stationary body would be jammed, and why it would be stationary."""
-        found = self._snapshot
-        if found is None:
+    def _explain_standstill(self, location: BodyLocation, points: list[WorldContact]) -> tuple[bool, str]:
+        """Explain why the body would be stationary if it does not move.
+
+        Args:
+            location: Position of the body on the path.
+            points: Push-points with their desired forces.
+
+        Returns:
+            Whether the body is jammed, and the reason as text.
+        """
+        snapshot = self._push_snapshot
+        if snapshot is None:
             return False, "standing still: backing out along its own path"
         names = [point.obstacle for point in points if point.obstacle is not None]
-        towards_head_w = (located.nodes_w[:, -1] - located.nodes_w[:, 0]).tolist()
-        net_force = self._contacts.resolve_along(towards_head_w)
-        return explain_push_standstill(found.touches, found.push, self._force_n, self._max_force_n, net_force, names)
+        towards_head_w = (location.body_points_w[:, -1] - location.body_points_w[:, 0]).tolist()
+        net_force = self._measured_contacts.resolve_along(towards_head_w)
+        return explain_push_standstill(
+            snapshot.contacts, snapshot.push, self._push_force_n, self._max_push_force_n, net_force, names
+        )

@@ -11,8 +11,8 @@ not wind up.
 
 from typing import Annotated
 
-from snakesim_gnc.control.bumpless import Blend, BumplessReference
-from snakesim_gnc.control.climb import Climb
+from snakesim_gnc.control.bumpless import Blend, BumplessFollower
+from snakesim_gnc.control.climb import PlatformClimb
 from snakesim_gnc.control.progress import PathProgress, SpeedFilter
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
@@ -42,24 +42,36 @@ class PathFollowing(Controller[PathFollowingParameters]):
     def __init__(self, robot: Description, parameters: PathFollowingParameters) -> None:
         super().__init__(robot, parameters)
         self._body = PlanarBody(robot)
-        self._climb = Climb(robot)
+        self._platform_climb = PlatformClimb(robot)
         self._progress = PathProgress(self._body, speed_filter_s=parameters.speed_filter_s)
-        self._bumpless = BumplessReference(robot, parameters.blend_s)
+        self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
         self._reference_s_m = 0.0  # s_ref
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Return the joint angles of the body slightly further along the path; hold if its position is unknown."""
-        located = self._progress.update(observation)
-        if isinstance(located, str):
-            return self._bumpless.hold_pose(observation, located)
-        tail_s_m = located.tail_s_m
-        if located.restarted:
+        """Return position setpoints of the body slightly further along its path.
+
+        The look-ahead is bounded, so that a blocked body does not wind up. While the position of the body on the path
+        is unknown, the joints hold their references.
+
+        Args:
+            observation: The inputs of this tick.
+
+        Returns:
+            Position setpoints of all joints, with telemetry about the position on the path.
+        """
+        location = self._progress.update(observation)
+        if isinstance(location, str):  # why the position is unknown
+            return self._bumpless_follower.hold_pose(observation, location)
+        tail_s_m = location.tail_s_m
+        if location.may_have_jumped:
             self._reference_s_m = tail_s_m
-        advanced_s_m = self._reference_s_m + located.trajectory.speed_m_s * observation.period_s
+        advanced_s_m = self._reference_s_m + location.trajectory.speed_m_s * observation.period_s
         self._reference_s_m = min(max(advanced_s_m, tail_s_m), tail_s_m + self.parameters.look_ahead_m)
 
-        yaw_rad = self._body.all_angles(located.on_path.pose_at(self._reference_s_m))
-        pitch_rad = self._climb.angles_rad(located.trajectory.rises, self._reference_s_m)
+        yaw_rad = self._body.expand_joint_angles(location.body_on_path.compute_pose_at(self._reference_s_m))
+        pitch_rad = self._platform_climb.compute_pitch_angles_rad(location.trajectory.rises, self._reference_s_m)
         reference_rad = yaw_rad + pitch_rad
-        setpoints = self._bumpless.follow(observation, reference_rad, restarted=located.restarted)
+        setpoints = self._bumpless_follower.make_setpoints(
+            observation, reference_rad, may_have_jumped=location.may_have_jumped
+        )
         return ControllerCommand(setpoints, Telemetry(path_s_m=tail_s_m, reference_rad=reference_rad.tolist()))

@@ -13,88 +13,97 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.observations import ObservationPart, Observer, make_parts, select_parts
+from snakesim_gnc.control.observations import (
+    ObservationBuilder,
+    ObservationPart,
+    make_observation_parts,
+    select_observation_parts,
+)
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
-from snakesim_hal.model.files import SHIPPED, FileStruct, expand_home
-from snakesim_hal.model.plugins import pip_install
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
+from snakesim_hal.model.files import SHIPPED_FILES_DIR, FileStruct, expand_home
+from snakesim_hal.model.plugins import make_pip_install_command
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
-RUNTIME: Any = None
+ONNX_RUNTIME: Any = None
 with contextlib.suppress(ModuleNotFoundError):
     # Imported when this file is loaded: the policy is constructed while the robot arms, and that must not wait.
     import onnxruntime
 
-    RUNTIME = onnxruntime
+    ONNX_RUNTIME = onnxruntime
 
 # Names of the metadata properties.
-OBSERVATIONS = "snakesim.observations"
-ACTION = "snakesim.action"
-JOINTS = "snakesim.joints"
-FRAME_SKIP = "snakesim.frame_skip"
+OBSERVATIONS_KEY = "snakesim.observations"
+ACTION_KEY = "snakesim.action"
+JOINTS_KEY = "snakesim.joints"
+FRAME_SKIP_KEY = "snakesim.frame_skip"
 
-MODES = {"position": Mode.POSITION, "velocity": Mode.VELOCITY, "torque": Mode.TORQUE}
+MODE_BY_ACTION = {"position": Mode.POSITION, "velocity": Mode.VELOCITY, "torque": Mode.TORQUE}
 MAX_FRAME_SKIP = 1000  # ticks; a longer pause between two targets is a mistake
-MAX_DIGITS = 9  # of a number in the metadata; more digits are a mistake
+MAX_INTEGER_DIGITS = 9  # of a number in the metadata; more digits are a mistake
 
 # Shipped policies.
-POLICIES = SHIPPED / "policies"
-SUFFIX = ".onnx"
+POLICY_FOLDER = SHIPPED_FILES_DIR / "policies"
+MODEL_SUFFIX = ".onnx"
 
 
-class Model:
+class PolicyModel:
     """A model from a file, with its metadata. Calling it computes targets from an observation."""
 
     def __init__(self, robot: Description, file: str) -> None:
         """Load the model and check that it fits the robot.
 
         Args:
-            robot: the robot that the model is going to move.
-            file: path of an ONNX file, or the name of a shipped policy.
+            robot: The robot that the model is going to move.
+            file: Path of an ONNX file, or the name of a shipped policy.
 
         Raises:
-            ConfigError: the model does not fit; the error names the file, the field, its value and what is expected.
+            ConfigError: The model does not fit; the error names the file, the field, its value and what is expected.
         """
         self._session, properties = load_model(file)
-        metadata = _Metadata(file, properties)
+        metadata = _ModelMetadata(file, properties)
 
         # What the model observes and returns.
         self.parts = metadata.read_parts(robot)
-        self.action = metadata.read_choice(ACTION, MODES)
-        self.frame_skip = metadata.read_integer(FRAME_SKIP, MAX_FRAME_SKIP, "ticks")  # ticks per inference
-        _check_joints(metadata, robot, self.action, self.parts)
+        self.action = metadata.read_choice(ACTION_KEY, MODE_BY_ACTION)
+        self.frame_skip = metadata.read_integer(FRAME_SKIP_KEY, MAX_FRAME_SKIP, "ticks")  # ticks per inference
+        _check_joints_of_model(metadata, robot, self.action, self.parts)
 
         # Names of the model's tensors.
         width = sum(len(part.names) for part in self.parts.values())
         joint_count = len(robot.joints)
-        self._input = _check_tensor("input", self._session.get_inputs(), width, ", ".join(self.parts), file)
-        self._output = _check_tensor(
+        self._input_name = _find_only_tensor_name(
+            "input", self._session.get_inputs(), width, ", ".join(self.parts), file
+        )
+        self._output_name = _find_only_tensor_name(
             "output", self._session.get_outputs(), joint_count, "a target for each joint", file
         )
 
     def __call__(self, observation: NDArray[np.float32]) -> list[float]:
         """Return the targets of all joints, tail to head, for an observation of shape (width,)."""
         batch = observation[None]
-        (targets,) = self._session.run([self._output], {self._input: batch})
+        (targets,) = self._session.run([self._output_name], {self._input_name: batch})
         return targets[0].tolist()
 
 
-def _check_joints(metadata: "_Metadata", robot: Description, action: str, parts: Mapping[str, ObservationPart]) -> None:
+def _check_joints_of_model(
+    metadata: "_ModelMetadata", robot: Description, action: str, parts: Mapping[str, ObservationPart]
+) -> None:
     """Check that the robot has the joints that the model commands and observes. Raises ConfigError."""
     joint_count = len(robot.joints)
-    expected_count = metadata.read_integer(JOINTS)
+    expected_count = metadata.read_integer(JOINTS_KEY)
     if expected_count != joint_count:
         allowed = f"{joint_count}, the number of joints of robot {robot.robot!r}"
-        raise metadata.make_error(JOINTS, expected_count, allowed)
+        raise metadata.make_error(JOINTS_KEY, expected_count, allowed)
     for joint in robot.joints:
-        if not joint.supports_mode(MODES[action]):
-            available = [name for name, mode in MODES.items() if joint.supports_mode(mode)]
-            raise metadata.make_error(ACTION, action, f"what {joint.name} can do: {', '.join(available)}")
+        if not joint.supports_mode(MODE_BY_ACTION[action]):
+            available = [name for name, mode in MODE_BY_ACTION.items() if joint.supports_mode(mode)]
+            raise metadata.make_error(ACTION_KEY, action, f"what {joint.name} can do: {', '.join(available)}")
         if "torque_nm" in parts and "torque" not in joint.measures:
             allowed = f"without torque_nm: {joint.name} measures none"
-            raise metadata.make_error(OBSERVATIONS, ",".join(parts), allowed)
+            raise metadata.make_error(OBSERVATIONS_KEY, ",".join(parts), allowed)
 
 
 class PolicyParameters(FileStruct, frozen=True, kw_only=True):
@@ -114,16 +123,16 @@ class Policy(Controller[PolicyParameters]):
     def __init__(self, robot: Description, parameters: PolicyParameters) -> None:
         """Load the model. Raises ConfigError if it does not fit the robot."""
         super().__init__(robot, parameters)
-        self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
+        self._torque_limits_nm = [joint.torque_limit_nm for joint in robot.joints]
 
         # The model.
-        self._model = Model(robot, parameters.model)
-        self._observer = Observer(robot, self._model.parts)
-        self._mode = MODES[self._model.action]
+        self._model = PolicyModel(robot, parameters.model)
+        self._observation_builder = ObservationBuilder(robot, self._model.parts)
+        self._mode = MODE_BY_ACTION[self._model.action]
 
         # Its last targets.
-        self._target: list[float] | None = None  # None: the next tick runs the model
-        self._target_tick = 0  # tick at which the model ran last
+        self._last_targets: list[float] | None = None  # None if the next tick runs the model
+        self._last_inference_tick = 0  # tick at which the model ran last
 
         # Setpoints that hold the pose while a sensor is late; None while all sensors are fresh.
         self._hold_setpoints: RequestedSetpoints | None = None
@@ -131,7 +140,7 @@ class Policy(Controller[PolicyParameters]):
     @classmethod
     def check(cls, robot: Description, parameters: PolicyParameters) -> None:
         """Check before a run that the model fits the robot. Raises ConfigError."""
-        Model(robot, parameters.model)
+        PolicyModel(robot, parameters.model)
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Return the model's targets, or setpoints that hold the pose while a sensor that the model needs is late.
@@ -140,41 +149,46 @@ class Policy(Controller[PolicyParameters]):
         limiter limits the targets.
 
         Args:
-            observation: the inputs of this tick.
+            observation: The inputs of this tick.
 
         Returns:
             Setpoints of all joints in the mode of the model.
         """
-        why_late = self._describe_late_sensors(observation)
-        if why_late:
-            return self._hold_pose(observation, why_late)
+        late_reason = self._describe_late_sensors(observation)
+        if late_reason:
+            return self._hold_pose(observation, late_reason)
         self._hold_setpoints = None
-        if self._target is None or observation.tick - self._target_tick >= self._model.frame_skip:
-            self._target = self._model(self._observer.update(observation))
-            self._target_tick = observation.tick
-        modes = [self._mode] * len(self._target)
-        setpoints = RequestedSetpoints(modes, list(self._target), list(self._torque_limit_nm))
+        if self._last_targets is None or observation.tick - self._last_inference_tick >= self._model.frame_skip:
+            self._last_targets = self._model(self._observation_builder.build_observation(observation))
+            self._last_inference_tick = observation.tick
+        modes = [self._mode] * len(self._last_targets)
+        setpoints = RequestedSetpoints(modes, list(self._last_targets), list(self._torque_limits_nm))
         reference: Sequence[float] = ()
         if self._mode is Mode.POSITION:
-            reference = self._target
+            reference = self._last_targets
         return ControllerCommand(setpoints, Telemetry(reason="a policy moves the joints", reference_rad=reference))
 
     def _describe_late_sensors(self, observation: Observation) -> str:
-        """Return why samples that the model needs must not be used; empty when all are fresh."""
+        """Return why samples that the model needs are too old; an empty text if all are fresh."""
         if observation.sensor_samples is None:
             return ""
-        late = observation.sensor_samples.late
-        return "; ".join(late[key] for key in sorted(self._observer.sensors & late.keys()))
+        late_reasons_by_key = observation.sensor_samples.late
+        return "; ".join(
+            late_reasons_by_key[key] for key in sorted(self._observation_builder.sensors & late_reasons_by_key.keys())
+        )
 
-    def _hold_pose(self, observation: Observation, why: str) -> ControllerCommand:
-        """Hold the pose that the robot had when the sensor became late."""
+    def _hold_pose(self, observation: Observation, reason: str) -> ControllerCommand:
+        """Return setpoints that hold the pose which the robot had when the sensor became late.
+
+        The next update without a late sensor runs the model at once.
+        """
         if self._hold_setpoints is None:
-            self._hold_setpoints = positions(self.robot, observation.joints.angle_rad)
-        self._target = None
-        return ControllerCommand(self._hold_setpoints, Telemetry(reason=why))
+            self._hold_setpoints = make_position_setpoints(self.robot, observation.joints.angle_rad)
+        self._last_targets = None
+        return ControllerCommand(self._hold_setpoints, Telemetry(reason=reason))
 
 
-class _Metadata:
+class _ModelMetadata:
     """Reads and checks the metadata properties of a model, which are texts. Its methods raise ConfigError."""
 
     def __init__(self, file: str, properties: Mapping[str, str]) -> None:
@@ -182,24 +196,24 @@ class _Metadata:
         self._properties = properties
 
     def read_parts(self, robot: Description) -> dict[str, ObservationPart]:
-        """Return the parts of the observation, in the order in which the model expects them."""
-        available = make_parts(robot)
+        """Return the parts of the observation, in the order in which the model expects them. Raises ConfigError."""
+        available = make_observation_parts(robot)
         allowed = f"names out of {', '.join(available)}, each once, with commas between"
-        text = self._read_text(OBSERVATIONS, allowed)
+        text = self._read_text(OBSERVATIONS_KEY, allowed)
         names = [name.strip() for name in text.split(",")]
         has_unknown_names = not set(names) <= set(available)
         has_repeated_names = len(set(names)) < len(names)
         if has_unknown_names or has_repeated_names:
-            raise self.make_error(OBSERVATIONS, text, allowed)
+            raise self.make_error(OBSERVATIONS_KEY, text, allowed)
         try:
-            return select_parts(robot, names)
+            return select_observation_parts(robot, names)
         except ConfigError as error:
             raise ConfigError(
-                f"{self._file}: metadata `{OBSERVATIONS}` is {shorten(text)!r}: {error}", code="policy/invalid"
+                f"{self._file}: metadata `{OBSERVATIONS_KEY}` is {shorten(text)!r}: {error}", code="policy/invalid"
             ) from None
 
     def read_choice(self, field: str, choices: Mapping[str, Any]) -> str:
-        """Return a text that is one of the choices."""
+        """Return a metadata property that must be one of the choices. Raises ConfigError."""
         allowed = f"one of {', '.join(choices)}"
         text = self._read_text(field, allowed).strip()
         if text not in choices:
@@ -207,7 +221,16 @@ class _Metadata:
         return text
 
     def read_integer(self, field: str, maximum: int | None = None, unit: str = "") -> int:
-        """Return an integer from 1 to `maximum`; None: without an upper bound."""
+        """Return a metadata property as an integer from 1 to `maximum`.
+
+        Args:
+            field: Name of the metadata property.
+            maximum: Upper bound; None for no upper bound.
+            unit: Unit of the number, for the error message; empty for a count.
+
+        Raises:
+            ConfigError: The property is missing, is not an integer, or is out of range.
+        """
         allowed = "a whole number"
         if unit:
             allowed += f" of {unit}"
@@ -215,7 +238,7 @@ class _Metadata:
         if maximum is not None:
             allowed += f" to {maximum}"
         text = self._read_text(field, allowed).strip()
-        is_number = text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS
+        is_number = text.isascii() and text.isdigit() and len(text) <= MAX_INTEGER_DIGITS
         if not is_number:
             raise self.make_error(field, text, allowed)
         value = int(text)
@@ -243,42 +266,44 @@ def _find_model_file(name: str) -> Path:
     """Return the path of a model from its path as written, or from the name of a shipped policy.
 
     Raises:
-        ConfigError: no shipped policy has this name.
+        ConfigError: No shipped policy has this name.
     """
-    if "/" in name or name.endswith(SUFFIX):
+    if "/" in name or name.endswith(MODEL_SUFFIX):
         return expand_home(name)
-    shipped = sorted(path.stem for path in POLICIES.glob(f"*{SUFFIX}"))
+    shipped = sorted(path.stem for path in POLICY_FOLDER.glob(f"*{MODEL_SUFFIX}"))
     if name not in shipped:
         raise ConfigError(
             f"no policy called {shorten(name)!r}; {suggest_word(name, shipped)}shipped are {', '.join(shipped)}. For a "
-            f"file of your own give its path, such as ./{shorten(name)}{SUFFIX}",
+            f"file of your own give its path, such as ./{shorten(name)}{MODEL_SUFFIX}",
             code="config/unknown-name",
         )
-    return POLICIES / f"{name}{SUFFIX}"
+    return POLICY_FOLDER / f"{name}{MODEL_SUFFIX}"
 
 
 def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     """Load a policy's ONNX model into an inference session that gives the same results on every computer.
 
     Args:
-        file: path of an ONNX file, or the name of a shipped policy.
+        file: Path of an ONNX file, or the name of a shipped policy.
 
     Returns:
         An inference session of onnxruntime, and the metadata properties of the model.
 
     Raises:
-        ConfigError: the file cannot be read or is no model, or onnxruntime is not installed.
+        ConfigError: The file cannot be read or is no model, or onnxruntime is not installed.
     """
     data = read_bytes(_find_model_file(file))
-    if RUNTIME is None:
-        raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}", code="extra/not-installed")
-    options = RUNTIME.SessionOptions()
+    if ONNX_RUNTIME is None:
+        raise ConfigError(
+            f"controller policy needs onnxruntime: {make_pip_install_command('policy')}", code="extra/not-installed"
+        )
+    options = ONNX_RUNTIME.SessionOptions()
     # One thread adds in the same order on every computer, so that results are equal to the bit.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 3  # errors only: they are raised as well, and would be printed twice below
     try:
-        session = RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        session = ONNX_RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many classes that share no base class
         raise ConfigError(
             f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}", code="policy/invalid"
@@ -286,32 +311,32 @@ def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     return session, session.get_modelmeta().custom_metadata_map
 
 
-def _check_tensor(kind: str, tensors: Sequence[Any], width: int, meaning: str, file: str) -> str:
-    """Return the name of a model's only input or output after a check of its type and shape.
+def _find_only_tensor_name(kind: str, tensors: Sequence[Any], width: int, content: str, file: str) -> str:
+    """Return the name of a model's only input or output tensor, after a check of its type and shape.
 
     Args:
-        kind: "input" or "output", for the error.
-        tensors: all inputs or all outputs of the model.
-        width: the tensor must be float32 of shape (1, width); its first dimension may be dynamic.
-        meaning: what the numbers of the tensor mean, for the error.
-        file: the model's file, for the error.
+        kind: "input" or "output", for the error message.
+        tensors: All inputs or all outputs of the model.
+        width: The tensor must be float32 of shape (1, width); its first dimension may be dynamic.
+        content: What the values of the tensor are, for the error message.
+        file: Path of the model's file, for the error message.
 
     Raises:
-        ConfigError: there is not exactly one tensor, or it has another type or shape.
+        ConfigError: There is not exactly one tensor, or it has another type or shape.
     """
-    if len(tensors) == 1 and _has_width(tensors[0], width):
+    if len(tensors) == 1 and _has_shape(tensors[0], width):
         return tensors[0].name
     descriptions = [f"{tensor.name} {tensor.type} {tuple(tensor.shape)}" for tensor in tensors]
     available = shorten("; ".join(descriptions) or "none", 200)
     raise ConfigError(
         f"{shorten(file)}: {kind} is {available}, must be one tensor(float), that is float32, of shape (1, {width}): "
-        f"{meaning}",
+        f"{content}",
         code="policy/invalid",
     )
 
 
-def _has_width(tensor: Any, width: int) -> bool:
-    """Return whether a tensor is float32 of shape (1, width), where the 1 may be left open."""
+def _has_shape(tensor: Any, width: int) -> bool:
+    """Return whether a tensor is float32 of shape (1, width), where the first dimension may also be dynamic."""
     if tensor.type != "tensor(float)" or len(tensor.shape) != 2:
         return False
     batch_size, tensor_width = tensor.shape

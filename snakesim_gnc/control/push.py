@@ -25,13 +25,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.geometry.planar import cross
+from snakesim_gnc.geometry.planar import cross_2d
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import LINK_FRACTIONS, Outlines, nearest_on_chain
+from snakesim_hal.model.outlines import LINK_FRACTIONS, Outlines, find_nearest_points_on_chain
 
 MAX_NORMAL_ALONG_BODY = 0.6  # |n . t| of a contact; above it, the obstacle stands in front of the head
-MAX_RESIDUAL = 0.05  # unbalanced fraction of the force up to which contacts count as able to push
-MAX_ITERATIONS = 30  # of the solver; it needs one for each contact that carries force
+MAX_BALANCE_RESIDUAL = 0.05  # unbalanced fraction of the force up to which contacts count as able to push
+MAX_SOLVER_ITERATIONS = 30  # of the solver; it needs one for each contact that carries force
 MIN_GRADIENT = 1e-9  # contacts with a smaller gradient do not improve the solution
 
 # Weights of the three parts of the least-squares problem.
@@ -41,11 +41,11 @@ FORCE_WEIGHT = 0.02  # size of the forces
 
 
 @dataclass(frozen=True)
-class Touches:
+class BodyContacts:
     """Contacts of a body with obstacles that it touches, or nearly touches; one row for each of k contacts."""
 
-    obstacle: NDArray[np.intp]  # (k,) index of the obstacle
-    places_w: Floats  # (k, 2) m, o_c on the surface of the body
+    obstacle_index: NDArray[np.intp]  # (k,) index of the obstacle
+    positions_w: Floats  # (k, 2) m, o_c on the surface of the body
     directions_w: Floats  # (k, 2), d_c: direction of the push, friction included
     tangents_w: Floats  # (k, 2), t_c: unit vectors along the body, towards the head
     body_s_m: Floats  # (k,) arc length from the tail end
@@ -56,80 +56,85 @@ class Touches:
 
 
 @dataclass(frozen=True)
-class UnitPush:
-    """Contact forces and joint torques for a push of 1 N along the body."""
+class NormalizedPush:
+    """Contact forces and joint torques, normalized to a push of 1 N along the body."""
 
-    lambdas: Floats  # (k,) N/N
-    torques_nm: Floats  # (n_joints,) N·m/N, of the joints that bend
-    residual: float  # fraction of the push that no contact can balance
+    contact_forces: Floats  # (k,) N/N, the multipliers lambda_c of the contacts' push directions
+    joint_torques_nm: Floats  # (n_joints,) N·m/N, of the joints that bend
+    balance_residual: float  # |A lambda - b|: fraction of the push that the contacts do not balance
 
     @property
-    def balanced(self) -> bool:
+    def is_balanced(self) -> bool:
         """Whether these contacts can push at all."""
-        return self.residual < MAX_RESIDUAL and bool((self.lambdas > 0.0).any())
+        return self.balance_residual < MAX_BALANCE_RESIDUAL and bool((self.contact_forces > 0.0).any())
 
 
-class PushFilter:
+class PushLowPassFilter:
     """First-order low-pass filter of pushes.
 
     Pose noise moves much of the force from one contact to another in every solution; the filter averages this.
     """
 
-    def __init__(self, filter_s: float) -> None:
-        self._filter_s = filter_s  # time constant
-        # Last output. Contacts are identified by the names of their obstacles.
-        self._time_s = -np.inf
-        self._lambdas: dict[str, float] = {}
-        self._torques_nm: Floats | float = 0.0
-        self._residual = 0.0
+    def __init__(self, time_constant_s: float) -> None:
+        self._time_constant_s = time_constant_s
+        # The last output. Contacts are identified by the names of their obstacles.
+        self._last_time_s = -np.inf
+        self._last_forces_by_obstacle: dict[str, float] = {}
+        self._last_joint_torques_nm: Floats | float = 0.0
+        self._last_residual = 0.0
 
-    def update(self, time_s: float, push: UnitPush, obstacles: Sequence[str]) -> UnitPush:
+    def update(self, time_s: float, push: NormalizedPush, obstacles: Sequence[str]) -> NormalizedPush:
         """Filter the contact forces of a push by a low-pass filter of first order, contact by contact.
 
+        With the time dt since the last push, decay = exp(-dt / time constant) and alpha = 1 - decay, the output is
+        alpha * new + decay * last. A contact that the last push did not have starts at zero.
+
         Args:
-            time_s: time of the push.
-            push: the new, unfiltered push.
-            obstacles: (k,) names of the obstacles of its contacts; they identify contacts from push to push.
+            time_s: Time of the push.
+            push: The new, unfiltered push.
+            obstacles: (k,) names of the obstacles of its contacts, which identify contacts from push to push.
 
         Returns:
             The filtered push, with the same k contacts.
         """
-        last_gain = float(np.exp((self._time_s - time_s) / self._filter_s))
-        new_gain = 1.0 - last_gain
-        lambdas: list[float] = []
-        for name, new_lambda in zip(obstacles, push.lambdas, strict=True):
-            lambdas.append(new_gain * new_lambda + last_gain * self._lambdas.get(name, 0.0))
-        torques_nm = new_gain * push.torques_nm + last_gain * self._torques_nm
-        residual = new_gain * push.residual + last_gain * self._residual
-        self._time_s = time_s
-        self._lambdas = dict(zip(obstacles, lambdas, strict=True))
-        self._torques_nm = torques_nm
-        self._residual = residual
-        return UnitPush(np.array(lambdas), torques_nm, residual)
+        decay = float(np.exp((self._last_time_s - time_s) / self._time_constant_s))
+        alpha = 1.0 - decay
+        filtered_forces: list[float] = []
+        for name, new_force in zip(obstacles, push.contact_forces, strict=True):
+            filtered_forces.append(alpha * new_force + decay * self._last_forces_by_obstacle.get(name, 0.0))
+        joint_torques_nm = alpha * push.joint_torques_nm + decay * self._last_joint_torques_nm
+        balance_residual = alpha * push.balance_residual + decay * self._last_residual
+        self._last_time_s = time_s
+        self._last_forces_by_obstacle = dict(zip(obstacles, filtered_forces, strict=True))
+        self._last_joint_torques_nm = joint_torques_nm
+        self._last_residual = balance_residual
+        return NormalizedPush(np.array(filtered_forces), joint_torques_nm, balance_residual)
 
 
-def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:
+def find_body_contacts(
+    body_points_w: Floats, radius_m: float, outlines: Outlines, *, max_gap_m: float, friction: float
+) -> BodyContacts:
     """Find the point of the body that is nearest to each obstacle within reach and beside the body.
 
     Args:
-        nodes_w: (2, n) m, nodes of the body's center line, tail to head.
-        radius_m: radius of the body.
-        outlines: outlines of all obstacles.
-        reach_m: largest gap between skin and obstacle that still counts as a contact.
-        friction: friction coefficient mu between body and obstacles.
+        body_points_w: (2, n) points of the body's center line (tail end, joints, head end) in the world, m.
+        radius_m: Radius of the body.
+        outlines: Outlines of all obstacles.
+        max_gap_m: Maximum gap between skin and obstacle that still counts as a contact.
+        friction: Friction coefficient mu between body and obstacles.
 
     Returns:
-        The contacts, each with its place on the skin, its direction of push, and its gap.
+        The k contacts, each with its position on the skin, its direction of push, and its gap.
     """
-    samples, nearest_w, distances_m = nearest_on_chain(nodes_w.T, outlines)
-    near_obstacles = np.flatnonzero(distances_m - radius_m < reach_m)
+    samples, nearest_w, distances_m = find_nearest_points_on_chain(body_points_w.T, outlines)
+    near_obstacles = np.flatnonzero(distances_m - radius_m < max_gap_m)
     center_w = nearest_w[near_obstacles]  # (k, 2) on the center line
     link, fraction_index = np.divmod(samples[near_obstacles], len(LINK_FRACTIONS))
 
     # Normal, tangent and arc length of each contact.
-    link_vectors_w = np.diff(nodes_w, axis=1).T  # (n_links, 2)
+    link_vectors_w = np.diff(body_points_w, axis=1).T  # (n_links, 2)
     lengths_m = np.hypot(*link_vectors_w.T)
-    distance_m, normal = outlines.distance_and_normal(center_w, near_obstacles)
+    distance_m, normal = outlines.compute_distances_and_normals(center_w, near_obstacles)
     tangent = (link_vectors_w / lengths_m[:, None])[link]
     link_start_m = np.concatenate(([0.0], np.cumsum(lengths_m)[:-1]))
     body_s_m = link_start_m[link] + LINK_FRACTIONS[fraction_index] * lengths_m[link]
@@ -140,9 +145,9 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     # An obstacle in front of the head or behind the tail, whose normal is along the body, cannot be pushed sideways.
     normal_along_body = np.abs(np.einsum("ij,ij->i", normal, tangent))
     beside_body = np.flatnonzero(normal_along_body < MAX_NORMAL_ALONG_BODY)
-    return Touches(
-        obstacle=near_obstacles[beside_body],
-        places_w=(center_w - radius_m * normal)[beside_body],
+    return BodyContacts(
+        obstacle_index=near_obstacles[beside_body],
+        positions_w=(center_w - radius_m * normal)[beside_body],
         directions_w=direction[beside_body],
         tangents_w=tangent[beside_body],
         body_s_m=body_s_m[beside_body],
@@ -150,14 +155,14 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     )
 
 
-def push_forward(
-    nodes_w: Floats,
-    touches: Touches,
-    turns_per_m: Floats,
+def solve_push(
+    body_points_w: Floats,
+    contacts: BodyContacts,
+    joint_slopes_rad_per_m: Floats,
     *,
     contact_gap_scale_m: float,
     extra_cost: Floats | float = 0.0,
-) -> UnitPush:
+) -> NormalizedPush:
     """Solve for the contact forces and joint torques that push with 1 N along the body.
 
     Minimizes, over lambda >= 0 and with W = diag(1 + gap_c / contact_gap_scale_m + extra_cost_c),
@@ -168,88 +173,102 @@ def push_forward(
     about the center of the body.
 
     Args:
-        nodes_w: (2, n) m, nodes of the body's center line, tail to head.
-        touches: k contacts.
-        turns_per_m: (n_joints,) theta_i' in rad/m, of the joints that bend.
-        contact_gap_scale_m: gap at which the force of a contact costs twice as much as without a gap.
-        extra_cost: (k,) added to the cost weights of the contacts.
+        body_points_w: (2, n) points of the body's center line (tail end, joints, head end) in the world, m.
+        contacts: The k contacts that may push.
+        joint_slopes_rad_per_m: (n_joints,) theta_i', derivatives of the joint angles by the arc length of the body on
+            its path, of the joints that bend.
+        contact_gap_scale_m: Gap at which the force of a contact costs twice as much as without a gap.
+        extra_cost: (k,) terms that are added to the cost weights of the contacts, or one term for all.
+
+    Returns:
+        The contact forces lambda and the joint torques tau for 1 N, and the residual |A lambda - b| of the balance.
     """
-    rear_w = nodes_w[:, :-1].T  # (n_links, 2)
-    run_w = np.diff(nodes_w, axis=1).T
-    lengths_m = np.hypot(*run_w.T)
-    middles_w = rear_w + 0.5 * run_w
-    tangents = run_w / lengths_m[:, None]
+    link_rear_ends_w = body_points_w[:, :-1].T  # (n_links, 2)
+    link_vectors_w = np.diff(body_points_w, axis=1).T
+    lengths_m = np.hypot(*link_vectors_w.T)
+    middles_w = link_rear_ends_w + 0.5 * link_vectors_w
+    tangents = link_vectors_w / lengths_m[:, None]
     length_fraction = lengths_m / lengths_m.sum()  # the drag of each link, for 1 N in sum
     center_w = length_fraction @ middles_w
 
     drag_force = length_fraction @ tangents
-    drag_moment = length_fraction @ cross(middles_w - center_w, tangents)
+    drag_moment = length_fraction @ cross_2d(middles_w - center_w, tangents)
     b = np.array([*drag_force, drag_moment])  # (3,)
-    arms_m = touches.places_w - center_w
-    a = np.column_stack([touches.directions_w, cross(arms_m, touches.directions_w)]).T  # (3, k)
+    arms_m = contacts.positions_w - center_w
+    a = np.column_stack([contacts.directions_w, cross_2d(arms_m, contacts.directions_w)]).T  # (3, k)
 
-    joints_w = nodes_w[:, 1:-1].T  # (n_joints, 2), p_i
-    is_ahead = touches.body_s_m[None, :] > np.cumsum(lengths_m)[:-1, None]
-    lever = -(is_ahead * cross(touches.places_w[None] - joints_w[:, None], touches.directions_w[None]))
+    joints_w = body_points_w[:, 1:-1].T  # (n_joints, 2), p_i
+    is_ahead = contacts.body_s_m[None, :] > np.cumsum(lengths_m)[:-1, None]
+    lever = -(is_ahead * cross_2d(contacts.positions_w[None] - joints_w[:, None], contacts.directions_w[None]))
     link_is_ahead = np.triu(np.ones((len(joints_w), len(lengths_m)), dtype=bool), 1)
-    drag_torque = (link_is_ahead * cross(middles_w[None] - joints_w[:, None], tangents[None])) @ length_fraction
+    drag_torque = (link_is_ahead * cross_2d(middles_w[None] - joints_w[:, None], tangents[None])) @ length_fraction
 
     # Solve for x = W lambda, so that the last part of the cost is that of a unit matrix.
-    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / contact_gap_scale_m + extra_cost
-    work_cost = WORK_WEIGHT * np.abs(turns_per_m)
+    weight = 1.0 + np.maximum(contacts.gap_m, 0.0) / contact_gap_scale_m + extra_cost
+    work_cost = WORK_WEIGHT * np.abs(joint_slopes_rad_per_m)
     rows = [
         BALANCE_WEIGHT * a / weight,
         work_cost[:, None] * lever / weight,
-        FORCE_WEIGHT * np.eye(len(touches)),
+        FORCE_WEIGHT * np.eye(len(contacts)),
     ]
-    right = [BALANCE_WEIGHT * b, -work_cost * drag_torque, np.zeros(len(touches))]
-    lambdas = _solve_nonnegative(np.vstack(rows), np.concatenate(right)) / weight
-    return UnitPush(
-        lambdas=lambdas,
-        torques_nm=lever @ lambdas + drag_torque,
-        residual=float(np.linalg.norm(a @ lambdas - b)),
+    right_side = [BALANCE_WEIGHT * b, -work_cost * drag_torque, np.zeros(len(contacts))]
+    lambdas = _solve_nonnegative(np.vstack(rows), np.concatenate(right_side)) / weight
+    return NormalizedPush(
+        contact_forces=lambdas,
+        joint_torques_nm=lever @ lambdas + drag_torque,
+        balance_residual=float(np.linalg.norm(a @ lambdas - b)),
     )
 
 
 def _solve_nonnegative(matrix: Floats, right_side: Floats) -> Floats:
-    """Return the x >= 0 that minimizes |matrix x - right|.
+    """Return the x >= 0 that minimizes |matrix x - right_side|.
 
     Source: the active-set algorithm NNLS of Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23.
 
     Args:
-        matrix: (m, k).
-        right: (m,) right side.
+        matrix: (m, k) matrix.
+        right_side: (m,) right-hand side.
 
     Returns:
-        (k,) solution.
+        (k,) solution. After MAX_SOLVER_ITERATIONS it may not be the minimum.
     """
-    count = matrix.shape[1]
-    x = np.zeros(count)
-    free = np.zeros(count, dtype=bool)  # variables that may be above 0
-    if count == 0:
+    variable_count = matrix.shape[1]
+    x = np.zeros(variable_count)
+    is_free = np.zeros(variable_count, dtype=bool)  # variables that may be above 0
+    if variable_count == 0:
         return x
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(MAX_SOLVER_ITERATIONS):
         gradient = matrix.T @ (right_side - matrix @ x)
-        gradient[free] = -np.inf
-        entering = int(np.argmax(gradient))
-        if gradient[entering] < MIN_GRADIENT:
+        gradient[is_free] = -np.inf
+        entering_index = int(np.argmax(gradient))
+        if gradient[entering_index] < MIN_GRADIENT:
             break
-        free[entering] = True
-        x = _solve_free(matrix, right_side, x, free)
+        is_free[entering_index] = True
+        x = _solve_free_variables(matrix, right_side, x, is_free)
     return x
 
 
-def _solve_free(matrix: Floats, right: Floats, x: Floats, free: NDArray[np.bool_]) -> Floats:
-    """Solve for the free variables, and bind those that would become negative; `free` is changed in place."""
+def _solve_free_variables(matrix: Floats, right_side: Floats, x: Floats, is_free: NDArray[np.bool_]) -> Floats:
+    """Solve least squares for the free variables, and bind those at 0 that would become negative.
+
+    Args:
+        matrix: (m, k) matrix.
+        right_side: (m,) right-hand side.
+        x: (k,) current solution.
+        is_free: (k,) which variables may be above 0; variables that are bound become False in this array.
+
+    Returns:
+        (k,) new solution, which is 0 for all variables that are not free.
+    """
     while True:
-        trial = np.zeros(len(x))
-        trial[free] = np.linalg.lstsq(matrix[:, free], right, rcond=None)[0]
-        if (trial[free] > 0).all():
-            return trial
+        trial_solution = np.zeros(len(x))
+        trial_solution[is_free] = np.linalg.lstsq(matrix[:, is_free], right_side, rcond=None)[0]
+        if (trial_solution[is_free] > 0).all():
+            return trial_solution
         # Go towards the trial until the first variable reaches 0.
-        negative = free & (trial <= 0)
-        step = float(np.min(x[negative] / np.maximum(x[negative] - trial[negative], 1e-12)))
-        x = x + step * (trial - x)
-        free &= x > 1e-12
-        if not free.any():
+        is_negative = is_free & (trial_solution <= 0)
+        step_fraction = float(np.min(x[is_negative] / np.maximum(x[is_negative] - trial_solution[is_negative], 1e-12)))
+        x = x + step_fraction * (trial_solution - x)
+        is_free &= x > 1e-12
+        if not is_free.any():
             return np.zeros(len(x))

@@ -18,7 +18,7 @@ from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.controller import Observation, SensorSamples, Task
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander, Feed
-from snakesim_hal.programs.preflight import describe_missing_capability
+from snakesim_hal.programs.preflight import find_missing_capability
 from snakesim_hal.service import SILENCE_S, Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -35,9 +35,9 @@ from snakesim_hal.wire.messages import (
 )
 
 # Sensor samples that a controller may request.
-SENSED: dict[str, type[Message]] = {keys.POSE: Pose, keys.CONTACTS: Contacts}
+SENSOR_MESSAGE_TYPES: dict[str, type[Message]] = {keys.POSE: Pose, keys.CONTACTS: Contacts}
 
-Outputs = list[tuple[str, Message]]  # messages to publish, with their keys
+KeyedMessages = list[tuple[str, Message]]  # messages to publish, with their keys
 
 
 class Control(Service):
@@ -50,34 +50,34 @@ class Control(Service):
         """Create the service that runs one controller: it reads the robot's state in every tick, and sends setpoints.
 
         Args:
-            client: connection to the robot, on which inputs are subscribed.
-            config: configuration of the run, with the controller and its parameters.
+            client: Connection to the robot, on which inputs are subscribed.
+            config: Configuration of the run, with the controller and its parameters.
 
         Raises:
-            ConfigError: there is no such controller, or its parameters are invalid.
+            ConfigError: There is no such controller, or its parameters are invalid.
         """
         self._client = client
         self._config = config
         self._parameters = LiveParameters(client, config)
 
         # Inputs of every controller.
-        self._joints = client.subscribe(keys.JOINTS, JointState)
-        self._world = client.subscribe(keys.WORLD, World)
-        self._trajectory = client.subscribe(keys.TRAJECTORY, Trajectory)
-        self._statuses = client.session.reader(keys.STATUS, Status)
+        self._joint_feed = client.subscribe(keys.JOINTS, JointState)
+        self._world_feed = client.subscribe(keys.WORLD, World)
+        self._trajectory_feed = client.subscribe(keys.TRAJECTORY, Trajectory)
+        self._status_reader = client.session.declare_reader(keys.STATUS, Status)
         self._last_clock: Clock | None = None
 
         # Inputs of a controller that requests sensor samples.
-        self._task: Task | None = None  # None: the controller requests no samples
+        self._task: Task | None = None  # None if the controller requests no samples
         self._sensor_feeds: dict[str, Feed[Message]] = {}
         self._sensor_samples: dict[str, Message] = {}  # the newest of each key
         if self._parameters.uses_sensors:
             self._task = Task.from_config(config)
             self._subscribe_to_sensors()
 
-        # The arm session of the present controller.
+        # The arm session of the current controller.
         self._arm_session = -1
-        self._armed_at_ns = 0
+        self._arming_time_ns = 0
 
         # Streams that the log already reports as too old.
         self._logged_late_streams: set[str] = set()
@@ -86,38 +86,39 @@ class Control(Service):
         """Subscribe to those sensors in SENSED that the robot has."""
         sensors = self._config.robot.sensors
         is_mounted = {keys.POSE: sensors.pose is not None, keys.CONTACTS: sensors.contacts is not None}
-        for key, message_type in SENSED.items():
+        for key, message_type in SENSOR_MESSAGE_TYPES.items():
             if is_mounted[key]:
                 self._sensor_feeds[key] = self._client.subscribe(key, message_type)
 
     def configure(self, robot: Description) -> None:
         """Prepare to command this robot. Raises ControllerError if the robot cannot do what the controller needs."""
-        missing = describe_missing_capability(robot.joints, self._parameters.controller_class, self._config.controller)
+        missing = find_missing_capability(robot.joints, self._parameters.controller_class, self._config.controller)
         if missing is not None:
             raise ControllerError(f"robot {robot.robot!r}: {missing}")
         self._parameters.configure(robot)
         self._commander = Commander(self._client, robot)
         self._age_limits = AgeLimits.from_config(self._config, robot)
-        self._reports = StateReports(self._config.controller, robot)
-        self._times = UpdateTimes(robot)
+        self._state_reports = StateReports(self._config.controller, robot)
+        self._update_times = UpdateTimes(robot)
         self._controller: GuardedController | None = None
         self._sensor_samples.clear()
 
-    def outputs(self, clock: Clock) -> Outputs | None:
+    def outputs(self, clock: Clock) -> KeyedMessages | None:
         """Command the robot in one tick: by the controller while the robot is armed, otherwise to hold its pose.
 
         Without the command lease, or with joint states that are too old, nothing is sent to the robot.
 
         Args:
-            clock: the current tick, with the lifecycle state of the robot.
+            clock: The current tick, with the lifecycle state of the robot.
 
         Returns:
-            The state of control if it is due; None if there is no joint state for this tick.
+            The state of control with its key, or an empty list if no message is due; None if there is no joint state
+            for this tick.
         """
         self._last_clock = clock
-        self._statuses.drain()  # `silence` considers only a status that is newer than the last clock
+        self._status_reader.drain()  # `silence` considers only a status that is newer than the last clock
         self._apply_new_parameters(clock)
-        joints = self._client.read(self._joints)
+        joints = self._client.read(self._joint_feed)
         if joints is None:
             return None
         is_armed = clock.lifecycle == "armed"
@@ -125,23 +126,27 @@ class Control(Service):
         if not (is_armed and holds_lease):
             self._controller = None
         if not holds_lease:
-            why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
-            return _state_messages(self._reports.make_state(clock, armed=is_armed, missing=why))
-        why_late = self._age_limits.check_joints(joints, clock.timestamp_ns)
-        if why_late:
-            self._log_late_streams(clock, [why_late], "no commands")
-            return _state_messages(self._reports.make_state(clock, armed=is_armed, missing=why_late))
+            lease_reason = f"no right to command: {self._commander.lease_refusal or 'the lease is not ours'}"
+            return _list_state_messages(
+                self._state_reports.make_state(clock, is_armed=is_armed, missing_inputs=lease_reason)
+            )
+        late_reason = self._age_limits.check_joints(joints, clock.timestamp_ns)
+        if late_reason:
+            self._log_late_streams(clock, [late_reason], "no commands")
+            return _list_state_messages(
+                self._state_reports.make_state(clock, is_armed=is_armed, missing_inputs=late_reason)
+            )
         if not is_armed:
             self._log_late_streams(clock)
-            self._commander.send(clock, joints, self._commander.hold_position(joints))
-            return _state_messages(self._reports.make_state(clock))
+            self._commander.send_command(clock, joints, self._commander.make_hold_setpoints(joints))
+            return _list_state_messages(self._state_reports.make_state(clock))
         return self._run_controller(clock, joints)
 
     def pause(self, clock: Clock) -> None:
-        """Answer requests for other parameters while time is paused; they take effect in the next tick."""
+        """Answer requests to change parameters while robot time is paused; changes take effect in the next tick."""
         self._apply_new_parameters(clock)
 
-    def silence(self) -> Outputs:
+    def silence(self) -> KeyedMessages:
         """Report why no clock arrives: time is paused, or the HAL is silent altogether, which is PowerOff.
 
         The controller stays. The next tick decides whether it continues.
@@ -149,89 +154,95 @@ class Control(Service):
         clock = self._last_clock
         if clock is None:
             return []
-        statuses = self._statuses.drain()
+        statuses = self._status_reader.drain()
         if not statuses:
-            silent = f"neither clock nor status from the HAL for {SILENCE_S:g} s, after tick {clock.tick}"
-            return _state_messages(self._reports.make_state(clock, silent=silent))
+            silence_reason = f"neither clock nor status from the HAL for {SILENCE_S:g} s, after tick {clock.tick}"
+            return _list_state_messages(self._state_reports.make_state(clock, silence_reason=silence_reason))
         status = statuses[-1]
-        why_paused = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
+        pause_reason = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
         is_armed = status.lifecycle == "armed"
-        reason = f"robot time is paused: {why_paused}"
-        return _state_messages(self._reports.make_state(clock, armed=is_armed, paused=reason))
+        reason = f"robot time is paused: {pause_reason}"
+        return _list_state_messages(self._state_reports.make_state(clock, is_armed=is_armed, pause_reason=reason))
 
     def _apply_new_parameters(self, clock: Clock) -> None:
-        """Answer requests for other parameters. If the parameters have changed, the controller is constructed again."""
+        """Answer requests to change parameters. After a change, discard the controller, so that it is made again."""
         if self._parameters.answer_requests(clock):
             self._controller = None
 
-    def _run_controller(self, clock: Clock, joints: JointState) -> Outputs:
+    def _run_controller(self, clock: Clock, joints: JointState) -> KeyedMessages:
         """Call the controller with its fresh inputs, send its setpoints, and return its state if it is due.
 
         Args:
-            clock: the current tick, in which the robot is armed and this service has the command lease.
-            joints: the joint state of this tick.
+            clock: The current tick, in which the robot is armed and this service has the command lease.
+            joints: The joint state of this tick.
 
         Raises:
-            ControllerError: the controller has failed; its last state has been published.
+            ControllerError: The controller has failed; its last state has been published.
         """
-        world, trajectory, missing = self._read_fresh_plan(clock)
+        world, trajectory, missing_inputs = self._read_fresh_plan(clock)
         sensor_samples = self._read_sensor_samples(clock)
         try:
             controller = self._prepare_controller(clock)
             observation = Observation(
                 tick=clock.tick,
-                time_s=(clock.timestamp_ns - self._armed_at_ns) * 1e-9,
+                time_s=(clock.timestamp_ns - self._arming_time_ns) * 1e-9,
                 period_s=clock.period_ns * 1e-9,
                 joints=joints,
                 world=world,
                 trajectory=trajectory,
                 sensor_samples=sensor_samples,
             )
-            started_s = time.perf_counter()
+            start_time_s = time.perf_counter()
             command = controller.update(observation)
-            duration_s = time.perf_counter() - started_s
+            duration_s = time.perf_counter() - start_time_s
             self._count_update(clock, duration_s)
-            self._commander.send(clock, joints, command.setpoints)
-            rests = _explain_rest(trajectory)
+            self._commander.send_command(clock, joints, command.setpoints)
+            rest_reason = _explain_no_motion(trajectory)
             try:
-                state = self._reports.make_state(clock, command.telemetry, armed=True, missing=missing, rests=rests)
+                state = self._state_reports.make_state(
+                    clock, command.telemetry, is_armed=True, missing_inputs=missing_inputs, rest_reason=rest_reason
+                )
             except ValueError as error:
                 raise controller.make_error(str(error)) from None
         except ControllerError as error:
-            self._client.publish(keys.CONTROL_STATE, self._reports.make_failure(clock, str(error)))
+            self._client.publish(keys.CONTROL_STATE, self._state_reports.make_failure_state(clock, str(error)))
             raise
-        return _state_messages(state)
+        return _list_state_messages(state)
 
     def _read_fresh_plan(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
         """Read the newest world model and trajectory, and replace those that are too old by None.
 
         Args:
-            clock: the current tick.
+            clock: The current tick.
 
         Returns:
-            The world model and the trajectory, each None if it is missing or too old, and why inputs are too old; empty
-            if none is.
+            The world model and the trajectory, each None if it is missing or too old, and the reason why inputs are too
+            old, which is empty if all are fresh.
         """
-        world = self._client.read(self._world)
-        trajectory = self._client.read(self._trajectory)
+        world = self._client.read(self._world_feed)
+        trajectory = self._client.read(self._trajectory_feed)
         late_reasons: list[str] = []
         if world is not None:
-            why_late = self._age_limits.check_world(world, clock.timestamp_ns)
-            if why_late:
-                late_reasons.append(why_late)
+            late_reason = self._age_limits.check_world(world, clock.timestamp_ns)
+            if late_reason:
+                late_reasons.append(late_reason)
                 world = None
         if trajectory is not None:
-            why_late = self._age_limits.check_trajectory(trajectory, clock.timestamp_ns)
-            if why_late:
-                late_reasons.append(why_late)
+            late_reason = self._age_limits.check_trajectory(trajectory, clock.timestamp_ns)
+            if late_reason:
+                late_reasons.append(late_reason)
                 trajectory = None
         self._log_late_streams(clock, late_reasons, "the controller holds")
         if world is not None:
-            self._reports.add_world(world)
+            self._state_reports.add_world(world)
         return world, trajectory, "; ".join(late_reasons)
 
     def _read_sensor_samples(self, clock: Clock) -> SensorSamples | None:
-        """Return the newest sensor samples, and which are too old; None for a controller that requests none."""
+        """Return the newest sensor samples, with a reason for each that is too old.
+
+        Returns:
+            The samples, or None if the controller does not request sensor samples.
+        """
         if self._task is None:
             return None
         for key, feed in self._sensor_feeds.items():
@@ -239,49 +250,54 @@ class Control(Service):
             if sample is not None:
                 self._sensor_samples[key] = sample
         timestamps_ns = {key: getattr(sample, "timestamp_ns", None) for key, sample in self._sensor_samples.items()}
-        late = self._age_limits.check_sensors(timestamps_ns, clock.timestamp_ns)
-        return SensorSamples(dict(self._sensor_samples), late, self._task)
+        late_reasons_by_key = self._age_limits.check_sensors(timestamps_ns, clock.timestamp_ns)
+        return SensorSamples(dict(self._sensor_samples), late_reasons_by_key, self._task)
 
     def _prepare_controller(self, clock: Clock) -> GuardedController:
-        """Return the controller of this arm session, which is new after an arming and after a change of parameters."""
+        """Return the controller of this arm session. Construct it after each arming and each change of parameters."""
         is_new_session = clock.arm_session != self._arm_session
         if self._controller is None or is_new_session:
             self._controller = self._parameters.construct_controller()
             if is_new_session:
                 self._arm_session = clock.arm_session
-                self._armed_at_ns = clock.timestamp_ns
+                self._arming_time_ns = clock.timestamp_ns
         return self._controller
 
     def _count_update(self, clock: Clock, duration_s: float) -> None:
-        """Count an update, and log once when the controller has become too slow for real time."""
+        """Record the duration of an update, and log once when the controller has become too slow for real time.
+
+        Args:
+            clock: The current tick.
+            duration_s: Wall time that the controller needed for this update.
+        """
         was_too_slow = bool(self.too_slow)
-        self._times.add(duration_s)
-        self.too_slow = self._times.too_slow
+        self._update_times.add_duration(duration_s)
+        self.too_slow = self._update_times.too_slow_reason
         # Other clock modes have no deadlines, and there no message may depend on the wall clock.
         if clock.clock_mode == "realtime":
-            self._reports.too_slow = self.too_slow
+            self._state_reports.too_slow_reason = self.too_slow
         if self.too_slow and not was_too_slow:
             print_stderr(f"{clock.timestamp_ns * 1e-9:.3f} s: {self.too_slow}")
 
-    def _log_late_streams(self, clock: Clock, late: Sequence[str] = (), consequence: str = "") -> None:
-        """Log when other streams are too old than in the tick before, and when all inputs are fresh again.
+    def _log_late_streams(self, clock: Clock, late_reasons: Sequence[str] = (), consequence: str = "") -> None:
+        """Log if the set of input streams that are too old has changed since the last tick.
 
         Args:
-            clock: the present tick.
-            late: why inputs are too old; each text begins with the key of its stream.
-            consequence: what control does without them.
+            clock: The current tick.
+            late_reasons: Why inputs are too old. Each text begins with the key of its stream. Empty if all are fresh.
+            consequence: What control does without these inputs, for the log.
         """
-        streams = {why.partition(" ")[0] for why in late}
+        streams = {reason.partition(" ")[0] for reason in late_reasons}
         if streams != self._logged_late_streams:
             text = "all inputs of control are fresh again"
-            if late:
-                text = f"{'; '.join(late)}: {consequence}"
+            if late_reasons:
+                text = f"{'; '.join(late_reasons)}: {consequence}"
             print_stderr(f"{clock.timestamp_ns * 1e-9:.3f} s: {text}")
         self._logged_late_streams = streams
 
 
-def _explain_rest(trajectory: Trajectory | None) -> str:
-    """Return why no motion is intended; empty when motion is intended."""
+def _explain_no_motion(trajectory: Trajectory | None) -> str:
+    """Return why no motion is requested by the trajectory; an empty text if motion is requested."""
     if trajectory is None:
         return "there is no trajectory yet"
     if trajectory.speed_m_s != 0.0:
@@ -289,8 +305,8 @@ def _explain_rest(trajectory: Trajectory | None) -> str:
     return trajectory.reason or "the speed is zero"
 
 
-def _state_messages(state: ControlState | None) -> Outputs:
-    """Return what `outputs` has to publish."""
+def _list_state_messages(state: ControlState | None) -> KeyedMessages:
+    """Return a state of control with its key, as `Service.outputs` returns messages; an empty list for None."""
     if state is None:
         return []
     return [(keys.CONTROL_STATE, state)]

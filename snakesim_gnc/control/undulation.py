@@ -12,32 +12,32 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.bumpless import Blend, BumplessReference
-from snakesim_gnc.control.standstill import Standstill
+from snakesim_gnc.control.bumpless import Blend, BumplessFollower
+from snakesim_gnc.control.standstill import StandstillDetector
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
-AIM_DISTANCE_M = 1.0  # how far ahead on the path the head steers for
-JAMMED_M = 0.02  # a body that moves less than this within `jam_after_s` is jammed
+STEERING_DISTANCE_M = 1.0  # how far ahead on the path the head steers for
+MAX_JAM_DISTANCE_M = 0.02  # a body that moves less than this within `jam_after_s` is jammed
 
 Steering = Annotated[float, from_zero(2, "1")]
 
 
-def aside_rad(nodes_w: NDArray[np.float64], aim_w: NDArray[np.float64]) -> float:
-    """Return the angle from the direction of a body to a direction, left positive, in rad.
+def compute_direction_angle_rad(body_points_w: NDArray[np.float64], direction_w: NDArray[np.float64]) -> float:
+    """Compute the angle from the direction of a body (tail to head) to another direction, left positive.
 
     Args:
-        nodes_w: (n, 2) m, nodes of the body, tail to head.
-        aim_w: (2,) the direction, of any length.
+        body_points_w: (n, 2) points of the body, tail to head, m.
+        direction_w: (2,) vector in the other direction, of any length.
 
     Returns:
-        The angle, between -2 pi and 2 pi.
+        The angle in rad, between -2 pi and 2 pi.
     """
-    along_w = nodes_w[-1] - nodes_w[0]
-    return math.atan2(aim_w[1], aim_w[0]) - math.atan2(along_w[1], along_w[0])
+    body_direction_w = body_points_w[-1] - body_points_w[0]
+    return math.atan2(direction_w[1], direction_w[0]) - math.atan2(body_direction_w[1], body_direction_w[0])
 
 
 class LateralUndulationParameters(FileStruct, frozen=True, kw_only=True):
@@ -70,62 +70,70 @@ class LateralUndulation(Controller[LateralUndulationParameters]):
     def __init__(self, robot: Description, parameters: LateralUndulationParameters) -> None:
         super().__init__(robot, parameters)
         self._body = PlanarBody(robot)
-        self._bumpless = BumplessReference(robot, parameters.blend_s)
+        self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
         self._phase_rad = 0.0
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Advance the wave while there is a path to move along, and keep its phase otherwise."""
-        passed_s = 0.0
+        elapsed_s = 0.0
         if is_motion_requested(observation):
-            passed_s = observation.period_s
-        reference = self.reference_rad(observation, passed_s)
-        setpoints = self._bumpless.follow(observation, reference)
+            elapsed_s = observation.period_s
+        reference = self.compute_reference_rad(observation, elapsed_s)
+        setpoints = self._bumpless_follower.make_setpoints(observation, reference)
         return ControllerCommand(setpoints, Telemetry(reference_rad=reference.tolist()))
 
-    def start_from(self, angles_rad: NDArray[np.float64]) -> None:
-        """Choose the phase at which the wave is most similar to a shape, (n_joints,) rad."""
-        lags_rad = self.parameters.lag_rad * np.arange(len(self._body.bends))[::-1]
-        correlation = angles_rad[self._body.bends] @ np.exp(1j * lags_rad)
+    def match_phase_to_angles(self, angles_rad: NDArray[np.float64]) -> None:
+        """Set the phase at which the wave is most similar to measured joint angles, (n_joints,) in rad."""
+        lags_rad = self.parameters.lag_rad * np.arange(len(self._body.yaw_joints))[::-1]
+        correlation = angles_rad[self._body.yaw_joints] @ np.exp(1j * lags_rad)
         self._phase_rad = float(np.angle(1j * correlation))
 
-    def reference_rad(self, observation: Observation, passed_s: float) -> NDArray[np.float64]:
-        """Return the angles of all joints, (n_joints,), `passed_s` later than in the last call."""
-        self._phase_rad += math.tau * passed_s / self.parameters.period_s
-        n = np.arange(len(self._body.bends))[::-1]  # 0 at the head
+    def compute_reference_rad(self, observation: Observation, elapsed_s: float) -> NDArray[np.float64]:
+        """Advance the phase of the wave, and compute the reference angles of all joints.
+
+        Args:
+            observation: The inputs of this tick.
+            elapsed_s: Time by which the wave advances; negative to let the wave travel the other way.
+
+        Returns:
+            (n_joints,) angles in rad, tail to head.
+        """
+        self._phase_rad += math.tau * elapsed_s / self.parameters.period_s
+        n = np.arange(len(self._body.yaw_joints))[::-1]  # 0 at the head
         waves = np.sin(self._phase_rad - self.parameters.lag_rad * n)
         reference = np.zeros(len(self.robot.joints))
-        reference[self._body.bends] = self._amplitude_rad(observation, waves, passed_s) * waves + self._bend_rad(
-            observation
-        )
+        reference[self._body.yaw_joints] = self._compute_amplitude_rad(
+            observation, waves, elapsed_s
+        ) * waves + self._compute_bend_rad(observation)
         return reference
 
-    def _amplitude_rad(
-        self, _observation: Observation, _waves: NDArray[np.float64], _passed_s: float
+    def _compute_amplitude_rad(
+        self, _observation: Observation, _waves: NDArray[np.float64], _elapsed_s: float
     ) -> float | NDArray[np.float64]:
-        """Return the amplitude of all joints, or of each joint that bends, (n_bends,)."""
+        """Compute the amplitude of the wave: one for all yaw joints, or one for each, (n_yaw_joints,) in rad."""
         return self.parameters.amplitude_rad
 
-    def _bend_rad(self, observation: Observation) -> float | NDArray[np.float64]:
-        """Return the bend of every joint that turns the body towards the path ahead.
+    def _compute_bend_rad(self, observation: Observation) -> float | NDArray[np.float64]:
+        """Compute the bend in rad that is added to every yaw joint to turn the body towards the path ahead.
 
         A body that moves by a wave towards the head turns against its bend, so the bend has the sign of the lag.
         """
         if self.parameters.steering == 0.0 or observation.world is None or observation.trajectory is None:
             return 0.0
-        nodes_w = self._body.nodes_w(observation.world, observation.joints.angle_rad).T
-        head_w = nodes_w[-1]
-        aim_w = _find_aim(np.array(observation.trajectory.path_w), head_w)
-        angle_rad = math.remainder(aside_rad(nodes_w, aim_w - head_w), math.tau)
-        return math.copysign(self.parameters.steering, self.parameters.lag_rad) * angle_rad / len(self._body.bends)
+        body_points_w = self._body.compute_body_points_w(observation.world, observation.joints.angle_rad).T
+        head_w = body_points_w[-1]
+        target_w = _find_steering_target(np.array(observation.trajectory.path_w), head_w)
+        angle_rad = math.remainder(compute_direction_angle_rad(body_points_w, target_w - head_w), math.tau)
+        return math.copysign(self.parameters.steering, self.parameters.lag_rad) * angle_rad / len(self._body.yaw_joints)
 
 
-def _find_aim(path_w: NDArray[np.float64], head_w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the point of a path, (n, 2), that is AIM_DISTANCE_M ahead of the head, or its last point."""
-    nearest = np.argmin(np.hypot(*(path_w - head_w).T))
-    ahead_w = path_w[nearest:]
+def _find_steering_target(path_w: NDArray[np.float64], head_w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the point of a path, (n, 2), that is STEERING_DISTANCE_M ahead of the head, or its last point."""
+    nearest_index = np.argmin(np.hypot(*(path_w - head_w).T))
+    ahead_w = path_w[nearest_index:]
     distances_m = np.hypot(*(ahead_w - head_w).T)
-    aim = np.searchsorted(distances_m, AIM_DISTANCE_M)
-    return ahead_w[min(aim, len(ahead_w) - 1)]
+    target_index = np.searchsorted(distances_m, STEERING_DISTANCE_M)
+    return ahead_w[min(target_index, len(ahead_w) - 1)]
 
 
 class HeadSteeredUndulationParameters(LateralUndulationParameters, frozen=True, kw_only=True):
@@ -172,39 +180,50 @@ class CompliantUndulation(HeadSteeredUndulation):
     def __init__(self, robot: Description, parameters: CompliantUndulationParameters) -> None:
         super().__init__(robot, parameters)
         self._yielded_amplitude_rad = parameters.amplitude_rad
-        # Resolving jams; None: never.
-        self._standstill: Standstill | None = None
+        # Resolving jams; None if jams are not resolved.
+        self._standstill_detector: StandstillDetector | None = None
         if parameters.jam_after_s > 0.0:
-            self._standstill = Standstill(parameters.jam_after_s)
-        self._reverse_s = parameters.back_s
-        self._reverse_until_s = -math.inf
+            self._standstill_detector = StandstillDetector(parameters.jam_after_s)
+        self._reverse_duration_s = parameters.back_s
+        self._reverse_end_s = -math.inf
 
-    def reference_rad(self, observation: Observation, passed_s: float) -> NDArray[np.float64]:
-        """Return the angles of all joints, (n_joints,), later than in the last call, or earlier during a jam."""
-        if passed_s > 0.0 and self._is_reversing(observation, passed_s):
-            passed_s = -passed_s
-        return super().reference_rad(observation, passed_s)
+    def compute_reference_rad(self, observation: Observation, elapsed_s: float) -> NDArray[np.float64]:
+        """Advance the phase of the wave, or turn it back during a jam, and compute the reference angles of all joints.
 
-    def _is_reversing(self, observation: Observation, passed_s: float) -> bool:
-        """Whether the wave travels the other way at this tick; a jam that is detected starts it at the next tick."""
-        if self._standstill is None or observation.world is None:
+        Args:
+            observation: The inputs of this tick.
+            elapsed_s: Time since the last call; 0 to keep the phase.
+
+        Returns:
+            (n_joints,) angles in rad, tail to head.
+        """
+        if elapsed_s > 0.0 and self._is_reversing(observation, elapsed_s):
+            elapsed_s = -elapsed_s
+        return super().compute_reference_rad(observation, elapsed_s)
+
+    def _is_reversing(self, observation: Observation, elapsed_s: float) -> bool:
+        """Return whether the wave travels the other way at this tick, and watch whether the body is jammed.
+
+        A jam that is detected at this tick reverses the wave from the next tick on, for `back_s`.
+        """
+        if self._standstill_detector is None or observation.world is None:
             return False
-        if observation.time_s < self._reverse_until_s:
+        if observation.time_s < self._reverse_end_s:
             return True
-        center_w = self._body.nodes_w(observation.world, observation.joints.angle_rad).mean(axis=1)
-        if self._standstill.update(observation.time_s, passed_s, center_w, JAMMED_M):
-            self._reverse_until_s = observation.time_s + self._reverse_s
-            self._standstill.reset()
+        center_w = self._body.compute_body_points_w(observation.world, observation.joints.angle_rad).mean(axis=1)
+        if self._standstill_detector.update(observation.time_s, elapsed_s, center_w, MAX_JAM_DISTANCE_M):
+            self._reverse_end_s = observation.time_s + self._reverse_duration_s
+            self._standstill_detector.reset()
         return False
 
-    def _amplitude_rad(self, observation: Observation, waves: NDArray[np.float64], passed_s: float) -> float:
+    def _compute_amplitude_rad(self, observation: Observation, waves: NDArray[np.float64], elapsed_s: float) -> float:
         """Return the amplitude A: a first-order lag of A0 + softness sum_i w_i tau_i, bounded to 0 to 2 A0."""
         parameters = self.parameters
         assert isinstance(parameters, CompliantUndulationParameters)
         # Drives measure their own torque; the torque from outside is opposite to it.
-        generalized_force_nm = -float(waves @ np.array(observation.joints.torque_nm)[self._body.bends])
+        generalized_force_nm = -float(waves @ np.array(observation.joints.torque_nm)[self._body.yaw_joints])
         desired_rad = parameters.amplitude_rad + parameters.softness_rad_per_nm * generalized_force_nm
         bounded_rad = min(max(desired_rad, 0.0), 2.0 * parameters.amplitude_rad)
-        gain = 1.0 - math.exp(-abs(passed_s) / parameters.yield_s)
-        self._yielded_amplitude_rad += gain * (bounded_rad - self._yielded_amplitude_rad)
+        alpha = 1.0 - math.exp(-abs(elapsed_s) / parameters.yield_s)
+        self._yielded_amplitude_rad += alpha * (bounded_rad - self._yielded_amplitude_rad)
         return self._yielded_amplitude_rad

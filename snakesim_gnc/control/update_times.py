@@ -19,29 +19,29 @@ class UpdateTimes:
         self._lease_s = robot.lease_ns * 1e-9
         self._update_count = 0
         self._late_count = 0  # updates that took longer than a period
-        self._longest_s = 0.0
+        self._max_duration_s = 0.0
 
-    def add(self, duration_s: float) -> None:
-        """Count an update that took this long."""
+    def add_duration(self, duration_s: float) -> None:
+        """Add the duration of an update."""
         self._update_count += 1
         if duration_s > self._period_s:
             self._late_count += 1
-        self._longest_s = max(self._longest_s, duration_s)
+        self._max_duration_s = max(self._max_duration_s, duration_s)
 
     @property
-    def too_slow(self) -> str:
+    def too_slow_reason(self) -> str:
         """Why the controller is too slow for real time, with the measured times; empty if it is fast enough.
 
         An update that takes longer than one lease stops the robot. So does a queue of late updates.
         """
         max_late = max(MAX_LATE_UPDATES, MAX_LATE_FRACTION * self._update_count)
-        outlasts_lease = self._longest_s > self._lease_s
+        outlasts_lease = self._max_duration_s > self._lease_s
         if not outlasts_lease and self._late_count <= max_late:
             return ""
-        longest = f"update() took {_format_ms(self._longest_s)} of {_format_ms(self._period_s)}"
+        longest_text = f"update() took {_format_ms(self._max_duration_s)} of {_format_ms(self._period_s)}"
         if self._update_count == 1:
-            return longest
-        return f"{longest}; {self._late_count} of {self._update_count} updates took longer than a period"
+            return longest_text
+        return f"{longest_text}; {self._late_count} of {self._update_count} updates took longer than a period"
 
 
 def _format_ms(time_s: float) -> str:

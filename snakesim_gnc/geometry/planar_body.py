@@ -8,18 +8,18 @@ from statistics import median
 
 import numpy as np
 
-from snakesim_gnc.geometry.body_on_path import BodyPose, chain_nodes, compute_heading_rad
+from snakesim_gnc.geometry.body_on_path import BodyPose, compute_chain_points, compute_heading_rad
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import find_nodes_w
-from snakesim_hal.model.route import yaw_segments_m
+from snakesim_hal.model.kinematics import compute_body_points_w
+from snakesim_hal.model.route import compute_yaw_segments_m
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, World
 
-MAX_TICKS = 128  # of joint angles: more than the latency of any pose
+MAX_HISTORY_TICKS = 128  # of joint angles: more than the latency of any pose
 
 
 class PlanarBody:
-    """Lengths, limits and indices of a robot. Nodes are the tail end, the joints that bend, and the head end."""
+    """Lengths, limits and indices of a robot. Its body points are the tail end, the yaw joints, and the head end."""
 
     def __init__(self, robot: Description) -> None:
         """Derive from a description the lengths, limits and indices that planar computations use.
@@ -27,71 +27,75 @@ class PlanarBody:
         Joints with another axis than yaw are rigid in the plane: the links on both sides of them are one segment.
 
         Args:
-            robot: description of the robot, whose joints and links are listed from tail to head.
+            robot: Description of the robot, whose joints and links are listed from tail to head.
         """
         axes = [joint.axis for joint in robot.joints]
         lengths = [link.length_m for link in robot.links]
         self._robot = robot
 
         # All joints and links.
-        self.names = [joint.name for joint in robot.joints]
+        self.joint_names = [joint.name for joint in robot.joints]
         self.torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
         self.radius_m = max(link.radius_m for link in robot.links)
         self.weight_n = GRAVITY_M_S2 * math.fsum(link.mass_kg for link in robot.links)
         self.joint_s_m = np.cumsum(lengths)[:-1]  # (n_joints,) along the body
-        self._joint_s_list: list[float] = self.joint_s_m.tolist()
+        self._joint_s_m_list: list[float] = self.joint_s_m.tolist()
 
         # The joints that bend the body in the plane, and the segments between them.
-        self.bends = [i for i, axis in enumerate(axes) if axis == "yaw"]
-        self._all_bend = len(self.bends) == len(axes)
-        self.segments_m = yaw_segments_m(axes, lengths)
+        self.yaw_joints = [i for i, axis in enumerate(axes) if axis == "yaw"]
+        self._are_all_yaw_joints = len(self.yaw_joints) == len(axes)
+        self.segments_m = compute_yaw_segments_m(axes, lengths)
         self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)  # of neighboring joints that bend
-        self.node_s_m: list[float] = [0.0, *np.cumsum(self.segments_m).tolist()]
-        self.length_m = self.node_s_m[-1]
-        self._node_rows = [0, *(i + 1 for i in self.bends), len(lengths)]  # of the nodes, among all joints and ends
+        self.body_points_s_m: list[float] = [0.0, *np.cumsum(self.segments_m).tolist()]
+        self.length_m = self.body_points_s_m[-1]
+        # Indices of the body points among the tail end (0), all joints (joint i is i + 1) and the head end.
+        self._body_point_rows = [0, *(i + 1 for i in self.yaw_joints), len(lengths)]
 
-    def all_angles(self, body_pose: BodyPose) -> Floats:
-        """Return the angles of all joints, (n_joints,): those that bend as on the path, the others straight."""
-        if self._all_bend:
+    def expand_joint_angles(self, body_pose: BodyPose) -> Floats:
+        """Return the angles of all joints, (n_joints,): those of the pose for yaw joints, and 0 for all others."""
+        if self._are_all_yaw_joints:
             return body_pose.angles_rad
-        angles_rad = np.zeros(len(self.names))
-        angles_rad[self.bends] = body_pose.angles_rad
+        angles_rad = np.zeros(len(self.joint_names))
+        angles_rad[self.yaw_joints] = body_pose.angles_rad
         return angles_rad
 
-    def nodes_w(self, world: World, angles_rad: Sequence[float]) -> Floats:
-        """Return the nodes (2, n_nodes) of the measured body.
+    def compute_body_points_w(self, world: World, angles_rad: Sequence[float]) -> Floats:
+        """Compute the points of the measured body on the ground.
 
         Args:
-            world: the pose of the base.
-            angles_rad: of all joints, at the time of that pose.
-        """
-        if not self._all_bend:
-            # A link that is pitched up is shorter, as seen from above.
-            chain_w = find_nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
-            return chain_w[self._node_rows, :2].T
-        bend_angles_rad = [angles_rad[i] for i in self.bends]
-        heading_rad = compute_heading_rad(world.base_orientation_wxyz)
-        return chain_nodes(world.base_position_w[:2], heading_rad, bend_angles_rad, self.segments_m)
+            world: World model with the pose of the base.
+            angles_rad: Measured angles of all joints at the time of that pose, tail to head.
 
-    def joints_w(self, body_pose: BodyPose) -> Floats:
-        """Return the places of all joints on the path, (n_joints, 2)."""
-        if self._all_bend:
-            return body_pose.nodes_w[:, 1:-1].T
-        node_x, node_y = body_pose.nodes_w
-        x = np.interp(self.joint_s_m, self.node_s_m, node_x)
-        y = np.interp(self.joint_s_m, self.node_s_m, node_y)
+        Returns:
+            (2, n_points) x and y of the tail end, the yaw joints and the head end, in m.
+        """
+        if not self._are_all_yaw_joints:
+            # A link that is pitched up is shorter, as seen from above.
+            chain_w = compute_body_points_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
+            return chain_w[self._body_point_rows, :2].T
+        bend_angles_rad = [angles_rad[i] for i in self.yaw_joints]
+        heading_rad = compute_heading_rad(world.base_orientation_wxyz)
+        return compute_chain_points(world.base_position_w[:2], heading_rad, bend_angles_rad, self.segments_m)
+
+    def compute_joint_positions_w(self, body_pose: BodyPose) -> Floats:
+        """Compute the positions of all joints of a body on its path, (n_joints, 2) in m."""
+        if self._are_all_yaw_joints:
+            return body_pose.body_points_w[:, 1:-1].T
+        node_x, node_y = body_pose.body_points_w
+        x = np.interp(self.joint_s_m, self.body_points_s_m, node_x)
+        y = np.interp(self.joint_s_m, self.body_points_s_m, node_y)
         return np.column_stack([x, y])
 
-    def link_at(self, body_s_m: float) -> int:
+    def find_link_at(self, body_s_m: float) -> int:
         """Return the index of the link at an arc length along the body."""
-        return bisect_right(self._joint_s_list, body_s_m)
+        return bisect_right(self._joint_s_m_list, body_s_m)
 
 
-class RecentAngles:
+class JointAngleHistory:
     """Stores the joint angles of the last ticks, for a pose that is some ticks old."""
 
     def __init__(self) -> None:
-        self._entries: deque[tuple[int, list[float]]] = deque(maxlen=MAX_TICKS)
+        self._entries: deque[tuple[int, list[float]]] = deque(maxlen=MAX_HISTORY_TICKS)
 
     def __bool__(self) -> bool:
         return bool(self._entries)
@@ -101,8 +105,11 @@ class RecentAngles:
         if not self._entries or timestamp_ns > self._entries[-1][0]:
             self._entries.append((timestamp_ns, angles_rad))
 
-    def nearest_to(self, timestamp_ns: int) -> list[float]:
-        """Return the angles that were measured nearest to a time; of two that are equally near, the older ones."""
+    def find_nearest(self, timestamp_ns: int) -> list[float]:
+        """Return the joint angles that were measured at the time nearest to a timestamp.
+
+        Of two measurements that are equally near, the older one is returned. The history must not be empty.
+        """
         nearest_ns, nearest_rad = self._entries[-1]
         # From the newest on they come nearer, and then go away again. Poses are rarely older than a few ticks.
         for measured_ns, angles_rad in reversed(self._entries):
@@ -113,7 +120,7 @@ class RecentAngles:
         return nearest_rad
 
 
-def pose_time_ns(world: World) -> int:
+def get_pose_time_ns(world: World) -> int:
     """Return when the body was at the world's base pose.
 
     A measured pose has the timestamp of the sensor. A dead-reckoned pose has that of the world model itself.

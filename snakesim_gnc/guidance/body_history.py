@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Description
 
 HISTORY_NS = 1_000_000_000
 MAX_AHEAD_NS = 50_000_000  # a sample may be this much newer than the newest joint state, which is used then
-AXIS_STEP_M = 0.02
+AXIS_POINT_SPACING_M = 0.02
 
 
 @dataclass(frozen=True)
-class Base:
+class BasePose:
     """Pose of the base: x, y and heading on the ground, its height and its tilt."""
 
     planar_w: Floats  # (3,) x, y, heading
@@ -27,7 +27,7 @@ class Base:
     @property
     def rotation(self) -> Floats:
         """Rotation matrix (3, 3) world_from_base."""
-        return rotation_about_z(self.planar_w[2]) @ self.tilt
+        return make_rotation_about_z(self.planar_w[2]) @ self.tilt
 
     @property
     def position_w(self) -> Floats:
@@ -41,17 +41,17 @@ class BodyFrames:
 
     origins_w: Floats  # (n, 3)
     rotations: Floats  # (n, 3, 3) world_from_link
-    head_w: Floats  # (3,) front end of the head
+    head_end_w: Floats  # (3,) front end of the head
 
-    def axis_w(self) -> Floats:
-        """Return points (m, 2) along the body as seen from above, a few for each link."""
-        nodes_w = np.vstack([self.origins_w, self.head_w])[:, :2]
-        steps = np.diff(nodes_w, axis=0)
+    def compute_axis_w(self) -> Floats:
+        """Compute points along the body as seen from above, (m, 2), at most AXIS_POINT_SPACING_M apart."""
+        body_points_w = np.vstack([self.origins_w, self.head_end_w])[:, :2]
+        steps = np.diff(body_points_w, axis=0)
         s_m = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
-        count = max(math.ceil(s_m[-1] / AXIS_STEP_M), 2)
-        at_s_m = np.linspace(0.0, s_m[-1], count)
-        x = np.interp(at_s_m, s_m, nodes_w[:, 0])
-        y = np.interp(at_s_m, s_m, nodes_w[:, 1])
+        count = max(math.ceil(s_m[-1] / AXIS_POINT_SPACING_M), 2)
+        sample_s_m = np.linspace(0.0, s_m[-1], count)
+        x = np.interp(sample_s_m, s_m, body_points_w[:, 0])
+        y = np.interp(sample_s_m, s_m, body_points_w[:, 1])
         return np.stack([x, y], axis=1)
 
 
@@ -60,11 +60,11 @@ class BodyHistory:
 
     def __init__(self, robot: Description) -> None:
         self._axes = [joint.axis for joint in robot.joints]
-        self._lengths = [link.length_m for link in robot.links]
+        self._link_lengths_m = [link.length_m for link in robot.links]
         self._timestamps_ns: list[int] = []
-        self._entries: list[tuple[Base, Floats]] = []
+        self._entries: list[tuple[BasePose, Floats]] = []
 
-    def add(self, timestamp_ns: int, base: Base, angles_rad: Sequence[float]) -> None:
+    def add(self, timestamp_ns: int, base: BasePose, angles_rad: Sequence[float]) -> None:
         """Store a base pose and joint angles. A timestamp that is not newer than the last one is ignored."""
         if self._timestamps_ns and timestamp_ns <= self._timestamps_ns[-1]:
             return
@@ -74,37 +74,44 @@ class BodyHistory:
         del self._timestamps_ns[:expired]
         del self._entries[:expired]
 
-    def base_at(self, timestamp_ns: int) -> Base | None:
+    def interpolate_base(self, timestamp_ns: int) -> BasePose | None:
         """Return the base pose at a time; None if the time is not in the history."""
-        entry = self._interpolate(timestamp_ns)
+        entry = self._interpolate_base_and_angles(timestamp_ns)
         return None if entry is None else entry[0]
 
-    def body_at(self, timestamp_ns: int) -> BodyFrames | None:
+    def interpolate_body(self, timestamp_ns: int) -> BodyFrames | None:
         """Return all links at a time; None if the time is not in the history."""
-        entry = self._interpolate(timestamp_ns)
+        entry = self._interpolate_base_and_angles(timestamp_ns)
         if entry is None:
             return None
         base, angles_rad = entry
         return self.compute_frames(base, angles_rad)
 
-    def compute_frames(self, base: Base, angles_rad: Floats) -> BodyFrames:
-        """Return all links for a base pose and joint angles (joints,)."""
-        origins_w, rotations = link_frames(base.position_w, base.rotation, angles_rad, self._axes, self._lengths)
-        head_w = origins_w[-1] + self._lengths[-1] * rotations[-1][:, 0]
+    def compute_frames(self, base: BasePose, angles_rad: Floats) -> BodyFrames:
+        """Compute the frames of all links for a base pose and joint angles (n_joints,) (forward kinematics)."""
+        origins_w, rotations = compute_link_frames(
+            base.position_w, base.rotation, angles_rad, self._axes, self._link_lengths_m
+        )
+        head_w = origins_w[-1] + self._link_lengths_m[-1] * rotations[-1][:, 0]
         return BodyFrames(origins_w, rotations, head_w)
 
-    def shift(self, center_w: Floats, shift: Floats) -> None:
-        """Correct every base pose: turn it around a center (2,), then move it. shift: (3,) x, y, turn."""
-        cosine = math.cos(shift[2])
-        sine = math.sin(shift[2])
+    def shift_all_poses(self, center_w: Floats, pose_shift: Floats) -> None:
+        """Correct every stored base pose by the same rotation and translation.
+
+        Args:
+            center_w: (2,) point about which the poses are rotated, m.
+            pose_shift: (3,) translation in x and y in m, and rotation in rad.
+        """
+        cosine = math.cos(pose_shift[2])
+        sine = math.sin(pose_shift[2])
         for i, (base, angles_rad) in enumerate(self._entries):
             dx, dy = base.planar_w[:2] - center_w
-            x = center_w[0] + cosine * dx - sine * dy + shift[0]
-            y = center_w[1] + sine * dx + cosine * dy + shift[1]
-            planar_w = np.array([x, y, base.planar_w[2] + shift[2]])
-            self._entries[i] = (Base(planar_w, base.z_m, base.tilt), angles_rad)
+            x = center_w[0] + cosine * dx - sine * dy + pose_shift[0]
+            y = center_w[1] + sine * dx + cosine * dy + pose_shift[1]
+            planar_w = np.array([x, y, base.planar_w[2] + pose_shift[2]])
+            self._entries[i] = (BasePose(planar_w, base.z_m, base.tilt), angles_rad)
 
-    def _interpolate(self, timestamp_ns: int) -> tuple[Base, Floats] | None:
+    def _interpolate_base_and_angles(self, timestamp_ns: int) -> tuple[BasePose, Floats] | None:
         """Interpolate the base pose and the joint angles at a time between two entries of the history.
 
         Returns:
@@ -121,21 +128,22 @@ class BodyHistory:
             return self._entries[-1]
         if after == 0 or timestamps_ns[after] == timestamp_ns:
             return self._entries[after]
-        previous, previous_rad = self._entries[after - 1]
-        following, following_rad = self._entries[after]
+        previous_base, previous_angles_rad = self._entries[after - 1]
+        next_base, next_angles_rad = self._entries[after]
         previous_ns = timestamps_ns[after - 1]
         ratio = (timestamp_ns - previous_ns) / (timestamps_ns[after] - previous_ns)
-        step = following.planar_w - previous.planar_w
+        # A tilt is not interpolated: the one nearer in time is used.
+        step = next_base.planar_w - previous_base.planar_w
         step[2] = wrap_angle(step[2])
-        base = Base(
-            planar_w=previous.planar_w + ratio * step,
-            z_m=previous.z_m + ratio * (following.z_m - previous.z_m),
-            tilt=following.tilt if ratio > 0.5 else previous.tilt,
+        base = BasePose(
+            planar_w=previous_base.planar_w + ratio * step,
+            z_m=previous_base.z_m + ratio * (next_base.z_m - previous_base.z_m),
+            tilt=next_base.tilt if ratio > 0.5 else previous_base.tilt,
         )
-        return base, previous_rad + ratio * (following_rad - previous_rad)
+        return base, previous_angles_rad + ratio * (next_angles_rad - previous_angles_rad)
 
 
-def rotation_about_z(yaw_rad: float) -> Floats:
+def make_rotation_about_z(yaw_rad: float) -> Floats:
     """Return the rotation matrix (3, 3) about the z axis."""
     cosine = math.cos(yaw_rad)
     sine = math.sin(yaw_rad)

@@ -30,45 +30,46 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.planar_dynamics import (
     ChainDynamics,
-    compute_friction,
-    compute_inertia,
+    compute_inertia_terms,
+    compute_unit_friction,
     estimate_accelerations,
-    estimate_spins,
+    estimate_angular_velocities,
 )
-from snakesim_gnc.guidance.sparse_fit import MIN_SIGNIFICANCE, fit_fewest_columns
+from snakesim_gnc.guidance.sparse_fit import MIN_SIGNIFICANCE_SD, fit_fewest_columns
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Description, Imu, Pose
 from snakesim_hal.wire.quantities import Vector
 
 # Standard deviations of the measurements; of the shipped robots.
 TORQUE_SD_NM = 0.012
-TOTAL_VARIANCE = 1e-6  # of the equations of the whole body, in N²m² and N²: they are exact but for the accelerations
+# Variance of the equations of the whole body, in N²m² and N²: they are exact except for the accelerations.
+WHOLE_BODY_VARIANCE = 1e-6
 
 MAX_MERGE_RATIO = 1.01  # of the longest link: pushes of one side no further apart are one contact
 
-LEFT = 1
-RIGHT = -1
+LEFT_SIDE = 1
+RIGHT_SIDE = -1
 HEAD_TIP = 0
 
 
 class EstimatedPush(NamedTuple):
-    """A push on a link."""
+    """An estimated force of an obstacle on a link."""
 
     link: int  # from 0 at the tail
-    along_m: float  # from the link's rear joint
+    distance_from_rear_joint_m: float  # from the link's rear joint
     normal_l: Vector  # from the obstacle into the body
     force_n: float
     confidence: float  # 0 to 1: 1 - its standard deviation / force
 
 
 @dataclass(frozen=True)
-class _UnitPush:
-    """A push of 1 N that may be there."""
+class _CandidatePush:
+    """A push of 1 N at a place where an obstacle may push."""
 
     link: int
-    side: int  # LEFT, RIGHT or HEAD_TIP
-    along_m: float  # from the link's rear joint
-    effect: Floats  # (n + 3,) left sides of all equations
+    side: int  # LEFT_SIDE, RIGHT_SIDE or HEAD_TIP
+    distance_from_rear_joint_m: float  # from the link's rear joint
+    generalized_force: Floats  # (n + 3,) left sides of all equations
 
 
 def estimate_pushes(
@@ -85,74 +86,76 @@ def estimate_pushes(
     the fewest possible pushes from a fixed list of places are fitted to it.
 
     Args:
-        robot: the description of the robot.
+        robot: The description of the robot.
         angles_rad: (n_joints,) angles, tail to head, at the time of `imu`.
         velocities_rad_s: (n_joints,) velocities at the same time.
         torques_nm: (n_joints,) torques at the same time.
-        imu: angular velocities and specific forces of some links, or of none.
-        pose: velocity of the base; None if the links are assumed to slide forward along themselves.
+        imu: Angular velocities and specific forces of some links, or of none.
+        pose: Velocity of the base; None if the links are assumed to slide forward along themselves.
 
     Returns:
         Pushes that are significant against the noise, tail to head.
     """
     chain = ChainDynamics.from_robot(robot, angles_rad)
-    spins_rad_s = estimate_spins(chain, velocities_rad_s, imu)
-    motion, motion_sd = estimate_accelerations(chain, spins_rad_s, imu)
-    inertia = compute_inertia(chain, spins_rad_s)
+    angular_velocities_rad_s = estimate_angular_velocities(chain, velocities_rad_s, imu)
+    accelerations, accelerations_sd = estimate_accelerations(chain, angular_velocities_rad_s, imu)
+    inertia = compute_inertia_terms(chain, angular_velocities_rad_s)
     joint_count = len(torques_nm)
     is_yaw: NDArray[np.bool_] = np.any(chain.axes_b != 0.0, axis=1)
 
-    right_side = inertia @ np.append(motion, 1.0)
+    right_side = inertia @ np.append(accelerations, 1.0)
     right_side[:joint_count] -= np.where(is_yaw, torques_nm, 0.0)
     right_side[:joint_count] *= is_yaw
 
     # Covariance of the right side: of torques, of accelerations, and of how the links share the friction.
-    friction, friction_sd = compute_friction(chain, spins_rad_s, pose)
-    inertia_sd = inertia[:, :-1] @ motion_sd
+    friction, friction_sd = compute_unit_friction(chain, angular_velocities_rad_s, pose)
+    inertia_sd = inertia[:, :-1] @ accelerations_sd
     torque_variances = np.full(joint_count, TORQUE_SD_NM**2)
-    total_variances = np.full(3, TOTAL_VARIANCE)  # of the total force (x, y) and moment
-    covariance = np.diag(np.append(torque_variances, total_variances))
+    whole_body_variances = np.full(3, WHOLE_BODY_VARIANCE)  # of the total force (x, y) and moment
+    covariance = np.diag(np.append(torque_variances, whole_body_variances))
     covariance += inertia_sd @ inertia_sd.T + friction_sd @ friction_sd.T
 
     # Whitening scales the equations to uncorrelated noise of standard deviation 1.
-    pushes = _list_unit_pushes(chain)
-    columns = np.column_stack([friction, *(push.effect for push in pushes)])
+    candidate_pushes = _list_candidate_pushes(chain)
+    columns = np.column_stack([friction, *(push.generalized_force for push in candidate_pushes)])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    amounts, amount_covariance = fit_fewest_columns(whitening @ columns, whitening @ right_side)
-    return _merge_pushes(chain, pushes, amounts[1:], amount_covariance[1:, 1:])
+    forces_n, force_covariance = fit_fewest_columns(whitening @ columns, whitening @ right_side)
+    return _merge_pushes(chain, candidate_pushes, forces_n[1:], force_covariance[1:, 1:])
 
 
-def _list_unit_pushes(chain: ChainDynamics) -> list[_UnitPush]:
-    """Return a push of 1 N at every candidate place, with its effect on the equations of motion.
+def _list_candidate_pushes(chain: ChainDynamics) -> list[_CandidatePush]:
+    """Return a push of 1 N at every candidate position, with its generalized force in the equations of motion.
 
     The places are on both sides of both ends of each link, and on the tip of the head.
 
     Args:
-        chain: lengths, radii and frames of the links.
+        chain: Lengths, radii and frames of the links.
     """
     last_link = len(chain.rear_b) - 1
-    places: list[tuple[int, int, float]] = []  # link, side, and end: 0.0 rear, 1.0 front
+    candidates: list[tuple[int, int, float]] = []  # link, side, and end: 0.0 rear, 1.0 front
     for link in range(last_link + 1):
-        for side in (LEFT, RIGHT):
-            places += [(link, side, 0.0), (link, side, 1.0)]
-    places.append((last_link, HEAD_TIP, 1.0))
+        for side in (LEFT_SIDE, RIGHT_SIDE):
+            candidates += [(link, side, 0.0), (link, side, 1.0)]
+    candidates.append((last_link, HEAD_TIP, 1.0))
 
-    links = np.array([link for link, _, _ in places])
-    ends = np.array([end for _, _, end in places])
-    outward_l = np.array([_outward_normal_l(side) for _, side, _ in places])
-    along_m = ends * chain.lengths_m[links]
-    skin_l = along_m[:, None] * [1.0, 0.0, 0.0] + chain.radii_m[links, None] * outward_l
+    links = np.array([link for link, _, _ in candidates])
+    end_fractions = np.array([end for _, _, end in candidates])
+    outward_l = np.array([_get_outward_normal_l(side) for _, side, _ in candidates])
+    distances_from_rear_m = end_fractions * chain.lengths_m[links]
+    skin_l = distances_from_rear_m[:, None] * [1.0, 0.0, 0.0] + chain.radii_m[links, None] * outward_l
     base_from_link = chain.frames[links]
     points_b = chain.rear_b[links] + np.einsum("kij,kj->ki", base_from_link, skin_l)
     forces_b = -np.einsum("kij,kj->ki", base_from_link, outward_l)
-    effects = chain.compute_effects(links, points_b, forces_b)
+    generalized_forces = chain.compute_generalized_forces(links, points_b, forces_b)
     return [
-        _UnitPush(link, side, place_m, effect)
-        for (link, side, _), place_m, effect in zip(places, along_m.tolist(), effects.T, strict=True)
+        _CandidatePush(link, side, distance_m, generalized_force)
+        for (link, side, _), distance_m, generalized_force in zip(
+            candidates, distances_from_rear_m.tolist(), generalized_forces.T, strict=True
+        )
     ]
 
 
-def _outward_normal_l(side: int) -> list[float]:
+def _get_outward_normal_l(side: int) -> list[float]:
     """Return the outward normal of the skin on one side of a link, in the frame of the link."""
     if side == HEAD_TIP:
         return [1.0, 0.0, 0.0]
@@ -160,48 +163,60 @@ def _outward_normal_l(side: int) -> list[float]:
 
 
 def _merge_pushes(
-    chain: ChainDynamics, pushes: Sequence[_UnitPush], amounts_n: Floats, covariance: Floats
+    chain: ChainDynamics, candidate_pushes: Sequence[_CandidatePush], forces_n: Floats, covariance: Floats
 ) -> list[EstimatedPush]:
     """Merge neighboring unit pushes on one side into one push, and leave out the insignificant results.
 
     Args:
-        chain: the links.
-        pushes: the p unit pushes.
-        amounts_n: (p,) force of each unit push; 0 where there is none.
+        chain: Lengths of the links.
+        candidate_pushes: The p candidate pushes of 1 N.
+        forces_n: (p,) force of each unit push; 0 where there is none.
         covariance: (p, p) covariance of the forces in N².
 
     Returns:
-        The pushes whose force is at least MIN_SIGNIFICANCE times its standard deviation, sorted.
+        The pushes whose force is at least MIN_SIGNIFICANCE_SD times its standard deviation, sorted.
     """
-    starts_m = np.append(0.0, np.cumsum(chain.lengths_m))  # arc length at which each link begins
+    link_starts_m = np.append(0.0, np.cumsum(chain.lengths_m))  # arc length at which each link begins
     max_gap_m = MAX_MERGE_RATIO * chain.lengths_m.max()
     merged: list[EstimatedPush] = []
-    for side in (LEFT, RIGHT, HEAD_TIP):
-        indices = [i for i, push in enumerate(pushes) if push.side == side and amounts_n[i] > 0.0]
+    for side in (LEFT_SIDE, RIGHT_SIDE, HEAD_TIP):
+        indices = [i for i, push in enumerate(candidate_pushes) if push.side == side and forces_n[i] > 0.0]
         if not indices:
             continue
-        places_m = np.array([starts_m[pushes[i].link] + pushes[i].along_m for i in indices])
-        order = np.argsort(places_m, kind="stable")
-        cuts = np.flatnonzero(np.diff(places_m[order]) > max_gap_m) + 1
-        for group in np.split(order, cuts):
-            members = [indices[i] for i in group]
-            force_n = float(amounts_n[members].sum())
-            sd_n = float(np.sqrt(covariance[np.ix_(members, members)].sum()))
-            if force_n < MIN_SIGNIFICANCE * sd_n:
+        candidates_s_m = np.array(
+            [link_starts_m[candidate_pushes[i].link] + candidate_pushes[i].distance_from_rear_joint_m for i in indices]
+        )
+        order = np.argsort(candidates_s_m, kind="stable")
+        group_starts = np.flatnonzero(np.diff(candidates_s_m[order]) > max_gap_m) + 1
+        for group in np.split(order, group_starts):
+            member_indices = [indices[i] for i in group]
+            force_n = float(forces_n[member_indices].sum())
+            sd_n = float(np.sqrt(covariance[np.ix_(member_indices, member_indices)].sum()))
+            if force_n < MIN_SIGNIFICANCE_SD * sd_n:
                 continue
-            place_m = float(amounts_n[members] @ places_m[group]) / force_n
-            merged.append(_make_push(starts_m, side, place_m, force_n, sd_n))
+            body_s_m = float(forces_n[member_indices] @ candidates_s_m[group]) / force_n
+            merged.append(_make_estimated_push(link_starts_m, side, body_s_m, force_n, sd_n))
     return sorted(merged)
 
 
-def _make_push(starts_m: Floats, side: int, place_m: float, force_n: float, sd_n: float) -> EstimatedPush:
-    """Return a push at an arc length along the body. starts_m: of the links, and the length of the body."""
-    last_link = len(starts_m) - 2
-    link = min(int(np.searchsorted(starts_m, place_m, side="right")) - 1, last_link)
+def _make_estimated_push(
+    link_starts_m: Floats, side: int, body_s_m: float, force_n: float, sd_n: float
+) -> EstimatedPush:
+    """Make a push at an arc length along the body.
+
+    Args:
+        link_starts_m: (n_links + 1,) arc lengths at which the links begin, and the length of the body.
+        side: LEFT_SIDE, RIGHT_SIDE or HEAD_TIP.
+        body_s_m: Arc length of the push from the tail end.
+        force_n: Force of the push.
+        sd_n: Standard deviation of the force.
+    """
+    last_link = len(link_starts_m) - 2
+    link = min(int(np.searchsorted(link_starts_m, body_s_m, side="right")) - 1, last_link)
     normal_l = (-1.0, 0.0, 0.0) if side == HEAD_TIP else (0.0, -float(side), 0.0)
     return EstimatedPush(
         link=link,
-        along_m=place_m - float(starts_m[link]),
+        distance_from_rear_joint_m=body_s_m - float(link_starts_m[link]),
         normal_l=normal_l,
         force_n=force_n,
         confidence=1.0 - sd_n / force_n,

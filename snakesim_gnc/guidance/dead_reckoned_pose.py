@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from snakesim_gnc.guidance.anchoring import ESTIMATED, MEASURED, Anchors
-from snakesim_gnc.guidance.body_history import Base
+from snakesim_gnc.guidance.anchoring import ESTIMATED_CONTACT_TRUST, MEASURED_CONTACT_TRUST, ObstacleAnchors
+from snakesim_gnc.guidance.body_history import BasePose
 from snakesim_gnc.guidance.localization import Localizer, PoseNoise
 from snakesim_gnc.guidance.perceived_world import compute_confidence, quaternion_from_rotation
 from snakesim_hal.wire.messages import Contacts, Description, JointState, Obstacle, Pose, World
@@ -21,30 +21,36 @@ MAX_YAW_SD_RAD = 10.0
 class DeadReckonedPose:
     """Computes poses from joint states and contacts."""
 
-    def __init__(self, robot: Description, start: Base, known: Sequence[Obstacle]) -> None:
-        """Begin at the start pose. known: the surveyed obstacles."""
+    def __init__(self, robot: Description, start: BasePose, known_obstacles: Sequence[Obstacle]) -> None:
+        """Create a dead-reckoned pose that starts at a known pose.
+
+        Args:
+            robot: Description of the robot.
+            start: Base pose at the start.
+            known_obstacles: The surveyed obstacles, against which contacts correct the pose.
+        """
         self._localizer = Localizer(robot, start, PoseNoise())
-        self._anchors = Anchors(robot, known)
+        self._anchors = ObstacleAnchors(robot, known_obstacles)
         self._timestamp_ns = -1
 
-    def move(self, joints: JointState, contacts: Contacts | None, *, estimated: bool) -> Pose:
+    def update(self, joints: JointState, contacts: Contacts | None, *, are_contacts_estimated: bool) -> Pose:
         """Update the dead-reckoned base pose by a joint state, and return it.
 
         The odometry moves the pose, and contacts with known obstacles correct it. A joint state that is not newer than
         the last one, or not valid for every joint, changes nothing.
 
         Args:
-            joints: the newest joint state.
-            contacts: contacts of the links; None if they are unknown.
-            estimated: whether the contacts are estimated rather than measured.
+            joints: The newest joint state.
+            contacts: Contacts of the links; None if they are unknown.
+            are_contacts_estimated: Whether the contacts are estimated rather than measured.
         """
         localizer = self._localizer
         is_new = joints.timestamp_ns > self._timestamp_ns
         if is_new and all(joints.valid):
             self._timestamp_ns = joints.timestamp_ns
-            localizer.move(joints, contacts, None)
+            localizer.predict(joints, contacts, None)
             contact_list = [] if contacts is None else contacts.contacts
-            trust = ESTIMATED if estimated else MEASURED
+            trust = ESTIMATED_CONTACT_TRUST if are_contacts_estimated else MEASURED_CONTACT_TRUST
             self._anchors.correct_pose(localizer, np.array(joints.angle_rad), contact_list, trust)
         return Pose(
             tick=joints.tick,
@@ -56,7 +62,7 @@ class DeadReckonedPose:
         )
 
     def mark_dead_reckoned(self, world: World) -> World:
-        """Return a world made with this pose, marked as dead-reckoned, with the uncertainty of the pose."""
+        """Return a copy of a world model that is marked as dead-reckoned, with the uncertainty of the pose."""
         position_sd_m = min(self._localizer.position_sd_m, MAX_POSITION_SD_M)
         return msgspec.structs.replace(
             world,

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
-from snakesim_hal.model.kinematics import tangents
+from snakesim_hal.model.kinematics import compute_contact_tangents
 from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState, Pose, World
 
 NO_IMU = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
@@ -28,13 +28,13 @@ class ContactEstimator:
     def __init__(self, robot: Description) -> None:
         self._robot = robot
 
-    def contacts(self, joints: JointState, imu: Imu | None, pose: Pose | None) -> EstimatedContacts | None:
+    def estimate_contacts(self, joints: JointState, imu: Imu | None, pose: Pose | None) -> EstimatedContacts | None:
         """Estimate the contacts of the body from its joint torques, or return None while a joint's values are outdated.
 
         Args:
-            joints: joint state with torques.
-            imu: used only if it has the same timestamp as the joints.
-            pose: pose sample, used for the velocity of the base; None if it is unknown.
+            joints: Joint state with torques.
+            imu: Newest IMU readings; used only if they have the same timestamp as the joints. None if there are none.
+            pose: Pose sample, used for the velocity of the base; None if it is unknown.
 
         Returns:
             The contacts as a sensor would publish them, with a confidence for each.
@@ -57,10 +57,12 @@ class ContactEstimator:
         return EstimatedContacts(message, [push.confidence for push in pushes])
 
     def _make_contact(self, push: EstimatedPush) -> Contact:
-        """Return the contact at the skin of the link, on the side of the obstacle."""
+        """Convert a push into the message of a contact at the skin of the link, on the side of the obstacle."""
         normal_l = np.array(push.normal_l)
-        position_l = np.array([push.along_m, 0.0, 0.0]) - self._robot.links[push.link].radius_m * normal_l
-        tangent_1_l, tangent_2_l = tangents(push.normal_l)
+        position_l = (
+            np.array([push.distance_from_rear_joint_m, 0.0, 0.0]) - self._robot.links[push.link].radius_m * normal_l
+        )
+        tangent_1_l, tangent_2_l = compute_contact_tangents(push.normal_l)
         return Contact(
             link=push.link,
             obstacle=None,

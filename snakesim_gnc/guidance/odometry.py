@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState
 
 # Standard deviations of speeds.
@@ -29,24 +29,26 @@ SIDEWAYS_SD_M_PER_RAD = 0.02  # in addition, for each rad/s of the joints
 STEP_SD_M_S = 0.005  # of the base at rest
 STEP_SD_M_PER_RAD = 1.0  # in addition, for each rad/s of the joints
 GYRO_SD_RAD_S = 0.01
-TURN_SD_RAD_S = 1.0  # without a gyroscope
+ROTATION_SD_WITHOUT_GYRO_RAD_S = 1.0  # without a gyroscope
 
-SLIP_S = 2.0  # time for which an error lasts
-MAX_STEP_S = 0.2  # between two joint states; a step over a longer gap is only uncertain
-GAP_SD = (0.3, 0.3, 1.0)  # standard deviations of such a step, in m/s and rad/s
-MIN_HORIZONTAL = 0.5  # part of a normal in the plane of the ground: with less, the body lies on the obstacle
+SLIP_CORRELATION_TIME_S = 2.0  # time for which an error lasts
+MAX_STEP_DURATION_S = 0.2  # between two joint states; a step over a longer gap is only uncertain
+GAP_SD_PER_S = (0.3, 0.3, 1.0)  # standard deviations of such a step, in m/s and rad/s
+MIN_HORIZONTAL_NORMAL_PART = (
+    0.5  # part of a normal in the plane of the ground: with less, the body lies on the obstacle
+)
 
 
 @dataclass(frozen=True)
 class OdometryStep:
-    """A step of the base, in its level frame before the step."""
+    """Displacement of the base between two joint states, in the level frame of the base before the step."""
 
-    motion: Floats  # (3,) forward, left, turn
+    motion: Floats  # (3,) forward in m, left in m, rotation about the vertical axis in rad
     covariance: Floats  # (3, 3), to be added to that of the pose
 
 
 @dataclass(frozen=True)
-class _Shape:
+class _LinkFrames:
     """The links at one time, in the level frame of the base; n is their number."""
 
     timestamp_ns: int
@@ -55,11 +57,11 @@ class _Shape:
 
 
 class _Equations(NamedTuple):
-    """Equations `rows @ step = values`."""
+    """Linear equations `rows @ motion = values` for the motion of the base."""
 
     rows: Floats  # (m, 3)
     values: Floats  # (m,)
-    sds: Floats  # (m,) standard deviations
+    standard_deviations: Floats  # (m,) standard deviations
 
 
 class Odometry:
@@ -67,114 +69,166 @@ class Odometry:
 
     def __init__(self, robot: Description) -> None:
         self._axes = [joint.axis for joint in robot.joints]
-        self._lengths = [link.length_m for link in robot.links]
-        self._half_m = 0.5 * np.array(self._lengths)
-        self._before: _Shape | None = None
+        self._link_lengths_m = [link.length_m for link in robot.links]
+        self._half_lengths_m = 0.5 * np.array(self._link_lengths_m)
+        self._previous_frames: _LinkFrames | None = None
 
-    def step(self, joints: JointState, tilt: Floats, contacts: Contacts | None, imu: Imu | None) -> OdometryStep | None:
-        """Estimate the motion of the base since the last call by weighted least squares.
+    def estimate_step(
+        self, joints: JointState, tilt: Floats, contacts: Contacts | None, imu: Imu | None
+    ) -> OdometryStep | None:
+        """Estimate the motion of the base since the last call by weighted least squares, and store the joint state.
 
         The equations say that the links slide along themselves and along the contacts, that the gyroscopes measure the
-        turn, and that the base hardly moves while the joints rest.
+        rotation, and that the base hardly moves while the joints rest. After a gap of more than MAX_STEP_DURATION_S the
+        motion is zero, with a large covariance.
 
         Args:
-            joints: the joint state after the step.
-            tilt: (3, 3) level_from_base.
-            contacts: contacts of the links; None if there are no recent ones.
-            imu: angular velocities; None if there are no recent ones.
+            joints: The joint state after the step.
+            tilt: (3, 3) rotation matrix level_from_base.
+            contacts: Contacts of the links; None if there are no recent ones.
+            imu: Angular velocities of some links; None if there are no recent ones.
 
         Returns:
-            The step with its covariance; None at the first call, and if no time has passed.
+            The step with its covariance; None at the first call, and if the joint state is not newer than the last one.
         """
-        origins, rotations = link_frames(np.zeros(3), tilt, joints.angle_rad, self._axes, self._lengths)
-        now = _Shape(joints.timestamp_ns, origins, rotations)
-        before = self._before
-        if before is None:
-            self._before = now
+        origins, rotations = compute_link_frames(np.zeros(3), tilt, joints.angle_rad, self._axes, self._link_lengths_m)
+        current = _LinkFrames(joints.timestamp_ns, origins, rotations)
+        previous = self._previous_frames
+        if previous is None:
+            self._previous_frames = current
             return None
-        if now.timestamp_ns <= before.timestamp_ns:
+        if current.timestamp_ns <= previous.timestamp_ns:
             return None
-        self._before = now
-        period_s = (now.timestamp_ns - before.timestamp_ns) * 1e-9
-        if period_s > MAX_STEP_S:
-            return OdometryStep(np.zeros(3), np.diag([sd * period_s for sd in GAP_SD]) ** 2)
+        self._previous_frames = current
+        period_s = (current.timestamp_ns - previous.timestamp_ns) * 1e-9
+        if period_s > MAX_STEP_DURATION_S:
+            return OdometryStep(np.zeros(3), np.diag([sd * period_s for sd in GAP_SD_PER_S]) ** 2)
 
-        joint_rad_s = float(np.sqrt(np.mean(np.square(joints.velocity_rad_s))))
-        equations = self._sliding_equations(before, now, joint_rad_s)
+        rms_joint_velocity_rad_s = float(np.sqrt(np.mean(np.square(joints.velocity_rad_s))))
+        equations = self._make_sliding_equations(previous, current, rms_joint_velocity_rad_s)
         if contacts is not None:
-            at_contacts = _contact_equations(before, now, contacts.contacts)
+            contact_equations = _make_contact_equations(previous, current, contacts.contacts)
             equations = _Equations(
-                rows=np.concatenate([equations.rows, at_contacts.rows]),
-                values=np.concatenate([equations.values, at_contacts.values]),
-                sds=np.concatenate([equations.sds, at_contacts.sds]),
+                rows=np.concatenate([equations.rows, contact_equations.rows]),
+                values=np.concatenate([equations.values, contact_equations.values]),
+                standard_deviations=np.concatenate(
+                    [equations.standard_deviations, contact_equations.standard_deviations]
+                ),
             )
-        turn_rad, turn_sd_rad = _measure_turn(before, now, imu, period_s)
-        still_sd_m = (STEP_SD_M_S + STEP_SD_M_PER_RAD * joint_rad_s) * period_s
+        rotation_rad, rotation_sd_rad = _measure_base_rotation(previous, current, imu, period_s)
+        translation_sd_m = (STEP_SD_M_S + STEP_SD_M_PER_RAD * rms_joint_velocity_rad_s) * period_s
         rows = np.vstack([equations.rows, np.eye(3)])
-        values = np.concatenate([equations.values, [0.0, 0.0, turn_rad]])
-        sds = np.concatenate([equations.sds * period_s, [still_sd_m, still_sd_m, turn_sd_rad]])
+        values = np.concatenate([equations.values, [0.0, 0.0, rotation_rad]])
+        standard_deviations = np.concatenate(
+            [equations.standard_deviations * period_s, [translation_sd_m, translation_sd_m, rotation_sd_rad]]
+        )
 
-        information = rows.T @ (rows / np.square(sds)[:, None])
+        information = rows.T @ (rows / np.square(standard_deviations)[:, None])
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        motion: Floats = covariance @ (rows.T @ (values / np.square(sds)))
-        # Slip lasts for about SLIP_S, so the errors of successive steps are alike and their variances add up faster.
-        step_covariance: Floats = covariance * (SLIP_S / period_s)
+        motion: Floats = covariance @ (rows.T @ (values / np.square(standard_deviations)))
+        # Slip lasts for about SLIP_CORRELATION_TIME_S. So the errors of successive steps are alike, and their variances
+        # add up faster.
+        step_covariance: Floats = covariance * (SLIP_CORRELATION_TIME_S / period_s)
         if imu is not None:
             # The noise of gyroscopes is white, so the error of the turn does not last.
-            turn_row = [0.0, 0.0, turn_sd_rad**2]
-            step_covariance[2, :] = turn_row
-            step_covariance[:, 2] = turn_row
+            rotation_row = [0.0, 0.0, rotation_sd_rad**2]
+            step_covariance[2, :] = rotation_row
+            step_covariance[:, 2] = rotation_row
         return OdometryStep(motion, step_covariance)
 
-    def _sliding_equations(self, before: _Shape, now: _Shape, joint_rad_s: float) -> _Equations:
-        """Return equations that no link's middle moves sideways; the standard deviations are speeds."""
-        middles_before = before.origins + self._half_m[:, None] * before.rotations[:, :, 0]
-        middles = now.origins + self._half_m[:, None] * now.rotations[:, :, 0]
+    def _make_sliding_equations(
+        self, previous: _LinkFrames, current: _LinkFrames, rms_joint_velocity_rad_s: float
+    ) -> _Equations:
+        """Make the equations that the middles of the links do not move sideways.
+
+        Args:
+            previous: Frames of the links before the step.
+            current: Frames of the links after the step.
+            rms_joint_velocity_rad_s: Root mean square of the joint velocities; the faster, the less certain.
+
+        Returns:
+            One equation for each link. The standard deviations are speeds in m/s.
+        """
+        middles_before = previous.origins + self._half_lengths_m[:, None] * previous.rotations[:, :, 0]
+        middles = current.origins + self._half_lengths_m[:, None] * current.rotations[:, :, 0]
         moved = (middles - middles_before)[:, :2]  # by the joints alone
-        left = now.rotations[:, :2, 1]
+        left = current.rotations[:, :2, 1]
         left = left / np.maximum(np.hypot(left[:, 0], left[:, 1]), 1e-6)[:, None]
-        sd_m_s = SIDEWAYS_SD_M_S + SIDEWAYS_SD_M_PER_RAD * joint_rad_s
+        sd_m_s = SIDEWAYS_SD_M_S + SIDEWAYS_SD_M_PER_RAD * rms_joint_velocity_rad_s
         return _Equations(
-            rows=_step_rows(left, middles[:, :2]),
+            rows=_make_step_rows(left, middles[:, :2]),
             values=-np.einsum("ij,ij->i", left, moved),
-            sds=np.ones(len(moved)) * sd_m_s,
+            standard_deviations=np.ones(len(moved)) * sd_m_s,
         )
 
 
-def _contact_equations(before: _Shape, now: _Shape, contacts: Sequence[Contact]) -> _Equations:
-    """Return equations that no contact moves along its normal; the standard deviations are speeds."""
+def _make_contact_equations(previous: _LinkFrames, current: _LinkFrames, contacts: Sequence[Contact]) -> _Equations:
+    """Make the equations that no contact moves along its normal.
+
+    Contacts whose normal is nearly vertical are left out, because the body lies on those obstacles.
+
+    Args:
+        previous: Frames of the links before the step.
+        current: Frames of the links after the step.
+        contacts: Contacts of the links, in the frames of the links.
+
+    Returns:
+        One equation for each contact that is used. The standard deviations are speeds in m/s.
+    """
     rows = [np.empty((0, 3))]
     values: list[float] = []
     for contact in contacts:
         link = contact.link
         position_l = np.array(contact.position_l)
-        normal = (now.rotations[link] @ np.array(contact.normal_l))[:2]
+        normal = (current.rotations[link] @ np.array(contact.normal_l))[:2]
         length = float(np.hypot(normal[0], normal[1]))
-        if length < MIN_HORIZONTAL:
+        if length < MIN_HORIZONTAL_NORMAL_PART:
             continue
         normal = normal / length
-        position = (now.origins[link] + now.rotations[link] @ position_l)[:2]
-        position_before = (before.origins[link] + before.rotations[link] @ position_l)[:2]
-        rows.append(_step_rows(normal[None], position[None]))
+        position = (current.origins[link] + current.rotations[link] @ position_l)[:2]
+        position_before = (previous.origins[link] + previous.rotations[link] @ position_l)[:2]
+        rows.append(_make_step_rows(normal[None], position[None]))
         values.append(-float(normal @ (position - position_before)))
     return _Equations(np.vstack(rows), np.array(values), np.full(len(values), ALONG_NORMAL_SD_M_S))
 
 
-def _measure_turn(before: _Shape, now: _Shape, imu: Imu | None, period_s: float) -> tuple[float, float]:
-    """Return the turn of the base by the gyroscopes, and its standard deviation, in rad."""
+def _measure_base_rotation(
+    previous: _LinkFrames, current: _LinkFrames, imu: Imu | None, period_s: float
+) -> tuple[float, float]:
+    """Measure the rotation of the base about the vertical axis by the gyroscopes of the links.
+
+    The rotation that the joints cause is subtracted from what each gyroscope measures.
+
+    Args:
+        previous: Frames of the links before the step.
+        current: Frames of the links after the step.
+        imu: Angular velocities of some links; None or without links if nothing is measured.
+        period_s: Duration of the step.
+
+    Returns:
+        The rotation in rad and its standard deviation in rad; 0 with a large standard deviation without gyroscopes.
+    """
     if imu is None or not imu.link:
-        return 0.0, TURN_SD_RAD_S * period_s
-    turns_rad: list[float] = []
+        return 0.0, ROTATION_SD_WITHOUT_GYRO_RAD_S * period_s
+    rotations_rad: list[float] = []
     for link, rate in zip(imu.link, imu.angular_velocity_rad_s, strict=True):
-        rotation = now.rotations[link]
-        relative = rotation @ before.rotations[link].T
+        rotation = current.rotations[link]
+        relative = rotation @ previous.rotations[link].T
         by_joints_rad = float(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
-        turn_rad = float((rotation @ np.array(rate))[2]) * period_s
-        turns_rad.append(turn_rad - by_joints_rad)
-    return float(np.mean(turns_rad)), GYRO_SD_RAD_S * period_s
+        rotation_rad = float((rotation @ np.array(rate))[2]) * period_s
+        rotations_rad.append(rotation_rad - by_joints_rad)
+    return float(np.mean(rotations_rad)), GYRO_SD_RAD_S * period_s
 
 
-def _step_rows(direction: Floats, points: Floats) -> Floats:
-    """Return rows (n, 3): how a step (forward, left, turn) moves points (n, 2) along directions (n, 2)."""
+def _make_step_rows(direction: Floats, points: Floats) -> Floats:
+    """Return the coefficients of the motion of points along directions, as functions of the motion of the base.
+
+    Args:
+        direction: (n, 2) unit vectors.
+        points: (n, 2) points in the level frame of the base, m.
+
+    Returns:
+        (n, 3) coefficients of forward, left and rotation.
+    """
     turning = direction[:, 1] * points[:, 0] - direction[:, 0] * points[:, 1]
     return np.column_stack([direction, turning])

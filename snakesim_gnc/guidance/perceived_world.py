@@ -9,13 +9,13 @@ from collections import Counter
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import Base, BodyFrames
+from snakesim_gnc.guidance.body_history import BasePose, BodyFrames
 from snakesim_gnc.guidance.core import transform_contact
 from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, decode_depth_m
-from snakesim_gnc.guidance.ground import fit_plane_under
+from snakesim_gnc.guidance.ground import fit_plane_under_body
 from snakesim_gnc.guidance.localization import Localizer, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.scan import Noise, RangingSample, Scan, make_scan
+from snakesim_gnc.guidance.scan import RangeNoise, RangingSample, Scan, make_scan
 from snakesim_gnc.guidance.scan_match import match_scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion
@@ -31,11 +31,11 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 
-TOUCH_PERIOD_NS = 50_000_000  # contacts are mapped this often: the body slides a few millimeters meanwhile
-OWN_BODY_M = 0.01  # beyond the body's radius: nearer points of a scan are on the body itself
+TOUCH_MAPPING_PERIOD_NS = 50_000_000  # contacts are mapped this often: the body slides a few millimeters meanwhile
+OWN_BODY_MARGIN_M = 0.01  # beyond the body's radius: nearer points of a scan are on the body itself
 HALF_CONFIDENCE_SD_M = 0.05  # of the position, at which the confidence in it is one half
-MAX_UPWARD = 0.7  # part of a contact's normal: with more, the body lies on the obstacle
-TRUSTED_POSE_NS = 300_000_000  # with a pose newer than this, scans do not correct the base
+MAX_VERTICAL_NORMAL_PART = 0.7  # part of a contact's normal: with more, the body lies on the obstacle
+MAX_TRUSTED_POSE_AGE_NS = 300_000_000  # with a pose newer than this, scans do not correct the base
 MAX_CARVE_SD_M = 0.01  # limit of the position's standard deviation that the map assumes for the body
 MAX_SCAN_SD_M = 0.02  # likewise for scans
 MAX_POSITION_SD_M = 1e3  # upper limits of what is reported
@@ -45,97 +45,111 @@ MAX_YAW_SD_RAD = 10.0
 class PerceivedWorld:
     """Makes world models from sensor samples."""
 
-    def __init__(self, robot: Description, start: Base, pose_noise: PoseNoise) -> None:
+    def __init__(self, robot: Description, start: BasePose, pose_noise: PoseNoise) -> None:
         """Create an empty map and an estimate of the base pose, which the samples of sensors then update.
 
         Args:
-            robot: description of the robot.
-            start: base pose at the start.
-            pose_noise: noise of the pose sensor.
+            robot: Description of the robot.
+            start: Base pose at the start.
+            pose_noise: Noise of the pose sensor.
         """
         # The robot.
         lengths_m = np.array([link.length_m for link in robot.links])
         masses_kg = np.array([link.mass_kg for link in robot.links])
-        self._half_m = 0.5 * lengths_m
+        self._half_lengths_m = 0.5 * lengths_m
         self._mass_ratios = masses_kg / masses_kg.sum()
-        self._rear_s_m = np.concatenate(([0.0], np.cumsum(lengths_m)))[:-1]
+        self._link_rear_s_m = np.concatenate(([0.0], np.cumsum(lengths_m)))[:-1]
         self._radius_m = max(link.radius_m for link in robot.links)
 
         # The estimates.
         self.map = ObstacleMap()
         self.localizer = Localizer(robot, start, pose_noise)
-        self._mapped_variance_m2 = 0.0  # of the position, after the last scan
+        self._variance_at_last_scan_m2 = 0.0  # of the position, after the last scan
 
         # Samples.
-        self.refused: Counter[str] = Counter()  # samples that could not be used, by reason
+        self.rejected_sample_counts: Counter[str] = Counter()  # samples that could not be used, by reason
         self.depth_timestamp_ns: int | None = None  # of the newest image or ranges in the map
-        self._scanners: dict[tuple[Intrinsics, Noise], DepthScanner] = {}
+        self._scanners: dict[tuple[Intrinsics, RangeNoise], DepthScanner] = {}
         self._joints: JointState | None = None
         self._contacts: Contacts | None = None
-        self._touched_ns = 0  # timestamp of the newest contacts in the map; 0: none yet
+        self._last_touch_ns = 0  # timestamp of the newest contacts in the map; 0 before the first ones
 
     def add_joints(self, joints: JointState, contacts: Contacts | None, imu: Imu | None) -> None:
-        """Move the body to the newest joint state. contacts, imu: the newest, for dead reckoning."""
+        """Move the estimated body to a joint state by dead reckoning. A joint state that is not newer is ignored.
+
+        Args:
+            joints: The newest joint state.
+            contacts: The newest contacts, for dead reckoning; None if there are none.
+            imu: The newest angular velocities and accelerations, for dead reckoning; None if there are none.
+        """
         if self._joints is not None and joints.timestamp_ns <= self._joints.timestamp_ns:
             return
         self._joints = joints
-        self.localizer.move(joints, contacts, imu)
+        self.localizer.predict(joints, contacts, imu)
 
     def add_pose(self, pose: Pose) -> None:
-        """Correct the body's pose by a sample of the pose sensor."""
+        """Correct the body's pose by a sample of the pose sensor. A jump makes the map less certain."""
         self.localizer.add_pose(pose)
-        if self.localizer.carried_m:
-            self.map.drift(self.localizer.carried_m**2)
+        if self.localizer.jump_distance_m:
+            self.map.add_drift(self.localizer.jump_distance_m**2)
 
     def add_contacts(self, contacts: Contacts) -> None:
-        """Store contacts, and add the touched places of upright surfaces to the map, at most every TOUCH_PERIOD_NS.
+        """Store contacts, and add the points at which the body touches upright surfaces to the map.
 
-        Contacts whose time is not covered by the history of the body are counted in `refused`.
+        Contacts are mapped at most every TOUCH_MAPPING_PERIOD_NS. Contacts whose time is not covered by the history of
+        the body are counted in `rejected_sample_counts`.
 
         Args:
-            contacts: contacts of the links, in the frames of the links.
+            contacts: Contacts of the links, in the frames of the links.
         """
         self._contacts = contacts
-        has_touched = self._touched_ns != 0
-        if has_touched and contacts.timestamp_ns - self._touched_ns < TOUCH_PERIOD_NS:
+        has_touched = self._last_touch_ns != 0
+        if has_touched and contacts.timestamp_ns - self._last_touch_ns < TOUCH_MAPPING_PERIOD_NS:
             return
-        body = self.localizer.history.body_at(contacts.timestamp_ns)
+        body = self.localizer.history.interpolate_body(contacts.timestamp_ns)
         if body is None:
-            self.refused["contacts without a joint state of their time"] += 1
+            self.rejected_sample_counts["contacts without a joint state of their time"] += 1
             return
-        self._touched_ns = contacts.timestamp_ns
+        self._last_touch_ns = contacts.timestamp_ns
         touches: list[tuple[Floats, Floats]] = []  # position (2,) and normal (2,) in the world
         for contact in contacts.contacts:
             if contact.link >= len(body.origins_w):
                 continue
             rotation = body.rotations[contact.link]
             normal_w = rotation @ np.array(contact.normal_l)
-            if abs(normal_w[2]) < MAX_UPWARD:
+            if abs(normal_w[2]) < MAX_VERTICAL_NORMAL_PART:
                 position_w = body.origins_w[contact.link] + rotation @ np.array(contact.position_l)
                 touches.append((position_w[:2], normal_w[:2] / math.hypot(*normal_w[:2])))
         self.map.add_touches(touches, contacts.timestamp_ns)
 
-    def add_ranging_sample(self, look: RangingSample, noise: Noise) -> None:
-        """Add an image or ranges of any camera, lidar or range finder to the map. noise: of its distances."""
-        body = self._find_body(look.timestamp_ns, "image" if isinstance(look, DepthImage) else "ranges")
-        if body is None or look.link >= len(body.origins_w):
+    def add_ranging_sample(self, sample: RangingSample, noise: RangeNoise) -> None:
+        """Add a sample of a depth camera, lidar or range finder to the map.
+
+        A sample whose time is not covered by the history of the body is counted in `rejected_sample_counts`.
+
+        Args:
+            sample: Depth image or ranges, with the mounting of the sensor on its link.
+            noise: Noise of the measured distances.
+        """
+        body = self._find_body_at_sample(sample.timestamp_ns, "image" if isinstance(sample, DepthImage) else "ranges")
+        if body is None or sample.link >= len(body.origins_w):
             return
-        position_w, rotation = _sensor_pose(body, look)
-        bottoms_w = np.vstack([body.origins_w, body.head_w]) - [0.0, 0.0, self._radius_m]
-        plane = fit_plane_under(bottoms_w, position_w[:2])
-        if isinstance(look, DepthImage):
-            scanner = self._find_scanner(Intrinsics.from_image(look), noise)
-            scan = scanner.scan(decode_depth_m(look), look.timestamp_ns, position_w, rotation, plane)
+        position_w, rotation = _compute_sensor_pose(body, sample)
+        lowest_points_w = np.vstack([body.origins_w, body.head_end_w]) - [0.0, 0.0, self._radius_m]
+        plane = fit_plane_under_body(lowest_points_w, position_w[:2])
+        if isinstance(sample, DepthImage):
+            scanner = self._get_scanner(Intrinsics.from_image(sample), noise)
+            scan = scanner.make_scan(decode_depth_m(sample), sample.timestamp_ns, position_w, rotation, plane)
         else:
-            scan = make_scan(look, position_w, rotation, float(plane[0]), noise)
-        self._map_scan(scan, body)
+            scan = make_scan(sample, position_w, rotation, float(plane[0]), noise)
+        self._add_scan_to_map(scan, body)
 
     def make_world(self, tick: int, now_ns: int) -> World | None:
         """Return the world model at the newest joint state, after removing obstacles where the body is.
 
         Args:
-            tick: tick of the clock.
-            now_ns: robot time of the clock.
+            tick: Tick of the clock.
+            now_ns: Robot time of the clock.
 
         Returns:
             The world model, or None before the first joint state.
@@ -146,10 +160,10 @@ class PerceivedWorld:
         localizer = self.localizer
         base = localizer.base
         body = localizer.history.compute_frames(base, np.asarray(joints.angle_rad))
-        axis_w = body.axis_w()
-        self.map.carve_body(axis_w, self._radius_m, min(localizer.position_sd_m, MAX_CARVE_SD_M))
-        self.map.drop_distant(axis_w)
-        middles_w = body.origins_w + self._half_m[:, None] * body.rotations[:, :, 0]
+        axis_w = body.compute_axis_w()
+        self.map.remove_surfaces_in_body(axis_w, self._radius_m, min(localizer.position_sd_m, MAX_CARVE_SD_M))
+        self.map.drop_distant_tracks(axis_w)
+        middles_w = body.origins_w + self._half_lengths_m[:, None] * body.rotations[:, :, 0]
         contacts_timestamp_ns = None
         contacts_from = None
         if self._contacts is not None:
@@ -162,87 +176,109 @@ class PerceivedWorld:
             base_orientation_wxyz=quaternion_from_rotation(base.rotation),
             base_confidence=compute_confidence(localizer.position_sd_m),
             contacts=self._transform_contacts(body),
-            obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
+            obstacles=self.map.list_obstacles(now_ns, base.z_m - self._radius_m),
             pose_timestamp_ns=localizer.pose_timestamp_ns,
             contacts_timestamp_ns=contacts_timestamp_ns,
             center_w=tuple((self._mass_ratios @ middles_w).tolist()),
             base_position_sd_m=min(localizer.position_sd_m, MAX_POSITION_SD_M),
             base_yaw_sd_rad=min(localizer.yaw_sd_rad, MAX_YAW_SD_RAD),
             depth_timestamp_ns=self.depth_timestamp_ns,
-            pose_from="sensor" if self._trusts_pose(now_ns) else "dead_reckoning",
+            pose_from="sensor" if self._has_recent_pose(now_ns) else "dead_reckoning",
             contacts_from=contacts_from,
         )
 
     def _transform_contacts(self, body: BodyFrames) -> list[WorldContact]:
-        """Return the newest contacts in the world, with the body of their time. body: of now."""
+        """Return the newest contacts in the world frame.
+
+        Args:
+            body: Frames of the links at the current tick; used only if those at the time of the contacts are unknown.
+        """
         contacts = self._contacts
         if contacts is None:
             return []
-        then = self.localizer.history.body_at(contacts.timestamp_ns) or body
+        body_then = self.localizer.history.interpolate_body(contacts.timestamp_ns) or body
         valid = [contact for contact in contacts.contacts if contact.link < len(body.origins_w)]
         return [
-            transform_contact(contact, then.origins_w, then.rotations, self._rear_s_m, self._find_name)
+            transform_contact(
+                contact, body_then.origins_w, body_then.rotations, self._link_rear_s_m, self._find_obstacle_name
+            )
             for contact in valid[:MAX_CONTACTS]
         ]
 
-    def _find_name(self, position_w: Floats) -> str | None:
+    def _find_obstacle_name(self, position_w: Floats) -> str | None:
         """Return the name of the mapped obstacle at a position (3,)."""
         track = self.map.find_track(position_w[:2])
         return None if track is None else track.name
 
-    def _trusts_pose(self, now_ns: int) -> bool:
-        """Return whether the pose sensor has measured lately. If not, the map corrects dead reckoning."""
+    def _has_recent_pose(self, now_ns: int) -> bool:
+        """Return whether the pose sensor has measured recently. If not, scan matching corrects the base instead."""
         pose_ns = self.localizer.pose_timestamp_ns
-        return pose_ns is not None and now_ns - pose_ns <= TRUSTED_POSE_NS
+        return pose_ns is not None and now_ns - pose_ns <= MAX_TRUSTED_POSE_AGE_NS
 
-    def _find_body(self, timestamp_ns: int, sample: str) -> BodyFrames | None:
-        """Return the body at a sample's timestamp; None if it is unknown, which is counted. sample: what it is."""
+    def _find_body_at_sample(self, timestamp_ns: int, sample_name: str) -> BodyFrames | None:
+        """Return the frames of the links at the timestamp of a sample.
+
+        Args:
+            timestamp_ns: Timestamp of the sample.
+            sample_name: Kind of the sample, for the reason under which a rejected sample is counted.
+
+        Returns:
+            The frames, or None if the sample cannot be used, which is counted in `rejected_sample_counts`.
+        """
         if self._joints is None or not all(self._joints.valid):
-            self.refused[f"{sample} while a joint's angle is unknown"] += 1
+            self.rejected_sample_counts[f"{sample_name} while a joint's angle is unknown"] += 1
             return None
         if self.depth_timestamp_ns is not None and timestamp_ns < self.depth_timestamp_ns:
-            self.refused[f"{sample} older than one before"] += 1
+            self.rejected_sample_counts[f"{sample_name} older than one before"] += 1
             return None
-        body = self.localizer.history.body_at(timestamp_ns)
+        body = self.localizer.history.interpolate_body(timestamp_ns)
         if body is None:
-            self.refused[f"{sample} without a joint state of its time"] += 1
+            self.rejected_sample_counts[f"{sample_name} without a joint state of its time"] += 1
         return body
 
-    def _find_scanner(self, lens: Intrinsics, noise: Noise) -> DepthScanner:
-        """Return the scanner of a camera, which is made once."""
-        key = (lens, noise)
+    def _get_scanner(self, intrinsics: Intrinsics, noise: RangeNoise) -> DepthScanner:
+        """Return the scanner of a camera; it is created at the first call for the camera's intrinsics and noise."""
+        key = (intrinsics, noise)
         scanner = self._scanners.get(key)
         if scanner is None:
-            scanner = DepthScanner(lens, noise)
+            scanner = DepthScanner(intrinsics, noise)
             self._scanners[key] = scanner
         return scanner
 
-    def _map_scan(self, scan: Scan, body: BodyFrames) -> None:
-        """Correct the base by a scan if no pose sensor does, and add the scan to the map. body: at its timestamp."""
-        offset = scan.points_w[:, None] - body.axis_w()
+    def _add_scan_to_map(self, scan: Scan, body: BodyFrames) -> None:
+        """Add a scan to the map. Without a recent pose, first correct the base by matching the scan to the map.
+
+        Args:
+            scan: The scan, with its points in the world.
+            body: Frames of the links at the timestamp of the scan; points on the robot's own body are masked.
+        """
+        offset = scan.points_w[:, None] - body.compute_axis_w()
         from_axis_m = np.hypot(offset[..., 0], offset[..., 1]).min(axis=1)
-        scan = scan.without(from_axis_m < self._radius_m + OWN_BODY_M)
-        variance_m2 = self._position_variance_m2()
-        self.map.drift(max(variance_m2 - self._mapped_variance_m2, 0.0))
-        self.map.here_m2 = variance_m2
-        if not self._trusts_pose(scan.timestamp_ns):
-            scan = self._correct_by_scan(scan)
+        scan = scan.mask_bins(from_axis_m < self._radius_m + OWN_BODY_MARGIN_M)
+        variance_m2 = self._compute_position_variance_m2()
+        self.map.add_drift(max(variance_m2 - self._variance_at_last_scan_m2, 0.0))
+        self.map.current_variance_m2 = variance_m2
+        if not self._has_recent_pose(scan.timestamp_ns):
+            scan = self._correct_base_by_scan(scan)
         self.depth_timestamp_ns = scan.timestamp_ns
         self.map.add_scan(scan, min(self.localizer.position_sd_m, MAX_SCAN_SD_M))
-        self._mapped_variance_m2 = self._position_variance_m2()
+        self._variance_at_last_scan_m2 = self._compute_position_variance_m2()
 
-    def _correct_by_scan(self, scan: Scan) -> Scan:
-        """Correct the base by matching a scan to the map. Returns the scan as seen from the corrected base."""
-        then = self.localizer.history.base_at(scan.timestamp_ns)
-        if then is None:
+    def _correct_base_by_scan(self, scan: Scan) -> Scan:
+        """Correct the base by matching a scan to the map, and return the scan moved to the corrected base.
+
+        If the scan does not match, the base and the scan stay as they are.
+        """
+        base_then = self.localizer.history.interpolate_base(scan.timestamp_ns)
+        if base_then is None:
             return scan
-        match = match_scan(scan, self.map.tracks, then.planar_w)
+        match = match_scan(scan, self.map.tracks, base_then.planar_w)
         if match is None:
             return scan
-        self.localizer.correct(then, match.planar_w, match.covariance, match.map_m2)
-        return scan.moved(then.planar_w, match.planar_w)
+        self.localizer.correct_by_pose(base_then, match.planar_w, match.covariance, match.map_variance_m2)
+        return scan.move_to_base(base_then.planar_w, match.planar_w)
 
-    def _position_variance_m2(self) -> float:
+    def _compute_position_variance_m2(self) -> float:
         """Return the mean variance of the base's position over x and y."""
         return 0.5 * float(np.trace(self.localizer.covariance[:2, :2]))
 
@@ -271,7 +307,7 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
     return tuple((best_row / np.linalg.norm(best_row)).tolist())
 
 
-def _sensor_pose(body: BodyFrames, sensor: RangingSample) -> tuple[Floats, Floats]:
+def _compute_sensor_pose(body: BodyFrames, sensor: RangingSample) -> tuple[Floats, Floats]:
     """Return position (3,) in the world and rotation (3, 3) world_from_sensor of a mounted sensor."""
     rotation = body.rotations[sensor.link]
     position_w = body.origins_w[sensor.link] + rotation @ np.array(sensor.position_l)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.path_search.native_library import (
-    INTEGER,
+    INTEGER_DTYPE,
     NativeGrid,
     NativeMemory,
     NativeWindow,
@@ -26,14 +26,14 @@ CELL_ERROR_M = CELL_M * 0.5**0.5  # distance from a cell's center to its corner
 MAX_DISTANCE_M = 0.30  # a point farther than this from every surface counts as free
 NO_OBSTACLE = -1
 OBSTACLES_PER_STEP = 20
-NODES_PER_OBSTACLE = 100  # nodes that a search (`beam`) could expand in the time that one obstacle takes
+NODE_COST_PER_OBSTACLE = 100  # nodes that a search (`beam`) could expand in the time that one obstacle takes
 
 
 @dataclass(frozen=True)
 class NearestObstacles:
     """The obstacle nearest to each point. All arrays have the shape of the points."""
 
-    obstacle: Ints  # (...) index; NO_OBSTACLE if none is within MAX_DISTANCE_M
+    obstacle_index: Ints  # (...) index; NO_OBSTACLE if none is within MAX_DISTANCE_M
     distance_m: Floats  # (...) to its surface, negative inside; MAX_DISTANCE_M if there is none
     normal_w: Floats  # (..., 2) unit vector from its surface to the point; zero if there is none
 
@@ -45,7 +45,7 @@ class ObstacleGrid:
     """
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
-        for _ in self._fill(obstacles):
+        for _ in self._fill_in_steps(obstacles):
             pass
 
     @classmethod
@@ -56,16 +56,16 @@ class ObstacleGrid:
             The cost of the next step in nodes, before doing it. See `beam`.
         """
         grid = cls.__new__(cls)
-        yield from grid._fill(obstacles)
+        yield from grid._fill_in_steps(obstacles)
         return grid
 
-    def _fill(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
+    def _fill_in_steps(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
         """Compute the nearest obstacle of each cell, in steps that a planner can spread over several ticks.
 
         Each obstacle is written into the cells within MAX_DISTANCE_M of its outline that have no nearer obstacle.
 
         Args:
-            obstacles: the obstacles of the map.
+            obstacles: The obstacles of the map.
 
         Yields:
             The cost of the next step in nodes of the search, before the step.
@@ -76,50 +76,50 @@ class ObstacleGrid:
             self._fill_empty()
             return
         outlines = self.outlines
-        reach_m = outlines.reach_m + MAX_DISTANCE_M
-        self.low_w = (outlines.center_w - reach_m[:, None]).min(axis=0)
-        high_w = (outlines.center_w + reach_m[:, None]).max(axis=0)
-        columns, rows = (np.ceil((high_w - self.low_w) / CELL_M).astype(int) + 1).tolist()
+        influence_radius_m = outlines.reach_m + MAX_DISTANCE_M
+        self.min_corner_w = (outlines.center_w - influence_radius_m[:, None]).min(axis=0)
+        max_corner_w = (outlines.center_w + influence_radius_m[:, None]).max(axis=0)
+        columns, rows = (np.ceil((max_corner_w - self.min_corner_w) / CELL_M).astype(int) + 1).tolist()
         self.shape = (columns, rows)
         self.cell_nearest = np.full(columns * rows, NO_OBSTACLE, dtype=np.int64)
         self.cell_distance_m = np.full(columns * rows, MAX_DISTANCE_M)
-        mark = self._choose_marking()
-        for index, (center_w, radius_m) in enumerate(zip(outlines.center_w, reach_m, strict=True)):
+        mark_obstacle = self._choose_marking_function()
+        for index, (center_w, radius_m) in enumerate(zip(outlines.center_w, influence_radius_m, strict=True)):
             if index % OBSTACLES_PER_STEP == 0:
-                yield NODES_PER_OBSTACLE * min(OBSTACLES_PER_STEP, len(outlines) - index)
-            first = np.maximum(((center_w - radius_m - self.low_w) / CELL_M).astype(int), 0)
-            last = np.minimum(((center_w + radius_m - self.low_w) / CELL_M).astype(int) + 2, self.shape)
-            mark(index, first, last)
+                yield NODE_COST_PER_OBSTACLE * min(OBSTACLES_PER_STEP, len(outlines) - index)
+            first_cell = np.maximum(((center_w - radius_m - self.min_corner_w) / CELL_M).astype(int), 0)
+            last_cell = np.minimum(((center_w + radius_m - self.min_corner_w) / CELL_M).astype(int) + 2, self.shape)
+            mark_obstacle(index, first_cell, last_cell)
 
     def _fill_empty(self) -> None:
         """Make a grid of one cell, which is free."""
-        self.low_w = np.zeros(2)
+        self.min_corner_w = np.zeros(2)
         self.shape = (1, 1)
         self.cell_nearest = np.full(1, NO_OBSTACLE, dtype=np.int64)
         self.cell_distance_m = np.full(1, MAX_DISTANCE_M)
 
-    def _choose_marking(self) -> Callable[[int, Ints, Ints], None]:
-        """Return the function that marks an obstacle: in C if the library is installed, else `_mark_obstacle`."""
+    def _choose_marking_function(self) -> Callable[[int, Ints, Ints], None]:
+        """Return the function that writes an obstacle into the grid: in C if the library is installed, else NumPy."""
         library = load_library()
         if library is None:
-            return self._mark_obstacle
-        return NativeMarking(library, self).mark_obstacle
+            return self._mark_obstacle_with_numpy
+        return NativeObstacleMarker(library, self).mark_obstacle
 
-    def _mark_obstacle(self, index: int, first: Ints, last: Ints) -> None:
+    def _mark_obstacle_with_numpy(self, index: int, first_cell: Ints, last_cell: Ints) -> None:
         """Write an obstacle into the cells of a window that have no nearer one.
 
         It is the reference implementation of a function of the C library, which gives the same result.
 
         Args:
-            index: index of the obstacle.
-            first: (2,) column and row of the first cell.
-            last: (2,) column and row after the last cell; both are within the grid.
+            index: Index of the obstacle.
+            first_cell: (2,) column and row of the first cell.
+            last_cell: (2,) column and row after the last cell; both are within the grid.
         """
-        x = self.low_w[0] + CELL_M * np.arange(first[0], last[0])
-        y = self.low_w[1] + CELL_M * np.arange(first[1], last[1])
+        x = self.min_corner_w[0] + CELL_M * np.arange(first_cell[0], last_cell[0])
+        y = self.min_corner_w[1] + CELL_M * np.arange(first_cell[1], last_cell[1])
         cells_w = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-        to_obstacle_m, _ = self.outlines.distance_and_normal(cells_w, np.full(cells_w.shape[:2], index))
-        window = (slice(first[0], last[0]), slice(first[1], last[1]))
+        to_obstacle_m, _ = self.outlines.compute_distances_and_normals(cells_w, np.full(cells_w.shape[:2], index))
+        window = (slice(first_cell[0], last_cell[0]), slice(first_cell[1], last_cell[1]))
         distance_m = self.cell_distance_m.reshape(self.shape)[window]
         nearest = self.cell_nearest.reshape(self.shape)[window]
         is_nearer = to_obstacle_m < distance_m
@@ -130,28 +130,30 @@ class ObstacleGrid:
         """Return the grid as the structure that the functions of the C library read, with pointers to its arrays.
 
         Args:
-            memory: keeps the arrays alive as long as C code may read them.
+            memory: Keeps the arrays alive as long as C code may read them.
         """
         columns, rows = self.shape
         outlines = self.outlines
         count = len(outlines)
         grid = NativeGrid()
-        grid.low_x_m, grid.low_y_m = self.low_w
+        grid.low_x_m, grid.low_y_m = self.min_corner_w
         grid.columns = columns
         grid.rows = rows
         grid.cell_m = CELL_M
         grid.cell_error_m = CELL_ERROR_M
         grid.max_distance_m = MAX_DISTANCE_M
         cells = (columns * rows,)
-        grid.nearest = memory.pass_array("the nearest obstacle of each cell", self.cell_nearest, cells, INTEGER)
-        grid.distance_m = memory.pass_array("the distance of each cell", self.cell_distance_m, cells)
-        grid.center_m = memory.pass_array("the centers of the obstacles", outlines.center_w, (count, 2))
-        grid.direction = memory.pass_array("the directions of the obstacles", outlines.direction, (count, 2))
-        grid.half_size_m = memory.pass_array("the half sizes of the obstacles", outlines.half_m, (count, 2))
-        grid.rounding_m = memory.pass_array("the roundings of the obstacles", outlines.rounding_m, (count,))
+        grid.nearest = memory.get_array_address(
+            "the nearest obstacle of each cell", self.cell_nearest, cells, INTEGER_DTYPE
+        )
+        grid.distance_m = memory.get_array_address("the distance of each cell", self.cell_distance_m, cells)
+        grid.center_m = memory.get_array_address("the centers of the obstacles", outlines.center_w, (count, 2))
+        grid.direction = memory.get_array_address("the directions of the obstacles", outlines.direction, (count, 2))
+        grid.half_size_m = memory.get_array_address("the half sizes of the obstacles", outlines.half_m, (count, 2))
+        grid.rounding_m = memory.get_array_address("the roundings of the obstacles", outlines.rounding_m, (count,))
         return grid
 
-    def approximate_distance_m(self, x: Floats, y: Floats) -> Floats:
+    def compute_approximate_distance_m(self, x: Floats, y: Floats) -> Floats:
         """Return distances to the nearest surface with an error of at most CELL_ERROR_M.
 
         Points without an obstacle within MAX_DISTANCE_M get MAX_DISTANCE_M.
@@ -160,7 +162,12 @@ class ObstacleGrid:
         return np.where(is_inside, self.cell_distance_m[cell], MAX_DISTANCE_M)
 
     def find_nearest(self, x: Floats, y: Floats) -> NearestObstacles:
-        """Find the obstacle nearest to each point of the world, with the exact distance. x, y: arrays of one shape."""
+        """Find the obstacle nearest to each point, with the exact distance and normal.
+
+        Args:
+            x: (...) positions in the world, m.
+            y: (...) positions in the world, m.
+        """
         shape = np.shape(x)
         is_inside, cell = self._find_cells(x, y)
         obstacle = np.where(is_inside, self.cell_nearest[cell], NO_OBSTACLE)
@@ -169,29 +176,37 @@ class ObstacleGrid:
         has_obstacle = obstacle >= 0
         if has_obstacle.any():
             points_w = np.stack([x[has_obstacle], y[has_obstacle]], axis=-1)
-            distances_m, normals_w = self.outlines.distance_and_normal(points_w, obstacle[has_obstacle])
+            distances_m, normals_w = self.outlines.compute_distances_and_normals(points_w, obstacle[has_obstacle])
             distance_m[has_obstacle] = distances_m
             normal_w[has_obstacle] = normals_w
         return NearestObstacles(obstacle, distance_m, normal_w)
 
     def _find_cells(self, x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Ints]:
-        """Return which points are in the grid, and the index of their cell, 0 for points outside."""
+        """Find the cells of points.
+
+        Args:
+            x: (...) positions in the world, m.
+            y: (...) positions in the world, m.
+
+        Returns:
+            Whether each point is in the grid, and the flat index of its cell, 0 for points outside; (...) each.
+        """
         columns, rows = self.shape
-        column = ((x - self.low_w[0]) / CELL_M + 0.5).astype(int)
-        row = ((y - self.low_w[1]) / CELL_M + 0.5).astype(int)
+        column = ((x - self.min_corner_w[0]) / CELL_M + 0.5).astype(int)
+        row = ((y - self.min_corner_w[1]) / CELL_M + 0.5).astype(int)
         is_inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
         return is_inside, np.where(is_inside, column * rows + row, 0)
 
 
-class NativeMarking:
-    """Marks obstacles in a grid in C."""
+class NativeObstacleMarker:
+    """Writes obstacles into the cells of a grid by a function of the C library."""
 
     def __init__(self, library: PlannerLibrary, grid: ObstacleGrid) -> None:
         self._library = library
         self._memory = NativeMemory()
         self._grid = grid.make_native_grid(self._memory)
 
-    def mark_obstacle(self, index: int, first: Ints, last: Ints) -> None:
+    def mark_obstacle(self, index: int, first_cell: Ints, last_cell: Ints) -> None:
         """Write an obstacle into the cells of a window that have no nearer one; see `ObstacleGrid`."""
-        window = NativeWindow(int(first[0]), int(last[0]), int(first[1]), int(last[1]))
+        window = NativeWindow(int(first_cell[0]), int(last_cell[0]), int(first_cell[1]), int(last_cell[1]))
         self._library.mark_obstacle(ctypes.byref(self._grid), ctypes.byref(window), index)

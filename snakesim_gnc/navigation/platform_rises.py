@@ -9,12 +9,12 @@ from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle, Rise
 
-SPACING_M = 0.01  # of the points of the path that are checked
+SAMPLE_SPACING_M = 0.01  # of the points of the path that are checked
 MAX_RISES = 64  # in a message
 
 
 class PlatformRises:
-    """Finds the rises of the present path, once for each path."""
+    """Finds the rises of the current path, once for each path."""
 
     def __init__(self, platforms: Sequence[Obstacle]) -> None:
         self._outlines = Outlines.from_obstacles(platforms)
@@ -23,20 +23,27 @@ class PlatformRises:
         self._rises: list[Rise] = []
 
     def find_rises(self, path_id: int, path_w: Sequence[tuple[float, float]]) -> list[Rise]:
-        """Return the rises along a path. path_id: changes when the path does."""
+        """Return the rises along a path, which are computed only when the path is a new one.
+
+        Args:
+            path_id: Number of the path, which changes when the path does.
+            path_w: Points of the path in the world, m.
+        """
         if len(self._tops_m) and path_id != self._path_id:
             self._path_id = path_id
             self._rises = self._compute_rises(Route(path_w))
         return self._rises
 
     def _compute_rises(self, route: Route) -> list[Rise]:
-        s_m = np.arange(0.0, route.length_m, SPACING_M)
-        is_on_platform = self._outlines.distance_m(route.position_w(s_m)) <= 0.0  # (points, platforms)
+        """Find the stretches of a route on platforms, at points every SAMPLE_SPACING_M, at most MAX_RISES."""
+        s_m = np.arange(0.0, route.length_m, SAMPLE_SPACING_M)
+        distances_m = self._outlines.compute_distances_m(route.compute_positions_w(s_m))  # (points, platforms)
+        is_on_platform = distances_m <= 0.0
         heights_m = np.where(is_on_platform, self._tops_m, 0.0).max(axis=1)
         points = zip(s_m.tolist(), heights_m.tolist(), strict=True)
         rises: list[Rise] = []
-        for height_m, run in groupby(points, key=lambda point: point[1]):
+        for height_m, same_height_points in groupby(points, key=lambda point: point[1]):
             if height_m > 0.0:
-                run_s_m = [s for s, _ in run]
-                rises.append(Rise(from_s_m=run_s_m[0], to_s_m=run_s_m[-1], height_m=height_m))
+                rise_s_m = [s for s, _ in same_height_points]
+                rises.append(Rise(from_s_m=rise_s_m[0], to_s_m=rise_s_m[-1], height_m=height_m))
         return rises[:MAX_RISES]

@@ -2,10 +2,11 @@
 
 OpenBLAS, NumPy and the C library each choose code for the processor that they find, and the last bits differ from one
 choice to the next. One seed gives one digest where all choose alike. That is called the common arithmetic here: the
-code for processors with AVX2 and FMA, which nearly every x86-64 computer can run, wider ones too. `pin` selects it,
-before NumPy is loaded. The result is measured, not guessed: `measured` hashes the bits of known computations.
+code for processors with AVX2 and FMA, which nearly every x86-64 computer can run, wider ones too.
+`pin_common_arithmetic` selects it, before NumPy is loaded. The result is measured, not guessed: `measure_arithmetic`
+hashes the bits of known computations.
 
-NumPy is not imported at the top here, as `pin` must come before it.
+NumPy is not imported at the top here, as `pin_common_arithmetic` must come before it.
 """
 
 import hashlib
@@ -20,7 +21,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-# What `measured` returns in the common arithmetic, with the wheels of NumPy 2.2 to 2.4. `make golden` prints it.
+# What `measure_arithmetic` returns in the common arithmetic, with the wheels of NumPy 2.2 to 2.4. `make golden` prints
+# it.
 COMMON: Mapping[str, str] = {
     "BLAS": "2a293bd2",
     "NumPy": "072d8a45",
@@ -29,8 +31,8 @@ COMMON: Mapping[str, str] = {
 COMMON_WITH = "NumPy 2.2 to 2.4"
 # Hashes of the BLAS in other wheels, with the same processor code: such a BLAS rounds alike on all computers.
 OTHER_WHEELS: Mapping[str, str] = {"3f7c15b6": "NumPy 2.5"}
-ONE_THREAD: dict[str, str] = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-NEEDED_FLAGS = {"avx2", "fma"}  # of the processor
+SINGLE_THREAD_ENV: dict[str, str] = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+REQUIRED_PROCESSOR_FLAGS = {"avx2", "fma"}  # of the processor
 # The code in NumPy for wider processors, by the version that began to call it so. NumPy warns of names that it does not
 # know, and where warnings are errors it cannot be imported then.
 WIDER_BEFORE_2_3 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_KNL AVX512_KNM"
@@ -43,16 +45,16 @@ CPUINFO = Path("/proc/cpuinfo")
 
 
 @cache
-def common_environment() -> dict[str, str]:
+def make_common_arithmetic_env() -> dict[str, str]:
     """Return variables that make a process compute in the common arithmetic; none for a processor that cannot."""
     if os.uname().machine != "x86_64":
         return {}
-    flags = _processor_flags()
-    if not flags >= NEEDED_FLAGS:
+    flags = _read_processor_flags()
+    if not flags >= REQUIRED_PROCESSOR_FLAGS:
         return {}
     wider = ""
     if "avx512f" in flags:
-        wider = _find_names_of_wider_code(_numpy_version())
+        wider = _find_wider_code_names(_find_numpy_version())
     return {
         "OPENBLAS_CORETYPE": "Haswell",
         "NPY_DISABLE_CPU_FEATURES": wider,
@@ -61,17 +63,17 @@ def common_environment() -> dict[str, str]:
     }
 
 
-def pin(*, one_thread: bool = False) -> None:
+def pin_common_arithmetic(*, one_thread: bool = False) -> None:
     """Compute in the common arithmetic, here and in child processes. It has no effect after NumPy was imported.
 
     Args:
-        one_thread: whether linear algebra starts no threads. Matrices of a robot's size only wait for them.
+        one_thread: Whether linear algebra runs in one thread. For matrices of a robot's size, more threads are slower.
     """
     if "numpy" in sys.modules:
         return
-    os.environ.update(common_environment())
+    os.environ.update(make_common_arithmetic_env())
     if one_thread:
-        os.environ.update(ONE_THREAD)
+        os.environ.update(SINGLE_THREAD_ENV)
 
 
 def is_pinned() -> bool:
@@ -79,7 +81,7 @@ def is_pinned() -> bool:
 
     True also where nothing could make it do so: then a child process would not either.
     """
-    if common_environment().items() <= os.environ.items():
+    if make_common_arithmetic_env().items() <= os.environ.items():
         return True
     differing = find_differing_parts(measure_arithmetic())
     return "BLAS" not in differing and "NumPy" not in differing
@@ -102,7 +104,7 @@ def format_digest(digest: str, differing: Sequence[str]) -> str:
 
     Args:
         digest: The whole digest.
-        differing: What `foreign` returns of the arithmetic in which it was computed.
+        differing: What `find_differing_parts` returns of the arithmetic in which it was computed.
     """
     beginning = digest[:16]
     unusual = [part for part in differing if part in COMMON]
@@ -124,9 +126,9 @@ def measure_arithmetic() -> dict[str, str]:
     numbers = [generator.uniform(-3.0, 3.0) for _ in range(2000)]
     with threadpool_limits(1):
         return {
-            "BLAS": _digest(_compute_linear_algebra(numbers)),
-            "NumPy": _digest(_compute_elementwise(numbers)),
-            "C library": _digest(_compute_library_functions(numbers)),
+            "BLAS": _compute_digest(_compute_linear_algebra(numbers)),
+            "NumPy": _compute_digest(_compute_elementwise(numbers)),
+            "C library": _compute_digest(_compute_library_functions(numbers)),
         }
 
 
@@ -148,7 +150,9 @@ def _compute_linear_algebra(numbers: list[float]) -> Iterable[Any]:
 
 
 def _compute_elementwise(numbers: list[float]) -> Iterable[Any]:
-    """Yield results of NumPy's own loops. NumPy has several of each, for different processors.
+    """Yield results of NumPy's element-wise functions, reductions and complex arithmetic.
+
+    NumPy has several implementations of each, for different processors, which may round differently.
 
     Stable sorting is left out: NumPy has only one loop for it.
     """
@@ -156,6 +160,7 @@ def _compute_elementwise(numbers: list[float]) -> Iterable[Any]:
 
     x = np.array(numbers)
     y = np.array(numbers[::-1])
+    # Element-wise functions.
     yield from (
         np.exp(x),
         np.arctan2(x, y),
@@ -167,6 +172,7 @@ def _compute_elementwise(numbers: list[float]) -> Iterable[Any]:
         np.sinh(x),
     )
     yield from (np.sin(x), np.cos(x), np.hypot(x, y), np.sqrt(np.abs(x)), np.arccos(x / 3.0), np.tan(x))
+    # Reductions.
     yield from (
         x.sum(),
         x[:13].sum(),
@@ -176,6 +182,7 @@ def _compute_elementwise(numbers: list[float]) -> Iterable[Any]:
         np.cumsum(x),
         np.einsum("i,i", x, y),
     )
+    # Complex and single-precision numbers.
     yield from (np.abs(x + 1j * y), (x + 1j * y) * (y - 1j * x), np.angle(x + 1j * y), np.exp(1j * x))
     yield from (np.sin(x.astype(np.float32)), np.exp(x.astype(np.float32)))
 
@@ -192,7 +199,7 @@ def _compute_library_functions(numbers: list[float]) -> Iterable[Any]:
     yield [math.hypot(*numbers[i : i + 3]) for i in range(len(numbers) - 3)]
 
 
-def _digest(results: Iterable[Any]) -> str:
+def _compute_digest(results: Iterable[Any]) -> str:
     import numpy as np
 
     digest = hashlib.sha256()
@@ -201,12 +208,12 @@ def _digest(results: Iterable[Any]) -> str:
     return digest.hexdigest()[:8]
 
 
-def _find_names_of_wider_code(numpy_version: tuple[int, int]) -> str:
+def _find_wider_code_names(numpy_version: tuple[int, int]) -> str:
     """Return NumPy's names of its code for wider processors, as this version knows them."""
     return next(names for since, names in WIDER.items() if numpy_version >= since)
 
 
-def _numpy_version() -> tuple[int, int]:
+def _find_numpy_version() -> tuple[int, int]:
     """Return major and minor number of the installed NumPy without importing it; the newest ones if unknown."""
     newest = next(iter(WIDER))
     spec = importlib.util.find_spec("numpy")
@@ -220,7 +227,7 @@ def _numpy_version() -> tuple[int, int]:
     return newest if number is None else (int(number[1]), int(number[2]))
 
 
-def _processor_flags() -> set[str]:
+def _read_processor_flags() -> set[str]:
     """Return the abilities of the processor, by the kernel's names; empty where they are not known."""
     try:
         lines = CPUINFO.read_text(errors="replace").splitlines()

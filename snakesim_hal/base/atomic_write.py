@@ -8,25 +8,28 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-PARTIAL = ".partial"  # suffix of a file that is not complete yet
+PARTIAL_SUFFIX = ".partial"  # suffix of a file that is not complete yet
 
 
 def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> None:
-    """Replace a file atomically, and keep its permissions. Raises OSError; then the earlier file is unchanged.
+    """Write a whole file so that it has either the old or the new content at any time. Its permissions are kept.
 
     A symbolic link at `path` is replaced, not followed: this is for files of this program, whose folder another user
     may write to. For a file that belongs to the user there is `write_through`.
 
     Args:
-        path: the file; its folder exists.
-        content: what the file contains afterwards.
-        durable: return only when it is on the disk, and survives a loss of power.
+        path: Path of the file. Its folder must exist.
+        content: New content of the file.
+        durable: If True, return only when the content is on the disk, so that it survives a loss of power.
+
+    Raises:
+        OSError: The file cannot be written. The earlier file is unchanged.
     """
-    partial = path.with_name(path.name + PARTIAL)
+    partial = path.with_name(path.name + PARTIAL_SUFFIX)
     try:
         partial.unlink(missing_ok=True)
         with partial.open("xb") as file:  # exclusive: it does not write through a link
-            permissions = _permissions(path)
+            permissions = _read_permissions(path)
             if permissions is not None:
                 os.fchmod(file.fileno(), permissions)
             file.write(content)
@@ -55,7 +58,7 @@ def write_through(path: Path, content: bytes, *, durable: bool = False) -> None:
     write_atomically(target, content, durable=durable)
 
 
-def _permissions(path: Path) -> int | None:
+def _read_permissions(path: Path) -> int | None:
     """Return the permissions of a regular file; None without one."""
     try:
         mode = path.lstat().st_mode
@@ -71,18 +74,19 @@ def replace_atomically(path: Path) -> Iterator[Path]:
     The other path has the same suffix, by which libraries choose a format. If anything is raised, `path` is unchanged
     and nothing is left of the other one.
     """
-    partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix}")
-    _remove(partial)  # a process that was killed may have left it
+    partial = path.with_name(f"{path.stem}{PARTIAL_SUFFIX}{path.suffix}")
+    _remove_if_exists(partial)  # a process that was killed may have left it
     try:
         yield partial
         partial.rename(path)
     except BaseException:
         with contextlib.suppress(OSError):
-            _remove(partial)
+            _remove_if_exists(partial)
         raise
 
 
-def _remove(path: Path) -> None:
+def _remove_if_exists(path: Path) -> None:
+    """Remove a file, or a folder with its contents."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

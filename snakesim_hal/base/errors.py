@@ -44,8 +44,8 @@ class WireError(SnakesimError, ValueError):
         """Make an error.
 
         Args:
-            reason: The short word.
-            detail: The values, and what is allowed.
+            reason: Short word by which rejections are counted.
+            detail: Values that were rejected, and what is allowed.
         """
         super().__init__(f"{reason}: {detail}")
         self.reason = reason
@@ -99,7 +99,7 @@ OUR_PACKAGES = frozenset(
         "snakesim_sim_backend",
     }
 )
-INSTALLED_IN = ("site-packages", "dist-packages")  # the second one is Debian's
+INSTALL_FOLDERS = ("site-packages", "dist-packages")  # the second one is Debian's
 
 
 def describe_exception(error: BaseException, plugin: str = "") -> str:
@@ -112,48 +112,48 @@ def describe_exception(error: BaseException, plugin: str = "") -> str:
     what = type(error).__name__
     if str(error):
         what = f"{what}: {error}"
-    file, line = _line_of_plugin(error, plugin.partition(".")[0])
+    file, line = _find_plugin_line(error, plugin.partition(".")[0])
     return f"raised {what} ({file.rpartition('/')[2]} line {line})"
 
 
-def _line_of_plugin(error: BaseException, package: str) -> tuple[str, int]:
+def _find_plugin_line(error: BaseException, package: str) -> tuple[str, int]:
     """Return the file and the line of plugin code that was executing when an error was raised.
 
     This is the innermost frame of the traceback that is not in SnakeSIM, in an installed package or in the standard
-    library. Otherwise it is the innermost frame of the package, or of all.
+    library. If there is none, it is the innermost frame of the plugin's package, or else the innermost frame.
 
     Args:
-        error: the error with its traceback.
-        package: top-level package of the plugin.
+        error: Error with its traceback.
+        package: Name of the plugin's top-level package, which may be an installed one.
     """
-    import sysconfig  # as in `nearest`
+    import sysconfig  # imported only for an error: `snakesim estop` must start at once
     import traceback
 
-    standard = (f"{sysconfig.get_path('stdlib')}/", "<frozen ")
-    newest_first: list[tuple[str, str, int]] = []  # package, file, line
+    standard_library_prefixes = (f"{sysconfig.get_path('stdlib')}/", "<frozen ")
+    frames: list[tuple[str, str, int]] = []  # package, file and line, innermost frame first
     for frame, line in traceback.walk_tb(error.__traceback__):
         module = str(frame.f_globals.get("__name__", ""))
-        newest_first.insert(0, (module.partition(".")[0], frame.f_code.co_filename, line))
-    for frame_package, file, line in newest_first:
-        is_installed = any(f"/{folder}/" in file for folder in INSTALLED_IN)
-        if frame_package not in OUR_PACKAGES and not is_installed and not file.startswith(standard):
+        frames.insert(0, (module.partition(".")[0], frame.f_code.co_filename, line))
+    for frame_package, file, line in frames:
+        is_installed = any(f"/{folder}/" in file for folder in INSTALL_FOLDERS)
+        if frame_package not in OUR_PACKAGES and not is_installed and not file.startswith(standard_library_prefixes):
             return file, line
-    for frame_package, file, line in newest_first:
+    for frame_package, file, line in frames:
         if frame_package == package:
             return file, line
-    _, file, line = newest_first[0]
+    _, file, line = frames[0]
     return file, line
 
 
-def shorten(text: str, most: int = 120) -> str:
-    """Return a text of a user for quoting in a message: at most `most` characters."""
-    if len(text) <= most:
+def shorten(text: str, max_length: int = 120) -> str:
+    """Return a text for quoting in a message, cut to a maximum number of characters."""
+    if len(text) <= max_length:
         return text
-    return text[: most - 3] + "..."
+    return text[: max_length - 3] + "..."
 
 
 def find_nearest_word(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that a mistyped one may mean; None if no word is near."""
+    """Return the known word that is most similar to a mistyped one, or None if no word is similar enough."""
     import difflib  # imported only for a mistake: `snakesim estop` must start at once
 
     matches = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
@@ -161,6 +161,6 @@ def find_nearest_word(word: str, known: Iterable[str]) -> str | None:
 
 
 def suggest_word(word: str, known: Iterable[str]) -> str:
-    """Return the question for a message, with a space behind it; empty if no known word is near."""
-    close = find_nearest_word(word, known)
-    return f"did you mean `{close}`? " if close else ""
+    """Return "did you mean `WORD`? " for a mistyped word, or an empty text if no known word is similar enough."""
+    nearest_word = find_nearest_word(word, known)
+    return f"did you mean `{nearest_word}`? " if nearest_word else ""

@@ -43,24 +43,24 @@ def get_user_name() -> str:
         return "operator"
 
 
-def python_command(*words: str) -> list[str]:
-    """Return the command line of a child that runs this interpreter: `python_command("-m", "package.module")`.
+def make_python_command(*arguments: str) -> list[str]:
+    """Return the command line of a child that runs this interpreter: `make_python_command("-m", "package.module")`.
 
     With `-P` the child does not search the folder that it runs in for modules. Without it, `python -m` searches that
     folder first, so that a file `random.py` there, even of another user, would replace the module of that name.
-    Every child that is started as Python gets its command line here and its variables from `child_environment`.
+    Every child that is started as Python gets its command line here and its variables from `make_child_environment`.
     """
-    return [sys.executable, "-P", *words]
+    return [sys.executable, "-P", *arguments]
 
 
-def child_environment(*more: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of a child: those of this process, then each of `more`.
+def make_child_environment(*extra_env: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment variables of a child: those of this process, then each of `extra_env`.
 
     `PYTHONSAFEPATH` does for the children of the child what `-P` does for itself. An empty entry of `PYTHONPATH`, as
     in `/opt/mine:$PYTHONPATH`, would stand for the working folder, and is left out.
     """
     variables = dict(os.environ)
-    for mapping in more:
+    for mapping in extra_env:
         variables.update(mapping)
     if SEARCH_PATH in variables:
         folders = variables[SEARCH_PATH].split(os.pathsep)
@@ -69,16 +69,17 @@ def child_environment(*more: Mapping[str, str]) -> dict[str, str]:
     return variables
 
 
-def protect_children() -> None:
+def isolate_children_from_working_folder() -> None:
     """Have every Python child that this process starts from now on ignore modules in the working folder."""
-    os.environ.update(child_environment())
+    os.environ.update(make_child_environment())
 
 
-def die_with_parent(parent_pid: int | None = None) -> None:
+def set_parent_death_signal(parent_pid: int | None = None) -> None:
     """Have the kernel kill this process the moment its parent dies, however it dies.
 
     Args:
-        parent_pid: the parent's process id, passed by the parent. If that process has ended already, exit at once.
+        parent_pid: Process id of the parent, as the parent has passed it on. If that process has ended already, this
+            process exits at once. None omits this check.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
@@ -87,7 +88,7 @@ def die_with_parent(parent_pid: int | None = None) -> None:
         sys.exit(1)
 
 
-def stop_signals() -> tuple[signal.Signals, ...]:
+def list_stop_signals() -> tuple[signal.Signals, ...]:
     """Return the stop signals that this program is to handle: all, but for a closed terminal under `nohup`."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return tuple(number for number in STOP_SIGNALS if not (ignored and number == signal.SIGHUP))
@@ -109,42 +110,43 @@ def restart_process() -> NoReturn:
     os.execv(sys.executable, sys.orig_argv)
 
 
-def on_stop_signal(stop: Callable[[], None]) -> None:
-    """Call `stop` on SIGTERM, SIGINT, and when the terminal is closed, instead of ending at once."""
+def call_on_stop_signals(stop: Callable[[], None]) -> None:
+    """Call a function on SIGTERM, on SIGINT and when the terminal is closed, instead of ending the process at once."""
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         stop()
 
-    for number in stop_signals():
+    for number in list_stop_signals():
         signal.signal(number, handle)
     accept_interrupts()
 
 
 @contextlib.contextmanager
-def stop_signals_raise() -> Iterator[None]:
-    """Raise KeyboardInterrupt in the main thread at the first Ctrl-C, SIGTERM or closed terminal in this context.
+def raise_on_stop_signals() -> Iterator[None]:
+    """Raise KeyboardInterrupt in the main thread at the first stop signal: Ctrl-C, SIGTERM or a closed terminal.
 
-    `with` blocks can then end their workers and remove their files. A second signal ends the process at once.
+    `with` blocks can then end their workers and remove their files. A second signal ends the process at once. The
+    previous handlers are restored at the end of the context.
     """
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        for number in replaced:
+        for number in previous_handlers:
             # A closed terminal sends SIGHUP twice, from the kernel and from the shell: the second one is ignored.
             signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
         raise KeyboardInterrupt
 
-    replaced = {number: signal.getsignal(number) for number in stop_signals()}
-    for number in replaced:
+    previous_handlers = {number: signal.getsignal(number) for number in list_stop_signals()}
+    for number in previous_handlers:
         signal.signal(number, handle)
     try:
         yield
     finally:
-        for number, handler in replaced.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
 def tune_garbage_collector() -> None:
-    """Keep the garbage collector out of the loop: freeze all present objects, and make collections rare."""
+    """Keep the garbage collector out of the loop: freeze all current objects, and make collections rare."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 50, 1000)
@@ -175,8 +177,8 @@ def set_realtime_priority(priority: int) -> str | None:
     return None
 
 
-def drop_priority_after(longest_s: float) -> None:
-    """Have this process give up its priority once it has computed for this long without a pause: it hangs.
+def drop_priority_after(max_busy_s: float) -> None:
+    """Drop the real-time priority of this process once it has computed for so long without a pause that it must hang.
 
     A busy thread with real-time priority starves ordinary processes, until the kernel throttles all real-time
     processes for some 50 ms.
@@ -184,15 +186,15 @@ def drop_priority_after(longest_s: float) -> None:
 
     def drop_priority(_number: int, _frame: FrameType | None) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        print_stderr(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
+        print_stderr(f"real time: priority dropped after computing for {max_busy_s * 1e3:.0f} ms without a pause")
 
     signal.signal(signal.SIGXCPU, drop_priority)
     _, hard_limit_us = resource.getrlimit(resource.RLIMIT_RTTIME)
-    resource.setrlimit(resource.RLIMIT_RTTIME, (round(longest_s * 1e6), hard_limit_us))
+    resource.setrlimit(resource.RLIMIT_RTTIME, (round(max_busy_s * 1e6), hard_limit_us))
 
 
 def lock_memory() -> str | None:
-    """Lock all present and future pages of this process into memory. Returns why it was refused, or None.
+    """Lock all current and future pages of this process into memory. Returns why it was refused, or None.
 
     Pages are locked as they are first touched, so that the unused part of each thread's stack costs nothing. Under a
     limit nothing is locked: the first allocation beyond it would fail in the middle of a run.
@@ -212,13 +214,13 @@ def limit_memory() -> None:
     Otherwise code that allocates without end makes the whole computer swap, until the kernel ends some process. A
     lower limit, as of `ulimit -d`, stays.
     """
-    allowed = max(available_memory(), MIN_MEMORY_LIMIT)
+    allowed = max(read_available_memory(), MIN_MEMORY_LIMIT)
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if soft == resource.RLIM_INFINITY or soft > allowed:
         resource.setrlimit(resource.RLIMIT_DATA, (allowed, hard))
 
 
-def available_memory() -> int:
+def read_available_memory() -> int:
     """Return how many bytes the kernel could give to programs without swapping."""
     for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
         if line.startswith("MemAvailable:"):
@@ -226,12 +228,12 @@ def available_memory() -> int:
     raise OSError("/proc/meminfo has no MemAvailable")
 
 
-def raise_open_files(most: int) -> None:
+def raise_open_file_limit(max_files: int) -> None:
     """Raise this process's limit of open files and connections, as far as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    allowed = most
+    allowed = max_files
     if hard != resource.RLIM_INFINITY:
-        allowed = min(most, hard)
+        allowed = min(max_files, hard)
     if soft != resource.RLIM_INFINITY and soft < allowed:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 

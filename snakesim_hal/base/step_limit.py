@@ -13,9 +13,9 @@ import time
 import traceback
 from typing import Self
 
-WATCH_PERIOD_S = 0.25  # between two checks of the present step
+WATCH_PERIOD_S = 0.25  # between two checks of the current step
 INTERRUPT_AGAIN_S = 2.0  # until a step that has caught the error is interrupted again
-TWO_TIMES = struct.Struct("dd")
+STEP_TIMES_FORMAT = struct.Struct("dd")  # start and deadline of the current step; zeros between steps
 
 
 class StepTooLongError(BaseException):
@@ -23,101 +23,110 @@ class StepTooLongError(BaseException):
 
 
 class SharedStepTimes:
-    """When the present step began, and by when it should have ended, in memory that a forked process shares.
+    """Start time and deadline of the current step, in memory that a forked process shares.
 
     Times are on the monotonic clock.
     """
 
     def __init__(self) -> None:
-        self._memory = mmap.mmap(-1, TWO_TIMES.size)
+        self._memory = mmap.mmap(-1, STEP_TIMES_FORMAT.size)
 
-    def begin(self, now_s: float, due_s: float) -> None:
-        """Note that a step begins."""
-        TWO_TIMES.pack_into(self._memory, 0, now_s, due_s)
+    def record_step_start(self, now_s: float, deadline_s: float) -> None:
+        """Store the start time and the deadline of a step that starts now."""
+        STEP_TIMES_FORMAT.pack_into(self._memory, 0, now_s, deadline_s)
 
-    def end(self) -> None:
-        """Note that no step is going on."""
-        TWO_TIMES.pack_into(self._memory, 0, 0.0, 0.0)
+    def record_step_end(self) -> None:
+        """Store that no step is running."""
+        STEP_TIMES_FORMAT.pack_into(self._memory, 0, 0.0, 0.0)
 
     def read_step_times(self) -> tuple[float, float] | None:
-        """Return when the present step began and when it is due; None between steps."""
-        began_s, due_s = TWO_TIMES.unpack_from(self._memory, 0)
-        if not began_s:
+        """Return the start time and the deadline of the current step, or None between steps."""
+        start_s, deadline_s = STEP_TIMES_FORMAT.unpack_from(self._memory, 0)
+        if not start_s:
             return None
-        return began_s, due_s
+        return start_s, deadline_s
 
 
-class StepLimit:
-    """Limits the steps of a thread: each `with` on this object is one.
+class StepWatchdog:
+    """Watchdog that interrupts a step which takes too long. Each `with` block on this object is one step.
 
-    limit = StepLimit(60.0)
-    with limit:
-        controller.update(view)  # raises StepTooLongError after 60 s
-    limit.close()
+    watchdog = StepWatchdog(60.0)
+    with watchdog:
+        controller.update(observation)  # raises StepTooLongError after 60 s
+    watchdog.close()
     """
 
     def __init__(
-        self, limit_s: float, step_times: SharedStepTimes | None = None, error: type[BaseException] = StepTooLongError
+        self,
+        step_timeout_s: float,
+        step_times: SharedStepTimes | None = None,
+        error_type: type[BaseException] = StepTooLongError,
     ) -> None:
-        """Limit steps to `limit_s` each.
+        """Create a watchdog that interrupts a step which takes too long.
+
+        While steps run, a watcher thread compares their duration with the limit. When a step exceeds it, the watcher
+        raises an exception in the thread of the step.
 
         Args:
-            limit_s: maximum wall time of a step.
-            step_times: shows another process when the present step began.
-            error: the class of what is raised. Two limits that are nested need different classes.
+            step_timeout_s: Maximum wall time of a step.
+            step_times: Shared memory that shows start and deadline of the current step to another process. None if no
+                other process needs to know.
+            error_type: Class of the exception that is raised in a step. Two watchdogs that are nested need different
+                classes.
         """
-        self.limit_s = limit_s
+        self.step_timeout_s = step_timeout_s
         self._step_times = step_times
-        self._error = error
+        self._error_type = error_type
         self._lock = threading.RLock()  # a signal handler may interrupt its own thread while that holds it
         self._closed = threading.Event()
         self._watcher: threading.Thread | None = None
-        # The present step.
-        self._began_s: float | None = None
-        self._thread = 0
-        self._interrupted_s: float | None = None
-        # After `hurry`: when it was called, and how long steps may take from then on.
-        self._hurried_s = 0.0
-        self._grace_s: float | None = None
+        # The current step.
+        self._step_start_time_s: float | None = None  # None between steps
+        self._step_thread_id = 0
+        self._last_interrupt_time_s: float | None = None  # None if the step was not interrupted
+        # Set by `request_shutdown`: when it was called, and how long steps may take from then on.
+        self._shutdown_request_time_s = 0.0
+        self._grace_period_s: float | None = None  # None before the call
 
     def __enter__(self) -> Self:
-        """Begin a step."""
+        """Start a step, and at the first one the watcher thread."""
         if self._watcher is None:
             self._watcher = threading.Thread(target=self._watch, name="step limit", daemon=True)
             self._watcher.start()
         now_s = time.monotonic()
-        self._thread = threading.get_ident()
-        self._interrupted_s = None
-        self._began_s = now_s
+        self._step_thread_id = threading.get_ident()
+        self._last_interrupt_time_s = None
+        self._step_start_time_s = now_s
         if self._step_times is not None:
-            self._step_times.begin(now_s, now_s + self.limit_s)
+            self._step_times.record_step_start(now_s, now_s + self.step_timeout_s)
         return self
 
     def __exit__(self, *_error: object) -> None:
         """End the step; after this nothing is raised for it any more."""
         try:
-            self._end()
-        except self._error:  # raised at the very end
-            self._end()
+            self._end_step()
+        except self._error_type:  # raised at the very end
+            self._end_step()
             raise
 
-    def _end(self) -> None:
+    def _end_step(self) -> None:
+        """End the step, and withdraw an exception that was not raised yet."""
         with self._lock:
-            self._began_s = None
-            if self._interrupted_s is not None:
-                _raise_in(self._thread, None)
+            self._step_start_time_s = None
+            if self._last_interrupt_time_s is not None:
+                _raise_in_thread(self._step_thread_id, None)
         if self._step_times is not None:
-            self._step_times.end()
+            self._step_times.record_step_end()
 
-    def hurry(self, grace_s: float) -> None:
-        """Give the present step and each later one only `grace_s` from now on. A signal handler may call this."""
-        self._hurried_s = time.monotonic()
-        self._grace_s = grace_s
+    def request_shutdown(self, grace_period_s: float) -> None:
+        """Limit the current step and each later one to a grace period from now on. A signal handler may call this."""
+        self._shutdown_request_time_s = time.monotonic()
+        self._grace_period_s = grace_period_s
 
     @property
-    def is_hurried(self) -> bool:
-        """Return whether steps get no more than a grace period."""
-        return self._grace_s is not None
+    def is_shutting_down(self) -> bool:
+        """Return whether steps are limited to the grace period."""
+        return self._grace_period_s is not None
 
     def close(self) -> None:
         """End the thread that watches the steps."""
@@ -129,17 +138,22 @@ class StepLimit:
         """Interrupt steps that take too long, until `close`."""
         while not self._closed.wait(WATCH_PERIOD_S):
             with self._lock:
-                if self._began_s is not None and self._is_due(self._began_s, time.monotonic()):
-                    self._interrupted_s = time.monotonic()
-                    _raise_in(self._thread, self._error)
+                if self._step_start_time_s is not None and self._should_interrupt(
+                    self._step_start_time_s, time.monotonic()
+                ):
+                    self._last_interrupt_time_s = time.monotonic()
+                    _raise_in_thread(self._step_thread_id, self._error_type)
 
-    def _is_due(self, began_s: float, now_s: float) -> bool:
-        """Return whether the present step is to be interrupted now."""
-        if self._interrupted_s is not None:
-            return now_s >= self._interrupted_s + INTERRUPT_AGAIN_S
-        if now_s >= began_s + self.limit_s:
+    def _should_interrupt(self, start_time_s: float, now_s: float) -> bool:
+        """Return whether to interrupt the step that started at this time, for the first time or again."""
+        if self._last_interrupt_time_s is not None:
+            return now_s >= self._last_interrupt_time_s + INTERRUPT_AGAIN_S
+        if now_s >= start_time_s + self.step_timeout_s:
             return True
-        return self._grace_s is not None and now_s >= max(began_s, self._hurried_s) + self._grace_s
+        return (
+            self._grace_period_s is not None
+            and now_s >= max(start_time_s, self._shutdown_request_time_s) + self._grace_period_s
+        )
 
 
 def describe_interrupted_line(error: StepTooLongError) -> str:
@@ -148,7 +162,12 @@ def describe_interrupted_line(error: StepTooLongError) -> str:
     return f"{innermost.name}() ({innermost.filename.rpartition('/')[2]} line {innermost.lineno})"
 
 
-def _raise_in(thread: int, error: type[BaseException] | None) -> None:
-    """Raise an error in a thread as soon as it runs Python code; None withdraws one that was not raised yet."""
-    pending = None if error is None else ctypes.py_object(error)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), pending)
+def _raise_in_thread(thread_id: int, error_type: type[BaseException] | None) -> None:
+    """Raise an exception in another thread as soon as that thread runs Python code.
+
+    Args:
+        thread_id: Identifier of the thread, as `threading.get_ident` returns it.
+        error_type: Class of the exception. None withdraws an exception that was not raised yet.
+    """
+    exception = None if error_type is None else ctypes.py_object(error_type)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread_id), exception)

@@ -44,7 +44,7 @@ def discard_line(_line: str) -> None:
 
 @contextmanager
 def tolerate_failed_output() -> Iterator[None]:
-    """Make failed writes harmless within, because a robot moves: a closed pipe or terminal, a full disk."""
+    """Ignore failed writes to stdout and stderr in this context, such as to a closed pipe, because a robot moves."""
     with redirect_stdout(_FailSafeStream(sys.stdout)), redirect_stderr(_FailSafeStream(sys.stderr)):
         yield
 
@@ -78,7 +78,7 @@ class _FailSafeStream(io.TextIOBase):
 
 
 def discard_output(stream: TextIO) -> None:
-    """Throw away what is printed to a stream from now on, and what is still in its buffer."""
+    """Redirect a stream to /dev/null, including the text that is still in its buffer."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
@@ -96,16 +96,16 @@ def print_stderr(line: str) -> None:
     print(escape_invisible(line), file=sys.stderr, flush=True)
 
 
-def run_tool(tool: str, act: Callable[[], int], *, as_json: bool = False) -> int:
+def run_tool(tool: str, run: Callable[[], int], *, as_json: bool = False) -> int:
     """Run a program and return its exit code. An error is printed: 2 means wrong input, 1 any other error.
 
     Args:
-        tool: name of the program, which its errors begin with.
-        act: the program.
-        as_json: Print an error also as one line of JSON, on stdout.
+        tool: Name of the program, which its errors begin with.
+        run: Function that runs the program, and returns the exit code.
+        as_json: Whether to print an error also as one line of JSON on stdout.
     """
     try:
-        return act()
+        return run()
     except SnakesimError as error:
         report_error(error, tool)
         if as_json:
@@ -130,21 +130,21 @@ def align_columns(columns: Sequence[str], rows: Sequence[Mapping[str, str]]) -> 
         yield "  ".join(cells).rstrip()
 
 
-def overwrite_line(line: str, most: int, before: int) -> int:
+def overwrite_line(line: str, max_length: int, previous_length: int) -> int:
     """Print a line over the previous one, and return its length.
 
     Args:
-        line: the line.
-        most: maximum number of characters; the rest is cut off.
-        before: length of the previous line.
+        line: New line.
+        max_length: Maximum number of characters. The rest is cut off.
+        previous_length: Length of the previous line, which is overwritten.
     """
-    shown = escape_invisible(line)[:most]
-    print("\r" + shown.ljust(before), end="", flush=True)
+    shown = escape_invisible(line)[:max_length]
+    print("\r" + shown.ljust(previous_length), end="", flush=True)
     return len(shown)
 
 
-def overwrite_lines(lines: list[str], before: int) -> int:
-    """Print lines over the `before` lines printed last, cut to the terminal's size, and return their number.
+def overwrite_lines(lines: list[str], previous_count: int) -> int:
+    """Print lines over the lines that were printed last, cut to the terminal's size, and return their number.
 
     It works in raw mode too, as for single keys.
     """
@@ -153,8 +153,8 @@ def overwrite_lines(lines: list[str], before: int) -> int:
     size = shutil.get_terminal_size()
     shown = [escape_invisible(line)[: size.columns - 1] for line in lines[: size.lines - 1]]
     text = ""
-    if before:
-        text = f"\x1b[{before}A"  # moves the cursor up
+    if previous_count:
+        text = f"\x1b[{previous_count}A"  # moves the cursor up
     for line in shown:
         text += f"\r\x1b[K{line}\r\n"  # clears the line and writes it
     text += "\x1b[J"  # clears what is below

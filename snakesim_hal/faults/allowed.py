@@ -10,7 +10,7 @@ from typing import Protocol
 from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import HAL
-from snakesim_hal.model.fault_plan import parse_planned
+from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Query
@@ -30,19 +30,19 @@ class Faults(Protocol):
 
     @property
     def notes(self) -> Sequence[str]:
-        """Return the begin and the end of each fault as texts, with the tick."""
+        """Return the start and the end of each fault as texts, with the tick."""
         ...
 
     def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
-        """Begin and end the faults that are due at a tick, answer requests, and hang if a fault requires it.
+        """Start and end the faults that are due at a tick, answer requests, and hang if a fault requires it.
 
         Args:
-            timestamp_ns: robot time of the tick.
-            arm_session: of the robot's clock; 0: never armed.
-            lifecycle: state of the robot.
+            timestamp_ns: Robot time of the tick.
+            arm_session: Number of the arm session from the robot's clock. 0 if the robot was never armed.
+            lifecycle: Lifecycle state of the robot.
 
         Returns:
-            Planned faults that could not be carried out, with the reason.
+            Texts about planned faults that could not be started or ended since the last call, each with the reason.
         """
         ...
 
@@ -56,23 +56,23 @@ class Faults(Protocol):
 
 
 class NoFaults:
-    """Refuses every request."""
+    """The faults of a part in which fault injection is not allowed: every request is refused."""
 
     active: Sequence[str] = ()
     notes: Sequence[str] = ()
 
     def __init__(self, part: str, config: RunConfig, session: Session) -> None:
-        """Declare the part's key for requests.
+        """Declare the key on which the part receives requests for faults.
 
         Raises:
-            ConfigError: the run plans a fault of this part.
+            ConfigError: The run has a planned fault of this part.
         """
-        if any(injection.part == part for injection in parse_planned(config)):
+        if any(injection.executing_part == part for injection in parse_planned_faults(config)):
             raise ConfigError(
                 f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out", code="injection/not-allowed"
             )
         self._lifecycle: LifecycleState = "disarmed"
-        session.on_query(keys.fault_key(part), self._refuse)
+        session.on_query(keys.fault_key(part), self._refuse_request)
 
     def update(self, _timestamp_ns: int, _arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
         self._lifecycle = lifecycle
@@ -84,19 +84,24 @@ class NoFaults:
     def close(self) -> None:
         """Do nothing: no message is delayed."""
 
-    def _refuse(self, question: Query) -> None:
+    def _refuse_request(self, query: Query) -> None:
         """Refuse a request, in Zenoh's thread."""
-        why = f"fault injection is not allowed: {HOW_TO_ALLOW}"
-        question.reply(Answer(ok=False, reason=why, refusal="not_allowed", lifecycle=self._lifecycle))
+        reason = f"fault injection is not allowed: {HOW_TO_ALLOW}"
+        query.reply(Answer(ok=False, reason=reason, refusal="not_allowed", lifecycle=self._lifecycle))
 
 
 def create_host_faults(config: RunConfig, backend: Backend, session: Session) -> tuple[Backend, Faults]:
-    """Return the backend that the host should use, and the faults of the host.
+    """Return the backend that the host should use, and the object that injects faults into the host.
+
+    Args:
+        config: Run configuration.
+        backend: Backend of the run. If faults are allowed, it is wrapped so that faults of joints can be injected.
+        session: Network session of the host.
 
     Raises:
-        ConfigError: the run plans a fault of the host, and faults are not allowed here.
+        ConfigError: The run has a planned fault of the host, but fault injection is not allowed.
     """
-    if not _allowed(config, backend.describe()):
+    if not _are_faults_allowed(config, backend.describe()):
         return backend, NoFaults(HAL, config, session)
     from snakesim_hal.faults.host_faults import HostFaults
 
@@ -105,26 +110,27 @@ def create_host_faults(config: RunConfig, backend: Backend, session: Session) ->
 
 
 def create_service_faults(
-    name: str, config: RunConfig, session: Session, robot: Description, newest: Callable[[], Clock | None]
+    name: str, config: RunConfig, session: Session, robot: Description, read_newest_clock: Callable[[], Clock | None]
 ) -> Faults:
-    """Return the faults of a service.
+    """Return the object that injects faults into a service, or one that refuses all faults if they are not allowed.
 
     Args:
-        name: of the service.
-        config: of the run.
-        session: of the service.
-        robot: description of the robot.
-        newest: returns the newest clock, also while the service hangs.
+        name: Name of the service.
+        config: Run configuration.
+        session: Network session of the service.
+        robot: Description of the robot.
+        read_newest_clock: Function that returns the newest clock message, also while the service hangs.
 
     Raises:
-        ConfigError: the run plans a fault of this service, and faults are not allowed here.
+        ConfigError: The run has a planned fault of this service, but fault injection is not allowed.
     """
-    if not _allowed(config, robot):
+    if not _are_faults_allowed(config, robot):
         return NoFaults(name, config, session)
     from snakesim_hal.faults.injector import Injector
 
-    return Injector(name, config, session, newest=newest)
+    return Injector(name, config, session, read_newest_clock=read_newest_clock)
 
 
-def _allowed(config: RunConfig, robot: Description) -> bool:
+def _are_faults_allowed(config: RunConfig, robot: Description) -> bool:
+    """Return whether faults may be injected: nothing real moves, or the configuration allows them."""
     return robot.emulated or config.allow_fault_injection

@@ -1,9 +1,10 @@
-"""Wraps any backend, with injected faults of its joints, buses and simulator.
+"""Wraps any backend, to inject faults of its joints, buses and simulator.
 
-The backend comes first: it injects faults more realistically. Other kinds are applied to its samples here, if
-possible, or refused.
+The wrapped backend is asked first, because it injects faults more realistically. A kind of fault that it does not
+support is applied here to its samples if that is possible, or refused.
 """
 
+import math
 import time
 from dataclasses import replace
 
@@ -14,36 +15,45 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState
 
-NO_NUMBER = float("nan")
+# Kinds of faults that are applied to samples here, see `fault_kinds`.
+MUTE = "mute"  # the joint sends nothing: its last state is repeated as invalid, and its age grows
+FREEZE = "freeze"  # the joint repeats its last state as valid, and the age of the state grows
+WRONG_ANGLE = "wrong"  # the measured angle has an offset, which is the amount of the fault
+NAN_ANGLE = "nan"  # the measured angle is NaN
 
 
 class FaultyBackend(Backend):
-    """A backend around another."""
+    """Wraps a backend, and applies injected faults to its samples and its speed."""
 
     def __init__(self, inner: Backend) -> None:
-        """Wrap a backend; its description is read once."""
+        """Wrap a backend, and read its description, which must not change afterwards."""
         self._inner = inner
         self._description = inner.describe()
-        self._active: dict[int, dict[str, Injection]] = {}  # joint index -> kind -> fault applied here
-        self._last: JointState | None = None  # as returned, with the faults
+        # Faults that are applied here: by joint index, then by kind.
+        self._active_faults: dict[int, dict[str, Injection]] = {}
+        self._last_state: JointState | None = None  # as returned, with the faults; None before the first sample
         self._speed_ratio: float | None = None  # of real time, for a slowed simulator; None: not slowed
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault.
+        """Start or end a fault, in the wrapped backend if it supports the kind of fault, otherwise here.
+
+        Args:
+            injection: Fault.
+            begins: True starts the fault, False ends it.
 
         Returns:
-            True.
+            Always True: a fault that is not supported raises an error.
 
         Raises:
-            ConfigError: Neither the backend nor this wrapper can carry it out.
+            ConfigError: Neither the backend nor this wrapper supports this kind of fault.
         """
-        if "host" in injection.about.by:
-            self._slow_down(injection, begins)
+        if "host" in injection.kind_info.executors:
+            self._set_slowdown(injection, begins)
             return True
         if self._inner.inject(injection, begins=begins):
             return True
-        if "samples" in injection.about.by:
-            self._change_samples(injection, begins)
+        if "samples" in injection.kind_info.executors:
+            self._set_sample_fault(injection, begins)
             return True
         raise ConfigError(
             f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}",
@@ -57,9 +67,9 @@ class FaultyBackend(Backend):
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Return the backend's samples, with the active faults applied."""
         samples = self._inner.sample(tick, timestamp_ns)
-        if self._active:
+        if self._active_faults:
             samples = replace(samples, joints=self._apply_faults(samples.joints))
-        self._last = samples.joints
+        self._last_state = samples.joints
         return samples
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
@@ -67,11 +77,11 @@ class FaultyBackend(Backend):
 
     def advance(self) -> None:
         """Advance the backend by a tick. A slowed simulator then waits for the rest of the longer tick."""
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         self._inner.advance()
         if self._speed_ratio is not None:
             duration_s = self._description.period_ns * 1e-9 / self._speed_ratio
-            time.sleep(max(began_s + duration_s - time.monotonic(), 0.0))
+            time.sleep(max(start_s + duration_s - time.monotonic(), 0.0))
 
     def faults(self) -> list[Fault]:
         return self._inner.faults()
@@ -84,7 +94,8 @@ class FaultyBackend(Backend):
 
     # --- faults applied here ---------------------------------------------------------------------------------
 
-    def _slow_down(self, injection: Injection, begins: bool) -> None:
+    def _set_slowdown(self, injection: Injection, begins: bool) -> None:
+        """Start or end a slowdown of the simulator. Raises ConfigError for a backend that is no simulator."""
         if not self._description.emulated:
             raise ConfigError(
                 f"backend {self._description.backend!r} has no simulation that could be slow",
@@ -92,45 +103,55 @@ class FaultyBackend(Backend):
             )
         self._speed_ratio = injection.amount if begins else None
 
-    def _change_samples(self, injection: Injection, begins: bool) -> None:
-        """Begin or end a fault that is applied to the samples of one joint."""
-        joint = injection.number
-        count = len(self._description.joints)
-        if joint >= count:
+    def _set_sample_fault(self, injection: Injection, begins: bool) -> None:
+        """Start or end a fault that is applied to the samples of one joint. Raises ConfigError for a missing joint."""
+        joint_index = injection.target_index
+        joint_count = len(self._description.joints)
+        if joint_index >= joint_count:
             raise ConfigError(
-                f"there is no {injection.target}; this robot has joint_1 to joint_{count}",
+                f"there is no {injection.target}; this robot has joint_1 to joint_{joint_count}",
                 code="injection/unknown-target",
             )
-        kinds = self._active.setdefault(joint, {})
+        faults_by_kind = self._active_faults.setdefault(joint_index, {})
         if begins:
-            kinds[injection.kind] = injection
+            faults_by_kind[injection.kind] = injection
         else:
-            kinds.pop(injection.kind, None)
-        if not kinds:
-            del self._active[joint]
+            faults_by_kind.pop(injection.kind, None)
+        if not faults_by_kind:
+            del self._active_faults[joint_index]
 
     def _apply_faults(self, joints: JointState) -> JointState:
-        """Return a joint state with the active faults of its joints."""
+        """Return a joint state to which the active faults of its joints are applied.
+
+        A joint that is mute or frozen repeats its last state, and the age of that state grows. A mute joint is invalid
+        in addition.
+
+        Args:
+            joints: State as the wrapped backend has measured it.
+        """
         angle_rad = list(joints.angle_rad)
         velocity_rad_s = list(joints.velocity_rad_s)
         torque_nm = list(joints.torque_nm)
         valid = list(joints.valid)
         age_ns = list(joints.age_ns)
-        last = self._last
-        for joint, kinds in self._active.items():
-            repeats_last = "mute" in kinds or "freeze" in kinds
-            if repeats_last and last is not None:
-                angle_rad[joint] = last.angle_rad[joint]
-                velocity_rad_s[joint] = last.velocity_rad_s[joint]
-                torque_nm[joint] = last.torque_nm[joint]
-                valid[joint] = last.valid[joint]
-                age_ns[joint] = last.age_ns[joint] + joints.timestamp_ns - last.timestamp_ns
-            elif "wrong" in kinds:
-                angle_rad[joint] += kinds["wrong"].amount or 0.0
-            if "mute" in kinds:
-                valid[joint] = False
-            if "nan" in kinds:
-                angle_rad[joint] = NO_NUMBER
+        last_state = self._last_state
+        for joint_index, faults_by_kind in self._active_faults.items():
+            repeats_last_state = MUTE in faults_by_kind or FREEZE in faults_by_kind
+            if repeats_last_state and last_state is not None:
+                angle_rad[joint_index] = last_state.angle_rad[joint_index]
+                velocity_rad_s[joint_index] = last_state.velocity_rad_s[joint_index]
+                torque_nm[joint_index] = last_state.torque_nm[joint_index]
+                valid[joint_index] = last_state.valid[joint_index]
+                elapsed_ns = joints.timestamp_ns - last_state.timestamp_ns
+                age_ns[joint_index] = last_state.age_ns[joint_index] + elapsed_ns
+            elif WRONG_ANGLE in faults_by_kind:
+                offset_rad = faults_by_kind[WRONG_ANGLE].amount
+                assert offset_rad is not None, "the injector has filled in the default of the amount"
+                angle_rad[joint_index] += offset_rad
+            if MUTE in faults_by_kind:
+                valid[joint_index] = False
+            if NAN_ANGLE in faults_by_kind:
+                angle_rad[joint_index] = math.nan
         return msgspec.structs.replace(
             joints, angle_rad=angle_rad, velocity_rad_s=velocity_rad_s, torque_nm=torque_nm, valid=valid, age_ns=age_ns
         )

@@ -17,17 +17,18 @@ class HostFaults(Injector):
     """Carries out the injected faults of the host, in the host's thread. Use `backend` instead of the original one."""
 
     def __init__(self, config: RunConfig, backend: Backend, session: Session) -> None:
-        """Wrap the host's backend. Declares the host's key for fault requests."""
+        """Wrap the host's backend, and declare the key on which the host receives requests for faults."""
         self.backend = FaultyBackend(backend)
         self._period_ns = config.period_ns
         self._tick = 0
-        super().__init__(HAL, config, session, carry_out=self.backend.inject)
+        super().__init__(HAL, config, session, apply_fault=self.backend.inject)
 
     def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
-        """Keep the tick for the record, then do what every part does."""
+        """Store the tick for `notes`, then update the faults as in every other part of a run."""
         self._tick = timestamp_ns // self._period_ns
         return super().update(timestamp_ns, arm_session, lifecycle)
 
-    def _note(self, text: str, now_s: float) -> None:
+    def _record_event(self, text: str, now_s: float) -> None:
+        """Add the start or the end of a fault to `notes`, with its tick."""
         if len(self.notes) < MAX_NOTES:
             self.notes.append(f"tick {self._tick}: {text}")

@@ -4,7 +4,7 @@ Every part of a run has one: the host, and each service. Times are robot time, s
 times are relative to the first arming. A part that was restarted while the robot was armed drops its plan.
 
 Threads: the part calls every method from the thread of its loop. Zenoh's thread only puts requests into a queue, which
-`turn` and `idle` read.
+`update` and `answer_requests` read.
 """
 
 import time
@@ -18,8 +18,8 @@ import msgspec
 from snakesim_hal.base.errors import BackendError, ConfigError, WireError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.faults.message_faults import MessageFaults
-from snakesim_hal.model.fault_kinds import Change, Injection, InjectionPlan, check_injection
-from snakesim_hal.model.fault_plan import parse_planned
+from snakesim_hal.model.fault_kinds import FaultTransition, Injection, InjectionPlan, validate_and_complete_injection
+from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Query
@@ -27,31 +27,30 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
 
-HALF_A_NANOSECOND = 0.5e-9
+TIME_TOLERANCE_S = 0.5e-9  # half of the resolution of timestamps
+MAX_REASON_LENGTH = 500  # characters, as the message Answer allows
 
-NEVER_S = inf
 
-
-class CarryOut(Protocol):
-    """Begins or ends a fault. Raises ConfigError if that is not possible."""
+class ApplyFault(Protocol):
+    """Starts or ends a fault. Raises ConfigError if that is not possible."""
 
     def __call__(self, injection: Injection, *, begins: bool) -> object: ...
 
 
-def no_action(injection: Injection, *, begins: bool) -> None:
+def refuse_fault(injection: Injection, *, begins: bool) -> None:
     """Refuse a fault, in a part that supports only message faults and `hang`."""
     raise ConfigError(
-        f"{injection.part} cannot do {injection.kind} to {injection.target}", code="injection/not-supported"
+        f"{injection.executing_part} cannot do {injection.kind} to {injection.target}", code="injection/not-supported"
     )
 
 
-def print_note(text: str, now_s: float) -> None:
-    """Write the begin or the end of a fault to the log, in a part that has no other record."""
+def print_event(text: str, now_s: float) -> None:
+    """Print the start or the end of a fault to stderr, in a part of the run that has no other log."""
     print_stderr(f"{now_s:.3f} s: injected: {text}")
 
 
 class Injector:
-    """The injector of one part. Call `turn` once in every cycle of the part's loop."""
+    """Injects the planned and requested faults of one part of a run. Call `update` once in every cycle of its loop."""
 
     def __init__(
         self,
@@ -59,216 +58,232 @@ class Injector:
         config: RunConfig,
         session: Session,
         *,
-        carry_out: CarryOut = no_action,
-        newest: Callable[[], Clock | None] | None = None,
-        note: Callable[[str, float], None] = print_note,
+        apply_fault: ApplyFault = refuse_fault,
+        read_newest_clock: Callable[[], Clock | None] | None = None,
+        report_event: Callable[[str, float], None] = print_event,
     ) -> None:
-        """Declare the part's key for requests.
+        """Read the planned faults of this part, and declare the key on which it receives requests for faults.
 
         Args:
-            part: name of the service, or of the host.
-            config: of the run, with its planned faults.
-            session: of the part; its messages can be disturbed.
-            carry_out: begins and ends faults that concern neither messages nor the process.
-            newest: returns the newest clock, also while this part hangs; None: this part is the clock, and wall time
-                is used.
-            note: is called with each begin and end, and its time in s.
+            part: Name of the part of the run: a service, or the host.
+            config: Run configuration with the planned faults.
+            session: Network session of the part. Message faults are applied to what it publishes.
+            apply_fault: Function that starts or ends a fault that concerns neither messages nor the process. The
+                default refuses such faults.
+            read_newest_clock: Function that returns the newest clock message, also while this part hangs. None in the
+                host, which publishes the clock: while the host hangs, its robot time follows the wall clock.
+            report_event: Function that is called with a text and the robot time in s when a fault starts or ends.
         """
-        # What carries out and reports faults.
+        # What applies and reports faults.
         self.part = part
-        self._messages = MessageFaults(session, config.seed)
-        self._carry_out = carry_out
-        self._newest = newest
-        self._print_note = note
-        self.notes: list[str] = []  # the host's have their tick
+        self._message_faults = MessageFaults(session, config.seed)
+        self._apply_fault = apply_fault
+        self._read_newest_clock = read_newest_clock
+        self._report_event = report_event
+        self.notes: list[str] = []  # starts and ends of faults; only the host fills it
         # Faults.
-        self._planned = InjectionPlan(injection for injection in parse_planned(config) if injection.part == part)
-        self._refused: list[str] = []  # planned, and not possible; reported by the next `turn`
-        self._ends: list[tuple[float, Injection]] = []  # robot time in s at which each requested fault ends
-        self._active: dict[tuple[str, str], Injection] = {}  # by kind and target
+        self._plan = InjectionPlan(
+            injection for injection in parse_planned_faults(config) if injection.executing_part == part
+        )
+        self._new_refusals: list[str] = []  # planned faults that are not possible; the next `update` returns them
+        self._scheduled_ends: list[tuple[float, Injection]] = []  # end in robot time (s), and the requested fault
+        self._active_faults: dict[tuple[str, str], Injection] = {}  # by kind and target
         # Requests.
         self._decoder = Decoder(FaultRequest)
-        self._questions: SimpleQueue[Query] = SimpleQueue()
+        self._request_queue: SimpleQueue[Query] = SimpleQueue()
         # The robot.
         self._first_armed_s: float | None = None
         self._lifecycle: LifecycleState = "disarmed"
         self._has_ticked = False
-        session.on_query(keys.fault_key(part), self._questions.put)
+        session.on_query(keys.fault_key(part), self._request_queue.put)
 
     @property
     def active(self) -> list[str]:
         """Return the active injected faults as texts."""
-        return [str(injection) for injection in self._active.values()]
+        return [str(injection) for injection in self._active_faults.values()]
 
     def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
-        """Begin and end the faults that are due at a tick, answer requests, and hang if a fault requires it.
+        """Start and end the faults that are due at a tick, answer requests, and hang if a fault requires it.
 
         Args:
-            timestamp_ns: robot time of the tick.
-            arm_session: of the robot's clock; 0: never armed.
-            lifecycle: state of the robot.
+            timestamp_ns: Robot time of the tick.
+            arm_session: Number of the arm session from the robot's clock. 0 if the robot was never armed.
+            lifecycle: Lifecycle state of the robot.
 
         Returns:
-            Planned faults that could not be carried out, with the reason.
+            Texts about planned faults that could not be started or ended since the last call, each with the reason.
         """
         now_s = timestamp_ns / 1e9
         self._lifecycle = lifecycle
         if arm_session and self._first_armed_s is None:
             self._first_armed_s = now_s
-            if not self._has_ticked:  # restarted while the robot was armed
-                self._planned = InjectionPlan()
+            if not self._has_ticked:  # this part was restarted while the robot was armed: the first arming is unknown
+                self._plan = InjectionPlan()
         self._has_ticked = True
-        self._apply_changes(now_s)
-        if self._hangs():
-            self._hang(now_s)
-        refused = self._refused
-        self._refused = []
-        return refused
+        self._apply_due_transitions(now_s)
+        if self._should_hang():
+            self._hang_until_ended(now_s)
+        refusals = self._new_refusals
+        self._new_refusals = []
+        return refusals
 
     def answer_requests(self) -> None:
         """Answer requests while no tick comes."""
-        self._answer_all(self._newest_s(0.0))
+        self._answer_queued_requests(self._read_newest_time_s(0.0))
 
     def close(self) -> None:
         """Drop delayed messages."""
-        self._messages.close()
+        self._message_faults.close()
 
-    def _note(self, text: str, now_s: float) -> None:
-        """Report the begin or the end of a fault."""
-        self._print_note(text, now_s)
+    def _record_event(self, text: str, now_s: float) -> None:
+        """Report the start or the end of a fault. A subclass may keep it instead."""
+        self._report_event(text, now_s)
 
     # --- time ------------------------------------------------------------------------------------------------
 
-    def _newest_s(self, default_s: float) -> float:
-        """Return the robot time of the newest clock, or the default without one."""
-        clock = None if self._newest is None else self._newest()
+    def _read_newest_time_s(self, default_s: float) -> float:
+        """Return the robot time of the newest clock message, or the default if there is no such message."""
+        clock = None if self._read_newest_clock is None else self._read_newest_clock()
         if clock is None:
             return default_s
         return clock.timestamp_ns / 1e9
 
-    def _since_arming_s(self, now_s: float) -> float:
+    def _compute_time_since_arming_s(self, now_s: float) -> float:
+        """Return the time since the first arming; 0 before it."""
         if self._first_armed_s is None:
             return 0.0
         return now_s - self._first_armed_s
 
-    def _apply_changes(self, now_s: float) -> None:
-        """Answer requests, then end requested faults and begin or end planned ones that are due."""
-        if not self._questions.empty():
-            self._answer_all(now_s)
-        soon_s = now_s + HALF_A_NANOSECOND  # sums of times are not exact
-        if self._ends:
-            due = [injection for end_s, injection in self._ends if end_s <= soon_s]
-            self._ends = [(end_s, injection) for end_s, injection in self._ends if end_s > soon_s]
-            self._carry_out_all([Change(injection.end_s, injection, False) for injection in due], now_s)
-        if self._first_armed_s is not None and self._planned.next_s() <= soon_s - self._first_armed_s:
-            self._carry_out_all(self._planned.until(soon_s - self._first_armed_s), now_s)
+    def _apply_due_transitions(self, now_s: float) -> None:
+        """Answer queued requests, then end requested faults and start or end planned faults that are due."""
+        if not self._request_queue.empty():
+            self._answer_queued_requests(now_s)
+        latest_s = now_s + TIME_TOLERANCE_S  # sums of times are not exact
+        if self._scheduled_ends:
+            due = [injection for end_s, injection in self._scheduled_ends if end_s <= latest_s]
+            self._scheduled_ends = [(end_s, injection) for end_s, injection in self._scheduled_ends if end_s > latest_s]
+            self._apply_transitions([FaultTransition(injection.end_s, injection, False) for injection in due], now_s)
+        if self._first_armed_s is not None and self._plan.next_transition_s() <= latest_s - self._first_armed_s:
+            self._apply_transitions(self._plan.pop_due_transitions(latest_s - self._first_armed_s), now_s)
 
-    def _carry_out_all(self, changes: list[Change], now_s: float) -> None:
-        for change in changes:
+    def _apply_transitions(self, transitions: list[FaultTransition], now_s: float) -> None:
+        """Start or end faults. A fault that is refused is reported, and `update` returns it."""
+        for transition in transitions:
             try:
-                if change.begins:
-                    self._begin(change.injection, now_s)
+                if transition.is_start:
+                    self._start_fault(transition.injection, now_s)
                 else:
-                    self._end(change.injection, now_s)
+                    self._end_fault(transition.injection, now_s)
             except (ConfigError, BackendError) as error:
-                refusal = f"{change.injection} is refused: {error}"
-                self._note(refusal, now_s)
-                self._refused.append(refusal)
+                refusal = f"{transition.injection} is refused: {error}"
+                self._record_event(refusal, now_s)
+                self._new_refusals.append(refusal)
 
     # --- requests --------------------------------------------------------------------------------------------
 
-    def _answer_all(self, now_s: float) -> None:
+    def _answer_queued_requests(self, now_s: float) -> None:
+        """Handle all queued requests, and reply to each."""
         while True:
             try:
-                question = self._questions.get_nowait()
+                query = self._request_queue.get_nowait()
             except Empty:
                 return
-            answer = self._answer_question(question, now_s)
-            question.reply(msgspec.structs.replace(answer, lifecycle=self._lifecycle))
+            answer = self._handle_query(query, now_s)
+            query.reply(msgspec.structs.replace(answer, lifecycle=self._lifecycle))
 
-    def _answer_question(self, question: Query, now_s: float) -> Answer:
-        """Decode a request and carry it out; every error becomes a refusal."""
+    def _handle_query(self, query: Query, now_s: float) -> Answer:
+        """Decode a request, start or end its fault, and return the answer. Every error becomes a refusal."""
         try:
-            request = self._decoder.decode(question.payload, question.encoding)
-            return self._carry_out_request(request, now_s)
+            request = self._decoder.decode(query.payload, query.encoding)
+            return self._apply_request(request, now_s)
         except WireError as error:
-            return _refuse(str(error), refusal=error.reason)
+            return _make_refusal(str(error), refusal=error.reason)
         except (ConfigError, BackendError) as error:
-            return _refuse(str(error), refusal="cannot")
+            return _make_refusal(str(error), refusal="cannot")
 
-    def _carry_out_request(self, request: FaultRequest, now_s: float) -> Answer:
-        """Begin or end the requested fault.
+    def _apply_request(self, request: FaultRequest, now_s: float) -> Answer:
+        """Start or end the requested fault, and schedule its end if the request has a duration.
+
+        Args:
+            request: Request with kind, target, amount and duration of the fault.
+            now_s: Current robot time.
+
+        Returns:
+            The answer. It refuses a fault that another part of the run carries out, and the end of a fault that is not
+            active.
 
         Raises:
-            ConfigError: the request is not valid, or cannot be carried out here.
+            ConfigError: The request is not valid, or this part cannot inject the fault.
         """
-        start_s = self._since_arming_s(now_s)
-        duration_s = NEVER_S if request.for_s is None else request.for_s
-        injection = check_injection(
+        start_s = self._compute_time_since_arming_s(now_s)
+        duration_s = inf if request.for_s is None else request.for_s
+        injection = validate_and_complete_injection(
             Injection(request.kind, request.target, start_s, start_s + duration_s, request.amount)
         )
-        name = f"{injection.kind} of {injection.target}"
-        if injection.part != self.part:
-            return _refuse(f"{name} is carried out by {injection.part}", refusal="wrong_part")
+        fault_name = f"{injection.kind} of {injection.target}"
+        if injection.executing_part != self.part:
+            return _make_refusal(f"{fault_name} is carried out by {injection.executing_part}", refusal="wrong_part")
         if request.end:
-            return self._end_on_request(injection, now_s)
-        self._begin(injection, now_s)
-        if duration_s != NEVER_S and not injection.about.once:
-            self._ends.append((now_s + duration_s, injection))
-        return Answer(ok=True, reason=f"{name} has begun, at {now_s:.3f} s of robot time")
+            return self._end_requested_fault(injection, now_s)
+        self._start_fault(injection, now_s)
+        if duration_s != inf and not injection.kind_info.is_instantaneous:
+            self._scheduled_ends.append((now_s + duration_s, injection))
+        return Answer(ok=True, reason=f"{fault_name} has begun, at {now_s:.3f} s of robot time")
 
-    def _end_on_request(self, injection: Injection, now_s: float) -> Answer:
-        name = f"{injection.kind} of {injection.target}"
-        active = self._active.get((injection.kind, injection.target))
+    def _end_requested_fault(self, injection: Injection, now_s: float) -> Answer:
+        """End the active fault of this kind and target, or return a refusal if there is none."""
+        fault_name = f"{injection.kind} of {injection.target}"
+        active = self._active_faults.get((injection.kind, injection.target))
         if active is None:
-            names = ", ".join(self.active) or "nothing"
-            return _refuse(f"{name} is not active; active: {names}", refusal="wrong_state")
-        self._end(active, now_s)
-        return Answer(ok=True, reason=f"{name} has ended")
+            active_names = ", ".join(self.active) or "nothing"
+            return _make_refusal(f"{fault_name} is not active; active: {active_names}", refusal="wrong_state")
+        self._end_fault(active, now_s)
+        return Answer(ok=True, reason=f"{fault_name} has ended")
 
     # --- faults ----------------------------------------------------------------------------------------------
 
-    def _begin(self, injection: Injection, now_s: float) -> None:
+    def _start_fault(self, injection: Injection, now_s: float) -> None:
+        """Start a fault and report it. Raises ConfigError or BackendError if it is not possible."""
         match injection.target_type:
             case "key":
-                self._messages.begin(injection)
+                self._message_faults.begin(injection)
             case "process":
-                pass  # `turn` hangs while the fault is active
+                pass  # `update` hangs while the fault is active
             case _:
-                self._carry_out(injection, begins=True)
-        if injection.about.once:
-            self._note(f"{injection} happens", now_s)
+                self._apply_fault(injection, begins=True)
+        if injection.kind_info.is_instantaneous:
+            self._record_event(f"{injection} happens", now_s)
         else:
-            self._active[injection.kind, injection.target] = injection
-            self._note(f"{injection} begins", now_s)
+            self._active_faults[injection.kind, injection.target] = injection
+            self._record_event(f"{injection} begins", now_s)
 
-    def _end(self, injection: Injection, now_s: float) -> None:
-        """End a fault, unless a newer one of the same kind has replaced it, or a request has ended it."""
-        name = injection.kind, injection.target
-        if self._active.get(name) is not injection:
+    def _end_fault(self, injection: Injection, now_s: float) -> None:
+        """End a fault and report it, unless a newer fault has replaced it, or a request has ended it."""
+        fault_key = injection.kind, injection.target
+        if self._active_faults.get(fault_key) is not injection:
             return
-        del self._active[name]
+        del self._active_faults[fault_key]
         match injection.target_type:
             case "key":
-                self._messages.end(injection)
+                self._message_faults.end(injection)
             case "process":
                 pass
             case _:
-                self._carry_out(injection, begins=False)
-        self._note(f"{injection} ends", now_s)
+                self._apply_fault(injection, begins=False)
+        self._record_event(f"{injection} ends", now_s)
 
-    def _hangs(self) -> bool:
-        return any(kind == "hang" for kind, _ in self._active)
+    def _should_hang(self) -> bool:
+        return any(kind == "hang" for kind, _ in self._active_faults)
 
-    def _hang(self, began_s: float) -> None:
-        """Keep the interpreter busy. Only the planned end, or a request, ends it."""
-        began_monotonic_s = time.monotonic()
-        while self._hangs():
-            wall_s = began_s + time.monotonic() - began_monotonic_s
-            now_s = wall_s if self._newest is None else self._newest_s(began_s)
-            self._apply_changes(now_s)
+    def _hang_until_ended(self, start_s: float) -> None:
+        """Keep the interpreter busy until the planned end of the fault, or until a request ends it."""
+        start_monotonic_s = time.monotonic()
+        while self._should_hang():
+            wall_time_s = start_s + time.monotonic() - start_monotonic_s
+            now_s = wall_time_s if self._read_newest_clock is None else self._read_newest_time_s(start_s)
+            self._apply_due_transitions(now_s)
 
 
-def _refuse(reason: str, *, refusal: str) -> Answer:
-    """Return a refusal, with its text and its code."""
-    return Answer(ok=False, reason=reason[:500], refusal=refusal)
+def _make_refusal(reason: str, *, refusal: str) -> Answer:
+    """Return the answer that refuses a request, with the reason as a text and as a code."""
+    return Answer(ok=False, reason=reason[:MAX_REASON_LENGTH], refusal=refusal)

@@ -15,24 +15,24 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.atomic_write import write_atomically
-from snakesim_hal.host.outbox import Sender
+from snakesim_hal.host.outbox import SerialWorker
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.safety.cables import TURN_RAD, CableJoint, Cables
+from snakesim_hal.safety.cables import REVOLUTION_RAD, CableJoint, CableTracker
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description, JointState
 
-CABLES = "cables.json"
-FRESH_S = 3600.0  # maximum age of `cable_unwound` in a robot file, for a host that has no stored angle
-AHEAD_S = 60.0  # by which the clock of the computer that declared it may be ahead
-END_STOP_RAD = 0.1  # minimum part of a revolution that end stops take
+CABLE_FILENAME = "cables.json"
+MAX_DECLARATION_AGE_S = 3600.0  # maximum age of `cable_unwound` in a robot file, for a host that has no stored angle
+MAX_CLOCK_SKEW_S = 60.0  # by which the clock of the computer that declared it may be ahead
+MIN_END_STOP_RAD = 0.1  # minimum part of a revolution that end stops take
 WAY_OUT = (
     "with its cable unwound and the robot straight, `snakesim robot calibrate zero`, then restart the host within an "
     "hour"
 )
 
-NO_STOPS = (
+NO_END_STOPS_MESSAGE = (
     "its limits of {:.3f} to {:.3f} rad leave no room for end stops: give `cable_turns`, that its cable bears to "
-    f"either side, or limits that are {END_STOP_RAD:g} rad less than a turn apart"
+    f"either side, or limits that are {MIN_END_STOP_RAD:g} rad less than a turn apart"
 )
 
 
@@ -48,66 +48,70 @@ class CableFile:
     """The file of one robot. `cables` counts the angles."""
 
     def __init__(self, folder: Path, joints: Sequence[Joint], robot: Description, now_s: float) -> None:
-        """Read the stored angles of the joints with cables, and continue to count from them.
+        """Read the stored angles of the joints with cables, and start to count from them.
 
         Args:
-            folder: folder of the robot's state, with the cable file.
-            joints: the joints of the robot file.
-            robot: description of the robot, with the same joints in the same order.
-            now_s: wall time in s since the epoch.
+            folder: Folder of the robot's state, with the cable file.
+            joints: Joints of the robot file.
+            robot: Description of the robot, with the same joints in the same order.
+            now_s: Wall time in s since the epoch.
         """
-        self._path = folder / CABLES
-        self._owners: dict[str, tuple[str, str]] = {}  # joint name -> drive, `cable_unwound`
+        self._path = folder / CABLE_FILENAME
+        # Joint name -> its drive with sign and zero, and the time at which its cable was declared unwound.
+        self._drive_by_joint: dict[str, tuple[str, str]] = {}
         cable_joints: list[CableJoint] = []
-        seen_rad: dict[str, float] = {}
-        unknown: dict[str, str] = {}
-        stored_angles = self._read()
+        last_angles_rad: dict[str, float] = {}
+        unknown_reasons: dict[str, str] = {}
+        stored_cables = self._read()
         for i, joint in enumerate(joints):
-            turns = joint.limits.cable_turns
-            if turns is None:
-                if _goes_round(joint):
-                    unknown[joint.name] = NO_STOPS.format(joint.limits.lower_rad, joint.limits.upper_rad)
+            cable_turns = joint.limits.cable_turns
+            if cable_turns is None:
+                if _lacks_end_stop_room(joint):
+                    limits = joint.limits
+                    unknown_reasons[joint.name] = NO_END_STOPS_MESSAGE.format(limits.lower_rad, limits.upper_rad)
                 continue
             described = robot.joints[i]
-            cable_joints.append(CableJoint(joint.name, i, described.angle_min_rad, described.angle_max_rad, turns))
-            owner = f"{described.serial} {joint.drive.sign:+d} {joint.drive.zero_rad:.6g}".strip()
-            self._owners[joint.name] = (owner, joint.limits.cable_unwound)
-            angle_rad = _find_angle(stored_angles, joint, owner, now_s)
+            cable_joints.append(
+                CableJoint(joint.name, i, described.angle_min_rad, described.angle_max_rad, cable_turns)
+            )
+            drive = f"{described.serial} {joint.drive.sign:+d} {joint.drive.zero_rad:.6g}".strip()
+            self._drive_by_joint[joint.name] = (drive, joint.limits.cable_unwound)
+            angle_rad = _find_counted_angle(stored_cables, joint, drive, now_s)
             if isinstance(angle_rad, str):
                 reason = angle_rad
-                unknown[joint.name] = f"how far its cable is wound is not known: {reason}; {WAY_OUT}"
+                unknown_reasons[joint.name] = f"how far its cable is wound is not known: {reason}; {WAY_OUT}"
             else:
-                seen_rad[joint.name] = angle_rad
-        self.cables = Cables(cable_joints, seen_rad, unknown)
-        self._writer = Sender("cables")
+                last_angles_rad[joint.name] = angle_rad
+        self.tracker = CableTracker(cable_joints, last_angles_rad, unknown_reasons)
+        self._writer = SerialWorker("cables")
 
     def update(self, joints: JointState) -> None:
-        """Count on with a joint state, and store the angles when that is due."""
-        self.cables.follow(joints)
-        self._keep(self.cables.take_angles_to_save())
+        """Update the counted angles from a joint state, and store them if a joint has turned far enough."""
+        self.tracker.update_angles(joints)
+        self._queue_writing(self.tracker.pop_angles_to_save())
 
     def close(self) -> None:
-        """Store the present angles, and wait for the disk unless it hangs."""
-        self._keep(self.cables.take_angles_to_save(all_of_it=True))
+        """Store the current angles, and wait for the disk unless it hangs."""
+        self._queue_writing(self.tracker.pop_angles_to_save(should_force=True))
         self._writer.close()
 
-    def _keep(self, angles_rad: dict[str, float] | None) -> None:
+    def _queue_writing(self, angles_rad: dict[str, float] | None) -> None:
         if angles_rad is not None:
-            self._writer.queue(partial(self._write, angles_rad))
+            self._writer.submit(partial(self._write, angles_rad))
 
     def _write(self, angles_rad: dict[str, float]) -> None:
         """Write the file, in the `Sender` thread."""
         content: dict[str, StoredCable] = {}
-        for name, (drive, unwound) in self._owners.items():
+        for name, (drive, unwound) in self._drive_by_joint.items():
             angle_rad = angles_rad.get(name)
             if angle_rad is not None:
                 content[name] = StoredCable(angle_rad=round(angle_rad, 4), drive=drive, unwound=unwound)
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, msgspec.json.encode(content), durable=True)
-            self.cables.save_problem = ""
+            self.tracker.save_problem = ""
         except OSError as error:
-            self.cables.save_problem = f"{self._path}: {error.strerror}: the turns of its joints would be lost"
+            self.tracker.save_problem = f"{self._path}: {error.strerror}: the turns of its joints would be lost"
 
     def _read(self) -> Mapping[str, StoredCable] | str:
         """Return the stored joints by name, or the reason why there are none."""
@@ -120,49 +124,51 @@ class CableFile:
 
 
 def open_cable_file(folder: Path, joints: Sequence[Joint], robot: Description) -> CableFile | None:
-    """Return the file of a robot; None if it has no joints without end stops, or if nothing real moves."""
-    if robot.emulated or all(joint.limits.cable_turns is None and not _goes_round(joint) for joint in joints):
+    """Return the cable file of a robot; None if it is emulated, or if each of its joints has end stops."""
+    if robot.emulated or all(joint.limits.cable_turns is None and not _lacks_end_stop_room(joint) for joint in joints):
         return None
     return CableFile(folder, joints, robot, time.time())
 
 
-def _goes_round(joint: Joint) -> bool:
+def _lacks_end_stop_room(joint: Joint) -> bool:
     """Return whether a joint's limits leave no room for end stops within a revolution."""
-    return joint.limits.upper_rad - joint.limits.lower_rad > TURN_RAD - END_STOP_RAD
+    return joint.limits.upper_rad - joint.limits.lower_rad > REVOLUTION_RAD - MIN_END_STOP_RAD
 
 
-def _find_angle(stored_cables: Mapping[str, StoredCable] | str, joint: Joint, drive: str, now_s: float) -> float | str:
-    """Return the angle that a joint has, counted over restarts of the host.
+def _find_counted_angle(
+    stored_cables: Mapping[str, StoredCable] | str, joint: Joint, drive: str, now_s: float
+) -> float | str:
+    """Return the last known angle of a joint, counted over restarts of the host.
 
-    It is the stored angle if that belongs to the same drive. Otherwise it is 0, if a person has just declared in the
-    robot file that the cable is unwound.
+    It is the stored angle if that belongs to the same drive. Otherwise it is 0 if a person has declared within the last
+    hour, in the robot file, that the cable is unwound.
 
     Args:
-        stored_cables: by name of the joint; or the reason why the file could not be read.
-        joint: the joint in the robot file.
-        drive: the drive that the joint has now, with its sign and zero.
-        now_s: wall time in s since the epoch.
+        stored_cables: Stored state of each joint by name, or the reason why the file could not be read.
+        joint: Joint in the robot file.
+        drive: Serial number, sign and zero of the joint's drive now.
+        now_s: Wall time in s since the epoch.
 
     Returns:
         The angle in rad, or the reason why it is not known.
     """
-    declared = joint.limits.cable_unwound
+    declaration_time = joint.limits.cable_unwound
     if isinstance(stored_cables, str):
         reason = stored_cables
     else:
         stored = stored_cables.get(joint.name)
         if stored is None:
             reason = "no host has stored it"
-        elif stored.drive == drive and stored.unwound == declared:
+        elif stored.drive == drive and stored.unwound == declaration_time:
             return stored.angle_rad
         else:
             reason = f"the stored angle is of another drive, sign or zero ({stored.drive}, now {drive})"
-    if not declared:
+    if not declaration_time:
         return reason
     try:
-        age_s = now_s - datetime.fromisoformat(declared).timestamp()
+        age_s = now_s - datetime.fromisoformat(declaration_time).timestamp()
     except ValueError:
-        return f"{reason}, and `cable_unwound` = {declared!r} is no time such as 2026-11-25T02:40:12+00:00"
-    if -AHEAD_S <= age_s <= FRESH_S:
+        return f"{reason}, and `cable_unwound` = {declaration_time!r} is no time such as 2026-11-25T02:40:12+00:00"
+    if -MAX_CLOCK_SKEW_S <= age_s <= MAX_DECLARATION_AGE_S:
         return 0.0
-    return f"{reason}, and it was declared unwound at {declared}, {age_s / 3600:.1f} h ago"
+    return f"{reason}, and it was declared unwound at {declaration_time}, {age_s / 3600:.1f} h ago"

@@ -4,10 +4,10 @@ The HAL host, the environments and the contract suite all drive a robot through 
 calls in the same order in each of them. Once in every tick, the caller
 
 1. reads the sensors: `samples = cycle.sample(tick, timestamp_ns)`,
-2. lets the safety core judge them: `cycle.observe(samples, now_ns)`,
-3. offers the commands that have arrived: `cycle.safety.offer_command(...)`,
-4. lets the safety core decide: `decision = cycle.decide(now_ns, tick)`,
-5. hands the setpoints to the motors: `cycle.enact(decision)`,
+2. passes them to the safety core: `cycle.process_samples(samples, now_ns)`,
+3. passes the commands that have arrived: `cycle.safety.process_command(...)`,
+4. computes the setpoints: `output = cycle.compute_setpoints(now_ns, tick)`,
+5. applies the setpoints to the motors: `cycle.enact(output)`,
 6. lets one control period pass: `cycle.advance()`.
 
 Every step may raise BackendError. The caller decides what follows from it.
@@ -16,7 +16,7 @@ Every step may raise BackendError. The caller decides what follows from it.
 from typing import Generic, Protocol, TypeVar
 
 from snakesim_hal.backend import Backend, Samples
-from snakesim_hal.safety.authority import TickDecision
+from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Power
 
@@ -29,28 +29,28 @@ class SafetyCore(Protocol):
         """Return the lifecycle state."""
         ...
 
-    def observe(self, joints: JointState, now_ns: int) -> None:
-        """Take the newest joint state."""
+    def observe_joints(self, joints: JointState, now_ns: int) -> None:
+        """Process the newest joint state."""
         ...
 
-    def observe_obstacles(self, obstacles: list[str]) -> None:
-        """Take the reasons of the backend why the robot cannot be armed now."""
+    def set_backend_obstacles(self, obstacles: list[str]) -> None:
+        """Process the reasons of the backend why the robot cannot be armed now."""
         ...
 
     def observe_power(self, power: Power, now_ns: int) -> None:
-        """Take the newest power sample."""
+        """Process the newest power sample."""
         ...
 
-    def check_deadlines(self, now_ns: int, tick: int) -> None:
-        """Turn an expired lease, an implausible joint state and a power fault into faults."""
+    def latch_faults_and_expire_lease(self, now_ns: int, tick: int) -> None:
+        """Latch an expired lease, an implausible joint state and a power fault; free an expired lease."""
         ...
 
-    def decide(self, up_to: int | None = None) -> TickDecision:
+    def compute_setpoints(self, max_tick: int | None = None) -> TickOutput:
         """Return the setpoints of the next period."""
         ...
 
-    def fault(self, fault: Fault) -> None:
-        """Take a fault that the backend has reported."""
+    def latch_fault(self, fault: Fault) -> None:
+        """Latch a fault that the backend has reported."""
         ...
 
 
@@ -68,38 +68,38 @@ class ControlCycle(Generic[SafetyCoreT]):
         """Read every sensor that is due at this tick."""
         return self.backend.sample(tick, timestamp_ns)
 
-    def observe(self, samples: Samples, now_ns: int) -> None:
-        """Let the safety core judge the samples.
+    def process_samples(self, samples: Samples, now_ns: int) -> None:
+        """Pass the joint state, the power sample and the backend's obstacles to arming to the safety core.
 
         Args:
-            samples: The samples of this tick.
-            now_ns: Safety time, in which leases and ages count.
+            samples: Samples of this tick.
+            now_ns: Safety time in ns, in which leases and ages are measured.
         """
-        self.safety.observe(samples.joints, now_ns)
-        self.safety.observe_obstacles(self.backend.list_arming_obstacles())
-        power = samples.others.get(keys.POWER)
+        self.safety.observe_joints(samples.joints, now_ns)
+        self.safety.set_backend_obstacles(self.backend.list_arming_obstacles())
+        power = samples.by_key.get(keys.POWER)
         if isinstance(power, Power):
             self.safety.observe_power(power, now_ns)
 
-    def decide(self, now_ns: int, tick: int, newest_command_tick: int | None = None) -> TickDecision:
-        """Return the setpoints of the next period.
+    def compute_setpoints(self, now_ns: int, tick: int, newest_command_tick: int | None = None) -> TickOutput:
+        """Latch new faults, and return the setpoints of the next period.
 
         Args:
-            now_ns: Safety time.
-            tick: The present tick, which faults are stamped with.
-            newest_command_tick: In lockstep, the newest tick whose command counts; None: the newest command counts.
+            now_ns: Safety time in ns.
+            tick: Current tick, which new faults name.
+            newest_command_tick: In lockstep, the newest tick whose command may be used. None means the newest command.
         """
-        self.safety.check_deadlines(now_ns, tick)
-        return self.safety.decide(newest_command_tick)
+        self.safety.latch_faults_and_expire_lease(now_ns, tick)
+        return self.safety.compute_setpoints(newest_command_tick)
 
-    def enact(self, decision: TickDecision) -> None:
+    def enact(self, tick_output: TickOutput) -> None:
         """Hand the decided setpoints to the motors."""
-        self.backend.enact(decision.setpoints, self.safety.state)
+        self.backend.enact(tick_output.setpoints, self.safety.state)
 
     def advance(self) -> list[Fault]:
-        """Let one control period pass; return the faults that the backend reports, which the safety core has taken."""
+        """Let one control period pass, latch the faults that the backend reports, and return them."""
         self.backend.advance()
         faults = self.backend.faults()
         for fault in faults:
-            self.safety.fault(fault)
+            self.safety.latch_fault(fault)
         return faults

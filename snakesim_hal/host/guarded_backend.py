@@ -25,26 +25,29 @@ from snakesim_hal.wire.outgoing import encode_checked, encode_unchecked
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
 
-def _guarded(method: MethodT) -> MethodT:
-    """Return a method that raises a BackendError for every exception that is not ours."""
+def _convert_exceptions(method: MethodT) -> MethodT:
+    """Decorate a method of `GuardedBackend` so that every foreign exception becomes a BackendError with its name.
+
+    SnakesimError and its subclasses pass unchanged. An interrupted call gets the code `backend/step-timeout`.
+    """
 
     @functools.wraps(method)
-    def call(self: "GuardedBackend", *arguments: Any, **named: Any) -> Any:
+    def call_converting_exceptions(self: "GuardedBackend", *args: Any, **kwargs: Any) -> Any:
         try:
-            return method(self, *arguments, **named)
+            return method(self, *args, **kwargs)
         except SnakesimError:
             raise
         except StepTooLongError as error:
-            where = f"{self.name}.{method.__name__}"
+            call_name = f"{self.name}.{method.__name__}"
             raise BackendError(
-                f"{where} did not return in time: it was in {describe_interrupted_line(error)}",
+                f"{call_name} did not return in time: it was in {describe_interrupted_line(error)}",
                 code="backend/step-timeout",
             ) from error
         except (Exception, SystemExit) as error:  # third-party code, which must not end the host
-            where = f"{self.name}.{method.__name__}"
-            raise BackendError(f"{where} failed: {type(error).__name__}: {error}") from error
+            call_name = f"{self.name}.{method.__name__}"
+            raise BackendError(f"{call_name} failed: {type(error).__name__}: {error}") from error
 
-    return call  # pyright: ignore[reportReturnType]
+    return call_converting_exceptions  # pyright: ignore[reportReturnType]
 
 
 class GuardedBackend(Backend):
@@ -57,50 +60,51 @@ class GuardedBackend(Backend):
         self._sensor_keys: list[str] | None = None  # None: not read yet
         self._custom_messages: dict[str, CustomMessage] = {}  # custom messages, by key
 
-    @_guarded
+    @_convert_exceptions
     def describe(self) -> Description:
         return self._inner.describe()
 
-    @_guarded
+    @_convert_exceptions
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Return the backend's samples, with the bytes of every message except the joint state."""
         samples = self._inner.sample(tick, timestamp_ns)
         encoded: dict[str, bytes] = {}
-        key = keys.JOINTS  # of the message in work, for the error
+        key = keys.JOINTS  # key of the message that is being encoded, for the error
         try:
-            encode_unchecked(samples.joints)  # the host judges joint by joint whether the values are plausible
-            for key, message in samples.others.items():
+            # Only that it can be encoded: the safety core checks joint by joint whether the values are plausible.
+            encode_unchecked(samples.joints)
+            for key, message in samples.by_key.items():
                 if key not in self._find_sensor_keys():
                     known = ", ".join(self._find_sensor_keys())
                     raise WireError("unknown_key", f"not a sensor of its description, which has {known}")
                 encoded[key] = encode_checked(key, message, self._custom_messages.get(key))
         except WireError as error:
             raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
-        return Samples(samples.joints, samples.others, encoded)
+        return Samples(samples.joints, samples.by_key, encoded)
 
-    @_guarded
+    @_convert_exceptions
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         self._inner.enact(setpoints, lifecycle)
 
-    @_guarded
+    @_convert_exceptions
     def advance(self) -> None:
         self._inner.advance()
 
-    @_guarded
+    @_convert_exceptions
     def faults(self) -> list[Fault]:
         return self._inner.faults()
 
-    @_guarded
+    @_convert_exceptions
     def list_arming_obstacles(self) -> list[str]:
         return self._inner.list_arming_obstacles()
 
-    @_guarded
+    @_convert_exceptions
     def close(self) -> None:
         self._inner.close()
 
-    @_guarded
+    @_convert_exceptions
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Begin or end a fault that the backend injects itself; return False if it does not have it."""
+        """Begin or end a fault that the backend injects itself; return False if it does not support the fault."""
         return self._inner.inject(injection, begins=begins)
 
     def _find_sensor_keys(self) -> list[str]:

@@ -7,7 +7,7 @@ from snakesim_hal.host.ending import RunEnding
 from snakesim_hal.host.host_clock import HostClock
 from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
-from snakesim_hal.host.timing import BackendTime
+from snakesim_hal.host.timing import BackendTimer
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire.messages import Answer, Description
@@ -24,7 +24,7 @@ class HostState:
     # The robot.
     authority: Authority
     clock: HostClock
-    backend_time: BackendTime
+    backend_time: BackendTimer
     faults: Faults  # injected ones
 
     # The services.
@@ -36,18 +36,18 @@ class HostState:
     statistics: RunStatistics = field(default_factory=RunStatistics)
     ending: RunEnding = field(default_factory=RunEnding)
 
-    def lease_holder(self) -> Participant | None:
+    def find_lease_holder(self) -> Participant | None:
         """Return the service that holds the lease, if it is one of the run."""
         return self.participants.get(self.authority.lease.holder or "")
 
-    def forget_answers_before_arming(self) -> None:
+    def reset_answered_ticks(self) -> None:
         """Commands that were sent before the arming do not answer its tick."""
-        holder = self.lease_holder()
+        holder = self.find_lease_holder()
         if holder is not None:
             holder.done_tick = -1
             self.newest_answered_tick = -1
 
-    def answer(self, *, ok: bool, reason: str, refusal: str | None = None) -> Answer:
+    def make_answer(self, *, ok: bool, reason: str, refusal: str | None = None) -> Answer:
         """Return an answer to a request."""
         return Answer(
             ok=ok,

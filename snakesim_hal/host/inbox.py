@@ -29,9 +29,9 @@ from snakesim_hal.wire.messages import (
     SimulatorRequest,
 )
 
-# The lanes, the most urgent first.
-STOPS = 0
-PRESENCE = 1
+# Indices of the lanes, the most urgent first.
+STOP_LANE = 0
+PRESENCE_LANE = 1
 SAMPLES = 2
 REQUESTS = 3
 LIMITS = (64, None, 4096, 64)  # presence comes from known services only, so its lane needs no bound
@@ -46,20 +46,20 @@ class Receiver(Protocol):
         """Handle a command that arrived at `monotonic_ns`."""
         ...
 
-    def on_done(self, service: str, tick: int) -> None:
+    def on_tick_done(self, service: str, tick: int) -> None:
         """Handle the message that a service has completed a tick."""
         ...
 
-    def on_presence(self, service: str, present: bool) -> None:
+    def on_service_presence(self, service: str, present: bool) -> None:
         """Handle that a service's liveliness token has appeared or vanished."""
         ...
 
     def on_request(self, request: Request, reply: Reply) -> None:
-        """Handle a request, and reply once, from any thread."""
+        """Execute a request, and reply once, from any thread."""
         ...
 
-    def on_undecodable(self, error: WireError) -> Answer:
-        """Count a message that cannot be decoded, and return the answer for the case that it was a query."""
+    def on_undecodable_message(self, error: WireError) -> Answer:
+        """Count a message that cannot be decoded, and return the answer to send if the message was a query."""
         ...
 
 
@@ -85,22 +85,22 @@ class CommandArrival:
 
 
 @dataclass(frozen=True)
-class _Done:
+class _DoneArrival:
     arrival: Arrival
     decoder: Decoder[Done]
 
     def deliver(self, receiver: Receiver) -> None:
         done = self.arrival.decode(self.decoder)
-        receiver.on_done(keys.parse_service(self.arrival.key), done.tick)
+        receiver.on_tick_done(keys.parse_service(self.arrival.key), done.tick)
 
 
 @dataclass(frozen=True)
-class _Presence:
+class _PresenceChange:
     service: str
     present: bool
 
     def deliver(self, receiver: Receiver) -> None:
-        receiver.on_presence(self.service, self.present)
+        receiver.on_service_presence(self.service, self.present)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class _RemoteRequest:
         try:
             request = self.decoder.decode(self.query.payload, self.query.encoding)
         except WireError as error:
-            self.send_answer(self.query, receiver.on_undecodable(error))
+            self.send_answer(self.query, receiver.on_undecodable_message(error))
         else:
             receiver.on_request(request, lambda answer: self.send_answer(self.query, answer))
 
@@ -141,92 +141,96 @@ class Inbox:
         services: Collection[str],
         send_answer: Callable[[Query, Answer], None],
     ) -> None:
-        """Declare all subscriptions of the host.
+        """Declare all subscriptions and queryables of the host.
 
         Args:
-            session: The host's session.
-            receiver: Handles the input. It must live as long as anything is taken from this inbox.
-            services: Services whose presence matters.
-            send_answer: Answers a query.
+            session: Session of the host.
+            receiver: Object that handles the input. The inbox holds only a weak reference to it.
+            services: Names of the services whose liveliness tokens are watched.
+            send_answer: Function that sends the answer to a query.
         """
         # The receiver owns its inbox. A reference back that counts would keep a whole run in memory after its end.
         self._receiver: Receiver = weakref.proxy(receiver)
         self._services = frozenset(services)
-        self._lanes: Mailbox[QueuedInput] = Mailbox(LIMITS)
+        self._queue: Mailbox[QueuedInput] = Mailbox(LIMITS)
         self.dropped = 0
 
         self._command_decoder = Decoder(JointCommand)
         self._done_decoder = Decoder(Done)
         self._send_answer = send_answer
 
-        session.on_urgent_arrival(keys.JOINT_COMMAND, self._put_command)
-        session.on_urgent_arrival(keys.DONE_ALL, self._put_done)
-        session.on_query(keys.ESTOP, partial(self._put_stop, Decoder(EstopRequest)))
-        session.on_query(keys.LEASE, partial(self._put_request, Decoder(LeaseRequest)))
-        session.on_query(keys.LIFECYCLE, partial(self._put_request, Decoder(LifecycleRequest)))
-        session.on_query(keys.SIMULATOR, partial(self._put_request, Decoder(SimulatorRequest)))
-        session.on_alive(self._put_presence)
+        session.on_urgent_arrival(keys.JOINT_COMMAND, self._queue_command)
+        session.on_urgent_arrival(keys.DONE_ALL, self._queue_done)
+        session.on_query(keys.ESTOP, partial(self._queue_stop_request, Decoder(EstopRequest)))
+        session.on_query(keys.LEASE, partial(self._queue_request, Decoder(LeaseRequest)))
+        session.on_query(keys.LIFECYCLE, partial(self._queue_request, Decoder(LifecycleRequest)))
+        session.on_query(keys.SIMULATOR, partial(self._queue_request, Decoder(SimulatorRequest)))
+        session.on_token_change(self._queue_presence)
 
     def waiting(self) -> int:
         """Return the number of queued items."""
-        return self._lanes.qsize()
+        return self._queue.qsize()
 
     def put_local_request(self, request: Request, reply: Reply) -> None:
         """Queue a request that did not come over Zenoh, before all other input; from any thread."""
-        self._lanes.put(_LocalRequest(request, reply), STOPS)
+        self._queue.put(_LocalRequest(request, reply), STOP_LANE)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until an item is queued, for at most `timeout_s`."""
-        self._lanes.wait(timeout_s)
+        self._queue.wait(timeout_s)
 
-    def handle_next(self, timeout_s: float) -> bool:
+    def handle_next_item(self, timeout_s: float) -> bool:
         """Handle the next item. Returns False when none arrives in time."""
         try:
-            item = self._lanes.get(timeout=timeout_s)
+            item = self._queue.get(timeout=timeout_s)
         except Empty:
             return False
         self.handle(item)
         return True
 
     def handle_until(self, monotonic_ns: int) -> None:
-        """Handle all items that arrive until a point in time."""
-        while (left_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.handle_next(left_ns * 1e-9):
+        """Handle items as they arrive, until a monotonic time."""
+        while (remaining_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.handle_next_item(remaining_ns * 1e-9):
             pass
 
     def handle_queued(self, limit_ns: float) -> None:
-        """Handle the items that are queued now, for at most `limit_ns`. The rest of a flood waits for the next tick."""
-        stop_ns = time.monotonic_ns() + limit_ns
-        for _ in range(self._lanes.qsize()):
-            if not self.handle_next(0.0) or time.monotonic_ns() > stop_ns:
+        """Handle the items that are queued now. The rest of a flood waits for the next tick.
+
+        Args:
+            limit_ns: Maximum duration in ns.
+        """
+        deadline_ns = time.monotonic_ns() + limit_ns
+        for _ in range(self._queue.qsize()):
+            if not self.handle_next_item(0.0) or time.monotonic_ns() > deadline_ns:
                 return
 
     def handle(self, item: QueuedInput) -> None:
-        """Decode one item and hand it over."""
+        """Decode one item and pass it to the receiver. An item that cannot be decoded is counted."""
         try:
             item.deliver(self._receiver)
         except WireError as error:
-            self._receiver.on_undecodable(error)
+            self._receiver.on_undecodable_message(error)
 
     # --- in Zenoh's threads ----------------------------------------------------------------------------------
 
-    def _put_command(self, arrival: Arrival) -> None:
-        self._put_sample(CommandArrival(arrival, self._command_decoder))
+    def _queue_command(self, arrival: Arrival) -> None:
+        self._queue_sample(CommandArrival(arrival, self._command_decoder))
 
-    def _put_done(self, arrival: Arrival) -> None:
-        self._put_sample(_Done(arrival, self._done_decoder))
+    def _queue_done(self, arrival: Arrival) -> None:
+        self._queue_sample(_DoneArrival(arrival, self._done_decoder))
 
-    def _put_sample(self, item: QueuedInput) -> None:
-        self.dropped += self._lanes.full(SAMPLES)
-        self._lanes.put(item, SAMPLES)
+    def _queue_sample(self, item: QueuedInput) -> None:
+        self.dropped += self._queue.is_full(SAMPLES)
+        self._queue.put(item, SAMPLES)
 
-    def _put_stop(self, decoder: Decoder[EstopRequest], query: Query) -> None:
-        self._lanes.put(_RemoteRequest(query, decoder, self._send_answer), STOPS)
+    def _queue_stop_request(self, decoder: Decoder[EstopRequest], query: Query) -> None:
+        self._queue.put(_RemoteRequest(query, decoder, self._send_answer), STOP_LANE)
 
-    def _put_request(self, decoder: RequestDecoder, query: Query) -> None:
-        self.dropped += self._lanes.full(REQUESTS)  # the requester gets no answer, and may ask again
-        self._lanes.put(_RemoteRequest(query, decoder, self._send_answer), REQUESTS)
+    def _queue_request(self, decoder: RequestDecoder, query: Query) -> None:
+        self.dropped += self._queue.is_full(REQUESTS)  # the requester gets no answer, and may ask again
+        self._queue.put(_RemoteRequest(query, decoder, self._send_answer), REQUESTS)
 
-    def _put_presence(self, key: str, present: bool) -> None:
+    def _queue_presence(self, key: str, present: bool) -> None:
         service = keys.parse_service(key)
         if service in self._services:
-            self._lanes.put(_Presence(service, present), PRESENCE)
+            self._queue.put(_PresenceChange(service, present), PRESENCE_LANE)

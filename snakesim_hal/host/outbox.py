@@ -21,50 +21,57 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES
 from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status
 
-WAITING_LIMIT = 64  # queued actions; each sends one message, or all messages of a tick; the oldest are dropped
-IMAGES_WAITING_LIMIT = 8
+MAX_QUEUED_ACTIONS = 64  # queued actions; each sends one message, or all messages of a tick; the oldest are dropped
+MAX_QUEUED_IMAGES = 8
 FLUSH_S = 1.0  # how long queued actions still run at the end: a network or a disk may hang
 
 Outgoing = tuple[str, Message, bytes | None]  # key, message, and its bytes if it has been encoded already
 
 
-class Sender:
+class SerialWorker:
     """A thread that runs actions one after another."""
 
-    def __init__(self, name: str, waiting_limit: int = WAITING_LIMIT) -> None:
-        """Start the thread. If more than `waiting_limit` actions wait, the oldest are dropped."""
-        self._waiting: Mailbox[Callable[[], None] | None] = Mailbox((waiting_limit,))  # None: end
-        self._closing = False
-        self._began_ns = 0  # monotonic time at which the present action began; 0: idle
+    def __init__(self, name: str, max_queued_actions: int = MAX_QUEUED_ACTIONS) -> None:
+        """Start the thread.
+
+        Args:
+            name: Name of the thread.
+            max_queued_actions: Number of actions that may wait. If there are more, the oldest are dropped.
+        """
+        self._queued_actions: Mailbox[Callable[[], None] | None] = Mailbox(
+            (max_queued_actions,)
+        )  # None ends the thread
+        self._is_closing = False
+        self._action_start_ns = 0  # monotonic time at which the current action started; 0 while idle
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def queue(self, action: Callable[[], None]) -> None:
+    def submit(self, action: Callable[[], None]) -> None:
         """Queue an action; never waits."""
-        self._waiting.put(action)
+        self._queued_actions.put(action)
 
-    def busy_s(self) -> float:
-        """Return for how long the present action has been running; 0 if there is none."""
-        began_ns = self._began_ns  # read once: the sender's thread changes it
-        if not began_ns:
+    def busy_duration_s(self) -> float:
+        """Return for how long the current action has been running, in s; 0 if there is none."""
+        start_ns = self._action_start_ns  # read once, because the sender's thread changes it
+        if not start_ns:
             return 0.0
-        return (time.monotonic_ns() - began_ns) * 1e-9
+        return (time.monotonic_ns() - start_ns) * 1e-9
 
     def close(self) -> None:
         """Run queued actions for at most FLUSH_S, and end."""
-        self._closing = True
-        self._waiting.put(None)
+        self._is_closing = True
+        self._queued_actions.put(None)
         self._thread.join(FLUSH_S)
 
     def _run(self) -> None:
-        while (action := self._waiting.get()) is not None:
-            self._began_ns = time.monotonic_ns()
+        while (action := self._queued_actions.get()) is not None:
+            self._action_start_ns = time.monotonic_ns()
             try:
                 action()
             except Exception as error:  # noqa: BLE001 - this thread's outermost loop; usually the network is closed
-                if not self._closing:
+                if not self._is_closing:
                     print_stderr(f"not sent: {type(error).__name__}: {error}")
-            self._began_ns = 0
+            self._action_start_ns = 0
 
 
 class Outbox:
@@ -74,24 +81,26 @@ class Outbox:
         """Publish the description and the effective configuration, and declare the host's liveliness tokens.
 
         Args:
-            session: a session in the robot's namespace.
-            description: of the robot.
-            config: the effective configuration as text; a very long one is not published.
-            lockstep: True: streams are sent in the caller's thread, and wait for slow subscribers.
+            session: Session in the robot's namespace.
+            description: Description of the robot.
+            config: Effective configuration as JSON. It is not published if it is longer than MAX_CONFIG.
+            lockstep: Whether streams are sent in the caller's thread, and wait for slow subscribers.
         """
         self._session = session
         self._lockstep = lockstep
-        self._publishers: dict[str, Publisher[Any]] = {keys.STATUS: session.latched_publisher(keys.STATUS, Status)}
-        # Threads. Without a camera, no thread for images is needed.
-        self._streams = Sender("streams")
-        self._answers = Sender("answers")
+        self._publishers: dict[str, Publisher[Any]] = {
+            keys.STATUS: session.declare_latched_publisher(keys.STATUS, Status)
+        }
+        # Threads. Without a camera, images need no thread of their own.
+        self._streams = SerialWorker("streams")
+        self._answers = SerialWorker("answers")
         has_camera = any(keys.find_message(sensor.key) in IMAGES for sensor in description.sensors)
-        self._images = Sender("images", IMAGES_WAITING_LIMIT) if has_camera else self._streams
+        self._images = SerialWorker("images", MAX_QUEUED_IMAGES) if has_camera else self._streams
         # Latched messages and liveliness tokens.
-        session.latched_publisher(keys.DESCRIPTION, Description).put(description)
+        session.declare_latched_publisher(keys.DESCRIPTION, Description).put(description)
         if len(config) <= MAX_CONFIG:
-            effective = Configuration(config_hash=description.config_hash, content=config.decode())
-            session.latched_publisher(keys.CONFIG, Configuration).put(effective)
+            configuration = Configuration(config_hash=description.config_hash, content=config.decode())
+            session.declare_latched_publisher(keys.CONFIG, Configuration).put(configuration)
         session.declare_alive(HAL)
         if description.host is not None:
             session.declare_token(keys.host_key(description.host))
@@ -104,25 +113,25 @@ class Outbox:
         if self._images is not self._streams:
             images = [outgoing for outgoing in messages if isinstance(outgoing[1], IMAGES)]
             if images:
-                self._images.queue(lambda: self._publish(images))
+                self._images.submit(lambda: self._publish(images))
                 messages = tuple(outgoing for outgoing in messages if outgoing not in images)
-        self._streams.queue(lambda: self._publish(messages))
+        self._streams.submit(lambda: self._publish(messages))
 
     def _publish(self, messages: Sequence[Outgoing]) -> None:
         for key, message, encoded in messages:
-            self._publisher(key, type(message)).put(message, encoded)
+            self._get_publisher(key, type(message)).put(message, encoded)
 
-    def answer(self, question: Query, answer: Answer) -> None:
-        """Answer a query. The requester may be slow."""
-        self._answers.queue(lambda: question.reply(answer))
+    def send_answer(self, query: Query, answer: Answer) -> None:
+        """Send the answer to a query in another thread, because the requester may be slow."""
+        self._answers.submit(lambda: query.reply(answer))
 
     def log(self, text: str) -> None:
-        """Write a line to the process's log. A disk may be slow."""
-        self._answers.queue(lambda: print_stderr(text))
+        """Write a line to the log of the process in another thread, because a disk may be slow."""
+        self._answers.submit(lambda: print_stderr(text))
 
-    def blocked_s(self) -> float:
+    def blocked_duration_s(self) -> float:
         """Return for how long the network has been blocked, in s."""
-        return self._streams.busy_s()
+        return self._streams.busy_duration_s()
 
     def close(self) -> None:
         """Send queued messages for at most FLUSH_S."""
@@ -130,9 +139,9 @@ class Outbox:
         for sender in senders:
             sender.close()
 
-    def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
+    def _get_publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         publisher = self._publishers.get(key)
         if publisher is None:
-            publisher = self._session.publisher(key, message, lossless=self._lockstep)
+            publisher = self._session.declare_publisher(key, message, lossless=self._lockstep)
             self._publishers[key] = publisher
         return publisher

@@ -18,12 +18,12 @@ class Participant:
     service: ServiceSchedule
     done_tick: int = NOT_ANSWERED  # the newest tick for which it has published all output
     first_tick: int = 0  # that it receives: it cannot answer ticks that were published before it was connected
-    present: bool = False
-    given_up: bool = False
+    is_connected: bool = False
+    is_abandoned: bool = False
 
     def behind(self, tick: int) -> bool:
         """Return whether the end of `tick` has to wait for this service."""
-        if not self.present or self.given_up:
+        if not self.is_connected or self.is_abandoned:
             return False
         awaited_tick = self.service.used_output_tick(tick + 1)
         return awaited_tick >= self.first_tick and awaited_tick > self.done_tick
@@ -36,34 +36,34 @@ class Participants(dict[str, Participant]):
         """Start with services that are not connected yet."""
         super().__init__({name: Participant(service) for name, service in services.items()})
 
-    def behind(self, tick: int) -> list[str]:
+    def find_services_behind(self, tick: int) -> list[str]:
         """Return the services for which the end of `tick` has to wait."""
         return [name for name, participant in self.items() if participant.behind(tick)]
 
     def describe_awaited(self, tick: int) -> str:
         """Return, as text, which service's answer to which tick the end of `tick` has to wait for."""
         answers: list[str] = []
-        for name in self.behind(tick):
+        for name in self.find_services_behind(tick):
             awaited_tick = self[name].service.used_output_tick(tick + 1)
             answers.append(f"{name}'s answer to tick {awaited_tick}")
         return ", ".join(answers)
 
-    def missing(self, *, must_have_answered: bool) -> list[str]:
+    def find_missing_services(self, *, must_have_answered: bool) -> list[str]:
         """Return the services that are not connected.
 
         Args:
-            must_have_answered: also return connected services that have not answered any tick yet.
+            must_have_answered: Also return connected services that have not answered any tick yet.
         """
         names: list[str] = []
         for name, participant in self.items():
             is_silent = must_have_answered and participant.done_tick < 0
-            if is_silent or not participant.present:
+            if is_silent or not participant.is_connected:
                 names.append(name)
         return names
 
     def present(self) -> list[str]:
         """Return the connected services, sorted by name."""
-        return sorted(name for name, participant in self.items() if participant.present)
+        return sorted(name for name, participant in self.items() if participant.is_connected)
 
     def mark_done(self, service: str | None, tick: int) -> None:
         """Note that a service has published all its output for a tick."""
@@ -75,22 +75,22 @@ class Participants(dict[str, Participant]):
         """Note that a service's liveliness token has appeared.
 
         Args:
-            service: name of the service, which has subscribed to its input already.
-            next_tick: the tick that is published next, also if it has been published before.
+            service: Name of the service, which has subscribed to its input already.
+            next_tick: The tick that is published next, also if it has been published before.
         """
         participant = self.get(service)
         if participant is None:
             return
-        if not participant.present:
+        if not participant.is_connected:
             participant.first_tick = next_tick
-        participant.present = True
-        participant.given_up = False
+        participant.is_connected = True
+        participant.is_abandoned = False
 
     def mark_absent(self, service: str) -> bool:
         """Note that a service's token has vanished. Returns whether it is a service of the run."""
         participant = self.get(service)
         if participant is None:
             return False
-        participant.present = False
+        participant.is_connected = False
         participant.done_tick = NOT_ANSWERED
         return True

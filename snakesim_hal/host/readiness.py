@@ -3,7 +3,7 @@
 from snakesim_hal.host.participants import Participants
 from snakesim_hal.host.status_messages import describe_wait
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
+from snakesim_hal.network.process_entries import HOST, ProcessEntries, make_own_entry, publish_process_entry
 from snakesim_hal.network.session import Session
 
 
@@ -12,20 +12,20 @@ class Readiness:
 
     def __init__(self, config: RunConfig, participants: Participants, session: Session) -> None:
         self._participants = participants
-        self._must_have_answered = config.clock_mode == "lockstep"  # tick 0, without which lockstep cannot begin
-        self._own_entry = own_entry(HOST, config)
-        show_process(session, self._own_entry)
+        self._requires_answers = config.clock_mode == "lockstep"  # tick 0, without which lockstep cannot begin
+        self._own_entry = make_own_entry(HOST, config)
+        publish_process_entry(session, self._own_entry)
         self._processes = ProcessEntries(session)
 
-    def missing_services(self) -> list[str]:
+    def find_missing_services(self) -> list[str]:
         """Return the services that are not connected, or in lockstep have not answered tick 0 yet."""
-        return self._participants.missing(must_have_answered=self._must_have_answered)
+        return self._participants.find_missing_services(must_have_answered=self._requires_answers)
 
-    def unpublished_processes(self) -> list[str]:
+    def find_undescribed_processes(self) -> list[str]:
         """Return the processes of awaited services whose description has not arrived yet."""
         return self._processes.unpublished(self._participants)
 
-    def differing_processes(self) -> list[str]:
+    def describe_differing_processes(self) -> list[str]:
         """Return how the processes of awaited services differ from this host, or lack a description."""
         return self._processes.find_problems(self._own_entry, self._participants)
 

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import msgspec
 
 from snakesim_hal.host.host_state import HostState
-from snakesim_hal.host.latch import EstopLatch, make_reply
+from snakesim_hal.host.latch import EstopLatch, make_storage_callback
 from snakesim_hal.host.outbox import Outbox
 from snakesim_hal.host.readiness import Readiness
-from snakesim_hal.host.simulated_time import Refusal
+from snakesim_hal.host.simulated_time import SimulatorRefusal
 from snakesim_hal.host.status_reporter import StatusReporter
 from snakesim_hal.wire.messages import (
     Answer,
@@ -43,65 +43,67 @@ class RequestHandler:
         self._latch = latch
         self._outbox = outbox
 
-    def handle(self, request: Request, reply: Reply) -> None:
-        """Carry one request out and reply to it. A simulator request waits until the next tick begins."""
+    def handle_request(self, request: Request, reply: Reply) -> None:
+        """Execute one request and reply to it. A simulator request waits until the next tick starts."""
         match request:
             case EstopRequest():
                 self._handle_estop(request, reply)
             case LeaseRequest():
                 self._handle_lease(request, reply)
             case LifecycleRequest() | SimulatorRequest() if self._is_for_another_host(request):
-                self._finish(request, self._refuse_wrong_host(request), reply)
+                self._log_and_reply(request, self._make_wrong_host_refusal(request), reply)
             case LifecycleRequest():
                 self._handle_lifecycle(request, reply)
             case SimulatorRequest():
                 self.simulator_requests.append((request, reply))
 
-    def change_simulated_time(self) -> None:
-        """Carry out, between two ticks, what was requested of the simulator's time."""
+    def execute_simulator_requests(self) -> None:
+        """Execute the queued simulator requests, between two ticks, and reply to them."""
         requests = self.simulator_requests
         self.simulator_requests = []
         for request, reply in requests:
-            answer = self._change_simulated_time(request)
+            answer = self._execute_simulator_request(request)
             self._log_request(request, answer)
-            self._status.publish()
+            self._status.publish_if_due()
             reply(answer)
 
     # --- one kind of request each ----------------------------------------------------------------------------
 
     def _handle_estop(self, request: EstopRequest, reply: Reply) -> None:
         tick = self._state.clock.tick
-        answer = self._state.authority.on_estop(request, tick)
-        answer = self._with_host(answer)
+        answer = self._state.authority.handle_estop_request(request, tick)
+        answer = self._add_host_id(answer)
         self._log_request(request, answer)
-        self._status.publish()
-        self._latch.engage(request.requester, tick, make_reply(reply, answer))
+        self._status.publish_if_due()
+        self._latch.engage(request.requester, tick, make_storage_callback(reply, answer))
 
     def _handle_lease(self, request: LeaseRequest, reply: Reply) -> None:
         state = self._state
         now_ns = state.clock.safety_ns()
-        state.authority.check_deadlines(now_ns, state.clock.tick)  # first, because an expired lease is a fault
-        answer = state.authority.on_lease(request, now_ns)
-        self._status.publish()
-        reply(self._with_host(answer))
+        state.authority.latch_faults_and_expire_lease(
+            now_ns, state.clock.tick
+        )  # first, because an expired lease is a fault
+        answer = state.authority.handle_lease_request(request, now_ns)
+        self._status.publish_if_due()
+        reply(self._add_host_id(answer))
 
     def _handle_lifecycle(self, request: LifecycleRequest, reply: Reply) -> None:
-        """Carry out a lifecycle request, and answer it.
+        """Arm, disarm or reset the robot, or finish the run, and answer the request.
 
         Args:
-            request: what to do: arm, disarm, reset, or finish the run.
-            reply: function that sends the answer.
+            request: Request with one of these actions.
+            reply: Function that sends the answer.
         """
         if request.action == "arm":
-            refusal = self._refuse_to_arm()
+            refusal = self._find_arming_refusal()
             if refusal is not None:
-                self._finish(request, refusal, reply)
+                self._log_and_reply(request, refusal, reply)
                 return
 
-        answer = self._state.authority.on_lifecycle(request, self._state.clock.safety_ns())
+        answer = self._state.authority.handle_lifecycle_request(request, self._state.clock.safety_ns())
         match request.action:
             case "arm" if answer.ok:
-                self._state.forget_answers_before_arming()
+                self._state.reset_answered_ticks()
             case "finish":
                 reason = "on request"
                 if request.requester:
@@ -109,65 +111,65 @@ class RequestHandler:
                 self._state.ending.request("finished", reason)
             case _:
                 pass
-        self._finish(request, answer, reply)
+        self._log_and_reply(request, answer, reply)
 
-    def _finish(self, request: LifecycleRequest | SimulatorRequest, answer: Answer, reply: Reply) -> None:
-        """Log a request and reply; to a reset of an emergency stop only after it is no longer on the disk."""
-        answer = self._with_host(answer)
+    def _log_and_reply(self, request: LifecycleRequest | SimulatorRequest, answer: Answer, reply: Reply) -> None:
+        """Log a request, publish the status, and reply. A reset is answered only after the stop is off the disk."""
+        answer = self._add_host_id(answer)
         self._log_request(request, answer)
-        self._status.publish()
+        self._status.publish_if_due()
         if isinstance(request, LifecycleRequest) and request.action == "reset" and answer.ok:
-            self._latch.release(make_reply(reply, answer))
+            self._latch.release(make_storage_callback(reply, answer))
         else:
             reply(answer)
 
-    def _change_simulated_time(self, request: SimulatorRequest) -> Answer:
+    def _execute_simulator_request(self, request: SimulatorRequest) -> Answer:
         state = self._state
-        outcome = state.clock.simulated.carry_out(request, state.clock.tick)
-        if isinstance(outcome, Refusal):
-            return state.answer(ok=False, reason=outcome.why, refusal=outcome.word)
+        outcome = state.clock.simulated.execute_request(request, state.clock.tick)
+        if isinstance(outcome, SimulatorRefusal):
+            return state.make_answer(ok=False, reason=outcome.reason, refusal=outcome.code)
 
         state.clock.restart_deadlines(state.clock.simulated.speed)
         if request.action == "reset":
             finish = LifecycleRequest(action="finish", requester=request.requester)
-            state.authority.on_lifecycle(finish, state.clock.safety_ns())
+            state.authority.handle_lifecycle_request(finish, state.clock.safety_ns())
             state.ending.request("reset", f"by {request.requester}")
-        return state.answer(ok=True, reason=outcome)
+        return state.make_answer(ok=True, reason=outcome)
 
     # --- refusals and the log --------------------------------------------------------------------------------
 
     def _is_for_another_host(self, request: LifecycleRequest | SimulatorRequest) -> bool:
         return request.host not in (None, self._state.description.host)
 
-    def _refuse_wrong_host(self, request: LifecycleRequest | SimulatorRequest) -> Answer:
+    def _make_wrong_host_refusal(self, request: LifecycleRequest | SimulatorRequest) -> Answer:
         own_host = self._state.description.host
         reason = f"this is host {own_host}, the request is for {request.host}: two have one name"
-        return self._state.answer(ok=False, reason=reason, refusal="wrong_host")
+        return self._state.make_answer(ok=False, reason=reason, refusal="wrong_host")
 
-    def _refuse_to_arm(self) -> Answer | None:
-        """Return the refusal while services are missing or differ from this host."""
-        missing = self._readiness.missing_services()
+    def _find_arming_refusal(self) -> Answer | None:
+        """Return the refusal of a request to arm if services are missing or differ from this host; otherwise None."""
+        missing = self._readiness.find_missing_services()
         if missing:
             reason = f"waiting for {', '.join(missing)}"
-            return self._state.answer(ok=False, reason=reason, refusal="not_ready")
-        unpublished = self._readiness.unpublished_processes()
+            return self._state.make_answer(ok=False, reason=reason, refusal="not_ready")
+        unpublished = self._readiness.find_undescribed_processes()
         if unpublished:
             reason = f"waiting for the settings of {', '.join(unpublished)}"
-            return self._state.answer(ok=False, reason=reason, refusal="not_ready")
-        differing = self._readiness.differing_processes()
+            return self._state.make_answer(ok=False, reason=reason, refusal="not_ready")
+        differing = self._readiness.describe_differing_processes()
         if differing:
-            return self._state.answer(ok=False, reason="; ".join(differing), refusal="settings_differ")
+            return self._state.make_answer(ok=False, reason="; ".join(differing), refusal="settings_differ")
         return None
 
-    def _with_host(self, answer: Answer) -> Answer:
+    def _add_host_id(self, answer: Answer) -> Answer:
         return msgspec.structs.replace(answer, host=self._state.description.host)
 
     def _log_request(self, request: LifecycleRequest | EstopRequest | SimulatorRequest, answer: Answer) -> None:
-        """Keep a request and its result, for the run's record and the process's log."""
+        """Add a request and its result to the run's record and to the log of the process."""
         if len(self.log) >= MAX_LOGGED_REQUESTS:
             return
         action = "estop" if isinstance(request, EstopRequest) else request.action
-        outcome = "done" if answer.ok else f"refused: {answer.reason}"
-        entry = f"tick {self._state.clock.tick}: {action} by {request.requester!r}, {outcome}"
+        result = "done" if answer.ok else f"refused: {answer.reason}"
+        entry = f"tick {self._state.clock.tick}: {action} by {request.requester!r}, {result}"
         self.log.append(entry)
         self._outbox.log(entry)

@@ -7,30 +7,34 @@ from itertools import accumulate
 
 from snakesim_hal.wire.messages import Timing
 
-SHOWN_BINS = 16  # at most, in a published histogram
+MAX_PUBLISHED_BINS = 16  # at most, in a published histogram
 MAX_DURATION_US = 1e7
 FINE_BIN_RATIO = 0.01  # width of a bin, relative to the duration
 COARSE_BIN_RATIO = 0.05
 
 
-class Durations:
+class DurationHistogram:
     """A histogram of durations from 1 us to 10 s. Its memory has a fixed size, however long the run.
 
     Bin i holds durations near exp(i * step) us, so that each bin is wider than the one before by the same ratio.
     The host's thread adds durations; other threads may read percentiles meanwhile.
     """
 
-    def __init__(self, width: float = FINE_BIN_RATIO) -> None:
-        """Start empty; width: of a bin, relative to the duration."""
+    def __init__(self, bin_width_ratio: float = FINE_BIN_RATIO) -> None:
+        """Start without durations.
+
+        Args:
+            bin_width_ratio: Width of a bin, divided by the duration.
+        """
         self.count = 0
-        self._step = math.log1p(width)
+        self._step = math.log1p(bin_width_ratio)
         self._bins = [0] * (1 + math.ceil(math.log(MAX_DURATION_US) / self._step))
 
-    def add(self, took_us: float) -> None:
-        """Count a duration."""
-        index = round(math.log(max(took_us, 1.0)) / self._step)
-        last = len(self._bins) - 1
-        self._bins[min(max(index, 0), last)] += 1
+    def add(self, duration_us: float) -> None:
+        """Add a duration to the histogram."""
+        index = round(math.log(max(duration_us, 1.0)) / self._step)
+        last_index = len(self._bins) - 1
+        self._bins[min(max(index, 0), last_index)] += 1
         self.count += 1
 
     def percentile_us(self, percent: float) -> float | None:
@@ -43,25 +47,26 @@ class Durations:
         """Return percentiles and a coarse histogram of the durations, from their logarithmic bins.
 
         Returns:
-            The statistics in microseconds, or None if there are no durations.
+            The statistics in microseconds, or None if there are no durations. The histogram has at most
+            MAX_PUBLISHED_BINS bins, from the first to the last bin that is not empty.
         """
-        bins = self._bins.copy()  # the host's thread may add to it meanwhile
+        bins = self._bins.copy()  # the host's thread may add durations at the same time
         cumulative = list(accumulate(bins))
         count = cumulative[-1]
         if not count:
             return None
-        first = bisect_left(cumulative, 1)  # the first bin that is not empty
-        end = bisect_left(cumulative, count) + 1  # behind the last bin that is not empty
-        bins_per_shown = -(-(end - first) // SHOWN_BINS)  # rounded up
-        shown_bins = [sum(bins[begin : begin + bins_per_shown]) for begin in range(first, end, bins_per_shown)]
+        first_bin = bisect_left(cumulative, 1)  # the first bin that is not empty
+        end_bin = bisect_left(cumulative, count) + 1  # the bin after the last one that is not empty
+        merged_count = -(-(end_bin - first_bin) // MAX_PUBLISHED_BINS)  # bins per published bin, rounded up
+        merged_bins = [sum(bins[i : i + merged_count]) for i in range(first_bin, end_bin, merged_count)]
         return Timing(
             count=count,
             median_us=self._find_percentile_us(cumulative, 50),
             p99_us=self._find_percentile_us(cumulative, 99),
-            max_us=math.exp((end - 1) * self._step),
-            low_us=math.exp((first - 0.5) * self._step),
-            bin_decades=bins_per_shown * self._step / math.log(10),
-            bins=shown_bins,
+            max_us=math.exp((end_bin - 1) * self._step),
+            low_us=math.exp((first_bin - 0.5) * self._step),  # lower end of the first bin, whose middle is at its index
+            bin_decades=merged_count * self._step / math.log(10),
+            bins=merged_bins,
         )
 
     def _find_percentile_us(self, cumulative: list[int], percent: float) -> float:
@@ -70,18 +75,22 @@ class Durations:
         return math.exp(bisect_left(cumulative, rank) * self._step)
 
 
-def _coarse() -> Durations:
-    return Durations(COARSE_BIN_RATIO)
+def _make_coarse_histogram() -> DurationHistogram:
+    return DurationHistogram(COARSE_BIN_RATIO)
 
 
 @dataclass
 class TickTimes:
     """Durations of the parts of a tick, while the robot is armed."""
 
-    cycle: Durations = field(default_factory=Durations)  # from the start of a tick to the start of the next
-    late: Durations = field(default_factory=_coarse)  # start of a tick after its deadline
-    read: Durations = field(default_factory=_coarse)  # the backend's sample
-    write: Durations = field(default_factory=_coarse)  # the backend takes setpoints, and lets the tick pass
+    cycle: DurationHistogram = field(
+        default_factory=DurationHistogram
+    )  # from the start of a tick to the start of the next
+    late: DurationHistogram = field(default_factory=_make_coarse_histogram)  # start of a tick after its deadline
+    read: DurationHistogram = field(default_factory=_make_coarse_histogram)  # the backend's sample
+    write: DurationHistogram = field(
+        default_factory=_make_coarse_histogram
+    )  # the backend takes setpoints, and lets the tick pass
 
     def timings(self) -> dict[str, Timing]:
         """Return the timing of each part that was measured, by its name."""
@@ -101,5 +110,5 @@ class RunStatistics:
     ticks: int = 0
     overruns: int = 0
     answered_ticks: int = 0  # ticks with a command that came in time
-    state_to_command: Durations = field(default_factory=Durations)
+    state_to_command: DurationHistogram = field(default_factory=DurationHistogram)
     times: TickTimes = field(default_factory=TickTimes)

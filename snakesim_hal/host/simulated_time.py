@@ -12,85 +12,100 @@ from typing import NamedTuple
 
 from snakesim_hal.wire.messages import ClockMode, Description, SimulatorRequest
 
-MEASURED_OVER_NS = 1_000_000_000  # of the real-time factor
+FACTOR_MEASUREMENT_NS = 1_000_000_000  # wall time over which the real-time factor is measured
 MIN_SPEED_RATIO = 0.95  # of the requested speed; below, the status reports that it is not reached
 
 
-class Refusal(NamedTuple):
+class SimulatorRefusal(NamedTuple):
     """The reason why a request cannot be carried out, as one word and as text."""
 
-    word: str
-    why: str
+    code: str
+    reason: str
+
+
+class _TimeOrigin(NamedTuple):
+    """One moment by three clocks."""
+
+    safety_ns: int
+    monotonic_ns: int
+    tick: int
 
 
 class SimulatedTime:
-    """The time of one host's robot. If the time is not simulated, every request is refused, and it never pauses."""
+    """Pauses the time of one host's robot, and changes its speed. Converts wall time to safety time.
 
-    def __init__(self, description: Description, clock_mode: ClockMode, clock: Callable[[], int]) -> None:
-        """Start at speed 1, not paused.
+    If the time of the robot is not simulated, every request is refused, and the time never pauses.
+    """
+
+    def __init__(self, description: Description, clock_mode: ClockMode, read_monotonic_ns: Callable[[], int]) -> None:
+        """Start with robot time that passes at the speed of wall time.
 
         Args:
-            description: of the robot.
-            clock_mode: of the run.
-            clock: returns the monotonic time in ns.
+            description: Description of the robot.
+            clock_mode: Clock mode of the run.
+            read_monotonic_ns: Function that returns the monotonic wall time in ns.
         """
         self._description = description
         self._clock_mode = clock_mode
-        self._clock = clock
-        # As requested.
-        self.speed = 1.0  # requested robot time per wall time; counts in clock mode realtime
-        self.paused_by: str | None = None
-        self._steps = 0  # ticks until it pauses again
-        # As measured.
-        self.real_time_factor: float | None = None  # robot time per wall time, while it passes
-        self._measured_since = (clock(), 0)  # monotonic ns, tick
-        # Where the present rate of safety time began.
-        self._base = (0, 0, 0)  # safety ns, monotonic ns, tick
+        self._read_monotonic_ns = read_monotonic_ns
+        # Requested by clients.
+        self.speed = 1.0  # robot time per wall time; used only in clock mode realtime
+        self.paused_by: str | None = None  # client that has paused the time, or lets single ticks pass
+        self._ticks_until_pause = 0  # only if `paused_by` is set
+        # Measured.
+        self.real_time_factor: float | None = None  # robot time per wall time; None if not measured yet
+        self._measurement_start = _TimeOrigin(safety_ns=0, monotonic_ns=read_monotonic_ns(), tick=0)
+        # Start of the time with the current pause and speed, from which safety time is extrapolated.
+        self._safety_time_origin = _TimeOrigin(safety_ns=0, monotonic_ns=0, tick=0)
 
     @property
     def is_paused(self) -> bool:
         """Return whether robot time is paused: no tick begins."""
-        return self.paused_by is not None and self._steps == 0
+        return self.paused_by is not None and self._ticks_until_pause == 0
 
     def safety_ns(self, tick: int, monotonic_ns: int | None = None) -> int:
-        """Return the safety time at a tick, in ns.
+        """Return the safety time at a moment in a tick, in ns.
 
         Args:
-            tick: the tick.
-            monotonic_ns: the moment in that tick; None: now.
+            tick: Tick that contains the moment.
+            monotonic_ns: Monotonic wall time of the moment. None means now.
         """
         period_ns = self._description.period_ns
         if self._clock_mode == "lockstep":
             return tick * period_ns
-        since_ns, since_monotonic_ns, since_tick = self._base
+        origin = self._safety_time_origin
         if self.is_paused:
-            return since_ns
+            return origin.safety_ns
         if self.speed != 1.0:
-            return since_ns + (tick - since_tick) * period_ns
-        at_ns = monotonic_ns or self._clock()
-        return since_ns + max(at_ns - since_monotonic_ns, 0)
+            return origin.safety_ns + (tick - origin.tick) * period_ns
+        moment_ns = monotonic_ns or self._read_monotonic_ns()
+        return origin.safety_ns + max(moment_ns - origin.monotonic_ns, 0)
 
-    def carry_out(self, request: SimulatorRequest, tick: int) -> str | Refusal:
-        """Carry out a request at a tick. The caller carries out a `reset`.
+    def execute_request(self, request: SimulatorRequest, tick: int) -> str | SimulatorRefusal:
+        """Pause, resume, step, or change the speed as requested. A `reset` is left to the caller.
+
+        Args:
+            request: Request of a client.
+            tick: Tick that comes next.
 
         Returns:
-            The result as text, or the reason for the refusal.
+            A text about the result, or the refusal.
         """
         refusal = self._find_refusal(request)
         if refusal is not None:
             return refusal
-        self._rebase(tick)
+        self._restart_safety_time(tick)
         match request.action:
             case "pause":
                 self.paused_by = request.requester
-                self._steps = 0
+                self._ticks_until_pause = 0
                 return f"paused by {request.requester}, before tick {tick}"
             case "resume":
                 self.paused_by = None
                 return f"resumed by {request.requester}, at tick {tick}"
             case "step":
                 self.paused_by = request.requester
-                self._steps = request.ticks
+                self._ticks_until_pause = request.ticks
                 return f"{request.ticks} ticks for {request.requester}, then paused before tick {tick + request.ticks}"
             case "speed":
                 self.speed = request.speed
@@ -98,50 +113,51 @@ class SimulatedTime:
             case _:
                 return f"reset by {request.requester}; arm again"
 
-    def _find_refusal(self, request: SimulatorRequest) -> Refusal | None:
-        """Return the reason to refuse a request; None: it can be carried out."""
+    def _find_refusal(self, request: SimulatorRequest) -> SimulatorRefusal | None:
+        """Return why a request cannot be carried out, or None if it can."""
         robot = self._description
         if not robot.simulated_time:
             if robot.emulated:
                 reason = "the time of emulated modules is that of their bus"
             else:
                 reason = "it moves something real"
-            return Refusal("not_simulated", f"backend {robot.backend!r} cannot {request.action}: {reason}")
+            return SimulatorRefusal("not_simulated", f"backend {robot.backend!r} cannot {request.action}: {reason}")
         if request.action == "resume" and self.paused_by is None:
-            return Refusal("wrong_state", "nothing to resume: it is not paused")
+            return SimulatorRefusal("wrong_state", "nothing to resume: it is not paused")
         if request.action == "speed" and self._clock_mode != "realtime":
             explanation = "goes as fast as it can; for a speed start the run with --clock-mode realtime"
-            return Refusal("wrong_clock_mode", f"the clock mode is {self._clock_mode}, which {explanation}")
+            return SimulatorRefusal("wrong_clock_mode", f"the clock mode is {self._clock_mode}, which {explanation}")
         return None
 
-    def tick_done(self, tick: int) -> None:
-        """Count a tick that has ended.
+    def on_tick_end(self, tick: int) -> None:
+        """Count a tick that has ended, and pause after the last requested one.
 
         Args:
-            tick: the tick that comes next.
+            tick: Tick that comes next.
         """
-        self._measure_factor(tick)
-        if self._steps == 1:
-            self._rebase(tick)  # before it pauses, because safety time passes until now
-        self._steps = max(self._steps - 1, 0)
+        self._measure_real_time_factor(tick)
+        if self._ticks_until_pause == 1:
+            self._restart_safety_time(tick)  # before the pause starts, because safety time passes until now
+        self._ticks_until_pause = max(self._ticks_until_pause - 1, 0)
 
-    def find_slowness(self) -> list[str]:
-        """Return a text that the requested speed is not reached; empty if it is, or if it is 1."""
+    def describe_slowness(self) -> list[str]:
+        """Return one warning if the requested speed is not reached; an empty list if it is, or if it is 1."""
         if self.speed == 1.0 or self.real_time_factor is None or self.real_time_factor >= MIN_SPEED_RATIO * self.speed:
             return []
         return [f"speed {self.speed:g} is requested, {self.real_time_factor:.2g} reached"]
 
-    def _rebase(self, tick: int) -> None:
-        """Begin another rate of safety time, and another measurement, at this tick."""
-        now_ns = self._clock()
-        self._base = (self.safety_ns(tick, now_ns), now_ns, tick)
+    def _restart_safety_time(self, tick: int) -> None:
+        """Start to count safety time, and to measure the real-time factor, from this tick on."""
+        now_ns = self._read_monotonic_ns()
+        self._safety_time_origin = _TimeOrigin(self.safety_ns(tick, now_ns), now_ns, tick)
         self.real_time_factor = None
-        self._measured_since = (now_ns, tick)
+        self._measurement_start = self._safety_time_origin
 
-    def _measure_factor(self, tick: int) -> None:
+    def _measure_real_time_factor(self, tick: int) -> None:
         """Update the real-time factor, about once a second."""
-        now_ns = self._clock()
-        since_ns, since_tick = self._measured_since
-        if now_ns - since_ns >= MEASURED_OVER_NS:
-            self.real_time_factor = (tick - since_tick) * self._description.period_ns / (now_ns - since_ns)
-            self._measured_since = (now_ns, tick)
+        now_ns = self._read_monotonic_ns()
+        start = self._measurement_start
+        elapsed_ns = now_ns - start.monotonic_ns
+        if elapsed_ns >= FACTOR_MEASUREMENT_NS:
+            self.real_time_factor = (tick - start.tick) * self._description.period_ns / elapsed_ns
+            self._measurement_start = start._replace(monotonic_ns=now_ns, tick=tick)

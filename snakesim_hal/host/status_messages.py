@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from snakesim_hal.safety.authority import TickDecision
+from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Description
 
@@ -10,17 +10,17 @@ from snakesim_hal.wire.messages import AppliedCommand, Description
 WAYS_OUT = {keys.POSE: "mission.localization=dead_reckoning does without, and so does a robot without [sensors.pose]"}
 
 
-def make_applied_command(description: Description, tick: int, decision: TickDecision) -> AppliedCommand:
+def make_applied_command(description: Description, tick: int, tick_output: TickOutput) -> AppliedCommand:
     """Return the message with the applied setpoints of a tick."""
-    setpoints = decision.setpoints
+    setpoints = tick_output.setpoints
     return AppliedCommand(
         tick=tick,
         timestamp_ns=tick * description.period_ns,
-        sequence=decision.sequence,
+        sequence=tick_output.command_sequence,
         mode=setpoints.mode,
         target=setpoints.target,
         torque_limit_nm=setpoints.torque_limit_nm,
-        limited={description.joints[i].name: word for i, word in decision.limited.items()},
+        limited={description.joints[i].name: word for i, word in tick_output.limit_by_joint.items()},
     )
 
 

@@ -13,11 +13,11 @@ from snakesim_hal.wire.messages import LifecycleState, Status
 
 STATUS_PERIOD_NS = 200_000_000
 MIN_STATUS_PERIOD_NS = 10_000_000  # for frequent changes, such as a contested lease
-HELD_UP_AFTER_NS = 500_000_000  # a tick that waits longer for answers is shown as held up
+LONG_WAIT_NS = 500_000_000  # a tick that waits longer for answers is shown as held up
 
 
-class _Mark(NamedTuple):
-    """What a status is published early for, when it changes."""
+class _StatusTrigger(NamedTuple):
+    """Values whose change makes the host publish its status before the next one is due."""
 
     lifecycle: LifecycleState
     lease_epoch: int
@@ -37,13 +37,13 @@ class StatusReporter:
         starter: HostEnd,
         realtime_warnings: Sequence[str],
     ) -> None:
-        """Publish nothing yet.
+        """Prepare to publish; the first status is published by the first call of `publish`.
 
         Args:
-            state: The host's state.
-            readiness: What the host waits for.
-            outbox: Sends the status over the network.
-            starter: Sends it to the process that started this host.
+            state: State of the host.
+            readiness: Finds the services that the host waits for.
+            outbox: Output that sends the status over the network.
+            starter: Channel that sends the status to the process that started this host.
             realtime_warnings: Real-time measures that the operating system refused.
         """
         self._state = state
@@ -51,32 +51,36 @@ class StatusReporter:
         self._outbox = outbox
         self._starter = starter
         self._realtime_warnings = list(realtime_warnings)
-        self._published_mark: _Mark | None = None
+        self._published_trigger: _StatusTrigger | None = None
         self._due_ns = 0  # monotonic
 
-    def publish(self, *, force: bool = False) -> None:
-        """Publish the status if it is due. `force` publishes it in any case."""
+    def publish_if_due(self, *, force: bool = False) -> None:
+        """Publish the status if it is due.
+
+        Args:
+            force: Whether to publish the status in any case.
+        """
         now_ns = time.monotonic_ns()
-        mark = self._mark()
-        if not force and not self._is_due(mark, now_ns):
+        trigger = self._make_trigger()
+        if not force and not self._is_due(trigger, now_ns):
             return
-        self._published_mark = mark
+        self._published_trigger = trigger
         self._due_ns = now_ns + STATUS_PERIOD_NS
-        status = self.build()
+        status = self.build_status()
         self._outbox.publish((keys.STATUS, status, None))
         self._starter.send(HostMessage(status=status))
 
-    def build(self) -> Status:
+    def build_status(self) -> Status:
         """Return the present status of the robot."""
         state = self._state
         authority = state.authority
         robot = state.description
         clock = state.clock
         simulated = clock.simulated
-        missing = self._readiness.missing_services()
-        differing = self._readiness.differing_processes()
+        missing = self._readiness.find_missing_services()
+        differing = self._readiness.describe_differing_processes()
         refusals = authority.list_unmet_conditions(clock.safety_ns())
-        slow_backend = state.backend_time.too_slow() if clock.clock_mode == "realtime" else []
+        slow_backend = state.backend_time.describe_slowness() if clock.clock_mode == "realtime" else []
 
         why = authority.reason
         if authority.state == "disarmed" and (refusals or missing or differing):
@@ -99,12 +103,12 @@ class StatusReporter:
             lifecycle=authority.state,
             reason=why,
             ready_to_arm=not refusals and not missing and not differing,
-            unchecked=authority.unchecked[:500],
+            unchecked=authority.unchecked_reason[:500],
             derated=authority.derated_joints,
             isolated=authority.isolated_joints,
             # Faults.
             faults=authority.faults,
-            faults_left_out=authority.faults_since_reset.left_out,
+            faults_left_out=authority.faults_since_reset.dropped_count,
             injected=list(state.faults.active),
             # Commands.
             lease_holder=authority.lease.holder,
@@ -116,16 +120,16 @@ class StatusReporter:
             # Services.
             alive=state.participants.present(),
             waiting_for=missing,
-            held_up=self._describe_wait()[:500],
+            held_up=self._describe_long_wait()[:500],
             # Timing.
             overruns=state.statistics.overruns,
             tick_times=state.statistics.times.timings(),
-            realtime_warnings=[*self._realtime_warnings, *slow_backend, *simulated.find_slowness()],
+            realtime_warnings=[*self._realtime_warnings, *slow_backend, *simulated.describe_slowness()],
         )
 
-    def _mark(self) -> _Mark:
+    def _make_trigger(self) -> _StatusTrigger:
         state = self._state
-        return _Mark(
+        return _StatusTrigger(
             lifecycle=state.authority.state,
             lease_epoch=state.authority.lease.epoch,
             fault_count=len(state.authority.faults),
@@ -133,21 +137,21 @@ class StatusReporter:
             speed=state.clock.simulated.speed,
         )
 
-    def _is_due(self, mark: _Mark, now_ns: int) -> bool:
-        published = self._published_mark
-        if published is None or mark.lifecycle != published.lifecycle:
+    def _is_due(self, trigger: _StatusTrigger, now_ns: int) -> bool:
+        published = self._published_trigger
+        if published is None or trigger.lifecycle != published.lifecycle:
             return True
-        if mark != published:
+        if trigger != published:
             return now_ns >= self._due_ns - STATUS_PERIOD_NS + MIN_STATUS_PERIOD_NS
         return now_ns >= self._due_ns
 
-    def _describe_wait(self) -> str:
-        """Return what lockstep has been waiting for, if it has waited for long; otherwise an empty text."""
+    def _describe_long_wait(self) -> str:
+        """Return a text about the services that lockstep has been waiting for, if for long; otherwise an empty text."""
         state = self._state
         if state.waiting_since_ns is None:
             return ""
         waited_ns = time.monotonic_ns() - state.waiting_since_ns
-        if waited_ns < HELD_UP_AFTER_NS:
+        if waited_ns < LONG_WAIT_NS:
             return ""
         tick = state.clock.tick
         return f"tick {tick} waits for {state.participants.describe_awaited(tick)}, for {waited_ns * 1e-9:.1f} s"

@@ -7,7 +7,7 @@ import time
 from collections import deque
 
 REANCHOR_PERIODS = 1  # if later, all deadlines are shifted: ticks that catch up in a burst would break rate limits
-KEPT_TICKS = 4096  # whose publish times are known
+MAX_STORED_TICKS = 4096  # whose publish times are known
 LONG_AGO_NS = -(2**60)  # publish time of a tick that is not known
 SMOOTHING = 0.1  # weight of the newest duration
 SETTLED_TICKS = 30  # after which a smoothed duration is meaningful
@@ -27,8 +27,8 @@ class Deadlines:
         """Begin a tick now, and derive all later deadlines from this one.
 
         Args:
-            tick: the tick that begins.
-            speed: robot time per wall time from now on; None: unchanged.
+            tick: The tick that begins.
+            speed: Robot time per wall time from now on; None: unchanged.
         """
         if speed is not None:
             self._period_ns = round(self._robot_period_ns / speed)
@@ -46,7 +46,7 @@ class Deadlines:
         return late_ns > 0
 
 
-class BackendTime:
+class BackendTimer:
     """Measures how long the backend's calls take in a tick, smoothed over some ten ticks."""
 
     def __init__(self, backend: str, period_ns: int) -> None:
@@ -58,24 +58,38 @@ class BackendTime:
         self._ticks = 0
 
     def record_read(self, since_ns: int) -> int:
-        """Note that the backend has been sampled, since a monotonic time. Returns the duration in ns."""
-        took_ns = time.monotonic_ns() - since_ns
-        self.read_ns += SMOOTHING * (took_ns - self.read_ns)
+        """Record how long the backend has taken to read its sensors.
+
+        Args:
+            since_ns: Monotonic time at which the call started.
+
+        Returns:
+            The duration in ns.
+        """
+        duration_ns = time.monotonic_ns() - since_ns
+        self.read_ns += SMOOTHING * (duration_ns - self.read_ns)
         self._ticks += 1
-        return took_ns
+        return duration_ns
 
     def record_write(self, since_ns: int) -> int:
-        """Note that the backend has taken setpoints and advanced, since a monotonic time. Returns as `read` does."""
-        took_ns = time.monotonic_ns() - since_ns
-        self.write_ns += SMOOTHING * (took_ns - self.write_ns)
-        return took_ns
+        """Record how long the backend has taken to process setpoints and to advance.
 
-    def too_slow(self) -> list[str]:
-        """Return a text that the backend's calls leave too little time in a tick, with a feasible rate; else empty."""
-        taken_ns = self.read_ns + self.write_ns
-        if self._ticks < SETTLED_TICKS or taken_ns < MAX_PERIOD_RATIO * self._period_ns:
+        Args:
+            since_ns: Monotonic time at which the first of these calls started.
+
+        Returns:
+            The duration in ns.
+        """
+        duration_ns = time.monotonic_ns() - since_ns
+        self.write_ns += SMOOTHING * (duration_ns - self.write_ns)
+        return duration_ns
+
+    def describe_slowness(self) -> list[str]:
+        """Return one warning, with a feasible rate, if the backend's calls take too long; otherwise an empty list."""
+        duration_ns = self.read_ns + self.write_ns
+        if self._ticks < SETTLED_TICKS or duration_ns < MAX_PERIOD_RATIO * self._period_ns:
             return []
-        feasible_hz = MAX_PERIOD_RATIO * 1e9 / taken_ns
+        feasible_hz = MAX_PERIOD_RATIO * 1e9 / duration_ns
         read_ms = self.read_ns / 1e6
         write_ms = self.write_ns / 1e6
         period_ms = self._period_ns / 1e6
@@ -90,29 +104,35 @@ class PublishTimes:
 
     def __init__(self) -> None:
         """Start without ticks."""
-        self._rows: deque[tuple[int, int, int]] = deque(maxlen=KEPT_TICKS)  # tick, safety ns, monotonic ns
+        self._published_ticks: deque[tuple[int, int, int]] = deque(
+            maxlen=MAX_STORED_TICKS
+        )  # tick, safety ns, monotonic ns
 
     @property
     def last_tick(self) -> int | None:
         """Return the newest published tick; None if there is none."""
-        if not self._rows:
+        if not self._published_ticks:
             return None
-        return self._rows[-1][0]
+        return self._published_ticks[-1][0]
 
     def record(self, tick: int, safety_ns: int, monotonic_ns: int) -> None:
         """Record when a tick was published. If it is the newest one again, its times are replaced."""
         if self.last_tick == tick:
-            self._rows.pop()
-        self._rows.append((tick, safety_ns, monotonic_ns))
+            self._published_ticks.pop()
+        self._published_ticks.append((tick, safety_ns, monotonic_ns))
 
-    def times_of_tick(self, tick: int) -> tuple[int, int]:
-        """Return the safety time and the monotonic time of a tick, in ns; LONG_AGO_NS for an unknown tick."""
+    def find_publish_times_ns(self, tick: int) -> tuple[int, int]:
+        """Return the safety time and the monotonic time at which a tick was published, in ns.
+
+        Returns:
+            LONG_AGO_NS twice for a tick that was never published, or too long ago to be stored.
+        """
         last_tick = self.last_tick
         if last_tick is None:
             return LONG_AGO_NS, LONG_AGO_NS
         ticks_back = last_tick - tick
-        if 0 <= ticks_back < len(self._rows):
-            published_tick, safety_ns, monotonic_ns = self._rows[-1 - ticks_back]
+        if 0 <= ticks_back < len(self._published_ticks):
+            published_tick, safety_ns, monotonic_ns = self._published_ticks[-1 - ticks_back]
             if published_tick == tick:
                 return safety_ns, monotonic_ns
         return LONG_AGO_NS, LONG_AGO_NS

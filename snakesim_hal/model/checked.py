@@ -16,29 +16,31 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import MAX_JOINTS, from_zero
 
-CHECK = "joint_check"  # the controller of the start check; it may run on a robot that is not checked yet
-Words = Annotated[str, Meta(max_length=200)]
+START_CHECK_CONTROLLER = (
+    "joint_check"  # the controller of the start check; it may run on a robot that is not checked yet
+)
+ShortText = Annotated[str, Meta(max_length=200)]
 JointProperty = Literal["drive", "order", "sign", "gear", "zero"]
 PROPERTIES: tuple[JointProperty, ...] = get_args(JointProperty)  # those that a start check confirms for every joint
-JointNames = Annotated[list[Words], Meta(max_length=MAX_JOINTS)]
+JointNames = Annotated[list[ShortText], Meta(max_length=MAX_JOINTS)]
 
 
 class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
     """The section [checked], which `snakesim robot check` writes."""
 
-    by: Words
+    by: ShortText
     """Name of the person who checked the robot."""
 
-    on: Words
+    on: ShortText
     """Date of the check."""
 
-    joints: Words
+    joints: ShortText
     """Digest of how the joints were mounted at the check. If it differs now, the record is not valid."""
 
-    backend: Words
+    backend: ShortText
     """Backend that the robot was checked with."""
 
-    hardware: Words = ""
+    hardware: ShortText = ""
     """Hardware of that backend, as it reports it. Empty: it does not report it."""
 
     serials: JointNames = []
@@ -57,7 +59,7 @@ class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
     """Backlash of a gear that the check allowed."""
 
 
-def mounting_digest(joints: Sequence[Joint]) -> str:
+def compute_mounting_digest(joints: Sequence[Joint]) -> str:
     """Return a digest of everything that the start check judges.
 
     It covers the order, axes, ids, buses, signs, zeros, gears and torque constants of the joints.
@@ -70,13 +72,16 @@ def mounting_digest(joints: Sequence[Joint]) -> str:
     return hashlib.sha256(encoded).hexdigest()[:16]
 
 
-def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], robot: Description) -> str:
-    """Return why this robot counts as not checked, in words; empty if it is checked, or if nothing real moves.
+def find_unchecked_reason(checked: StartCheckRecord | None, joints: Sequence[Joint], robot: Description) -> str:
+    """Find the reason why a robot counts as not checked.
 
     Args:
-        checked: the record in the robot file.
-        joints: the joints as the robot file has them now.
-        robot: the description from the host, with the serial numbers that the drives report now.
+        checked: Record of the last start check in the robot file. None if the robot was never checked.
+        joints: Joints as the robot file describes them now.
+        robot: Description from the host, with the serial numbers that the drives report now.
+
+    Returns:
+        The reason as a clause that follows the robot's name, or an empty text if the robot is checked or emulated.
     """
     if robot.emulated:
         return ""
@@ -84,7 +89,7 @@ def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], rob
         return "its joints have not been checked against its file: check them (docs/hardware/calibration.md)"
     remedy = "check it again (docs/hardware/calibration.md)"
     since = f"since {checked.by} checked it on {checked.on}"
-    if checked.joints != mounting_digest(joints):
+    if checked.joints != compute_mounting_digest(joints):
         return f"how its joints are mounted was changed in its file {since}: {remedy}"
     unconfirmed = [name for name in PROPERTIES if name not in checked.confirmed]
     if unconfirmed:
@@ -94,7 +99,7 @@ def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], rob
         )
     drives_report_serials = any(joint.serial for joint in robot.joints)
     if drives_report_serials or any(checked.serials):
-        replaced = _replaced_drives(checked, robot)
+        replaced = _describe_replaced_drives(checked, robot)
         if not replaced:
             return ""
         return f"{'; '.join(replaced)}: changed {since}: {remedy}"
@@ -105,7 +110,7 @@ def why_unchecked(checked: StartCheckRecord | None, joints: Sequence[Joint], rob
     return ""
 
 
-def _replaced_drives(checked: StartCheckRecord, robot: Description) -> list[str]:
+def _describe_replaced_drives(checked: StartCheckRecord, robot: Description) -> list[str]:
     """Return a sentence for each joint whose drive has another serial number than at the check."""
     checked_serials = checked.serials or [""] * len(robot.joints)
     sentences: list[str] = []

@@ -17,8 +17,8 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire import keys
 
 TargetType = Literal["process", "key", "joint", "bus", "simulator", "clock"]
-Doer = Literal["supervisor", "process", "writer", "module", "samples", "driver", "host", "simulator"]
-DOERS: Mapping[Doer, str] = {
+FaultExecutor = Literal["supervisor", "process", "writer", "module", "samples", "driver", "host", "simulator"]
+EXECUTOR_DESCRIPTIONS: Mapping[FaultExecutor, str] = {
     "supervisor": "the supervisor, `snakesim run`",
     "process": "the process itself",
     "writer": "the publisher of the key",
@@ -35,101 +35,109 @@ HAL = "hal"
 CONTROL = "control"
 ROUTER = "router"  # the Zenoh router of a run with --with-router
 
-FORM = "KIND:TARGET@START, KIND:TARGET@START-END, or either with =AMOUNT; in seconds, such as mute:joint_3@2-3.5"
-LONGEST_TEXT = 200  # characters of an injected fault in its text form
-_text = re.compile(
+TEXT_FORMAT = "KIND:TARGET@START, KIND:TARGET@START-END, or either with =AMOUNT; in seconds, such as mute:joint_3@2-3.5"
+MAX_TEXT_LENGTH = 200  # characters of an injected fault in its text form
+_TEXT_PATTERN = re.compile(
     r"(?P<kind>[a-z_]+):(?P<target>[a-z0-9_/]+)@(?P<start>[0-9.]+)(-(?P<end>[0-9.]+))?(=(?P<amount>[-+0-9.e]+))?"
 )
-_numbered = re.compile(r"(?P<type>joint|bus)_(?P<number>[1-9][0-9]*)")
+_NUMBERED_TARGET_PATTERN = re.compile(r"(?P<type>joint|bus)_(?P<number>[1-9][0-9]*)")
 
 
 @dataclass(frozen=True)
-class Amount:
+class FaultAmount:
     """The strength of an injected fault: the number behind `=`."""
 
     description: str  # what the number is
     unit: str  # "1": it has no unit
     default: float
-    low: float
-    high: float
+    min_value: float
+    max_value: float
 
 
 @dataclass(frozen=True)
-class Kind:
+class FaultKind:
     """One kind of injected fault."""
 
     description: str
-    by: tuple[Doer, ...]  # who carries it out; of two, the first one if it can
-    amount: Amount | None = None  # none: it has no strength
-    once: bool = False  # true: it happens at its start, and has no end
-    in_module: str = ""  # what it does in a joint module, where that is more than `description`
+    executors: tuple[FaultExecutor, ...]  # what can carry it out; of two, the first one if it supports the kind
+    amount: FaultAmount | None = None  # None if the kind has no strength
+    is_instantaneous: bool = False  # True if it happens at its start, and has no end
+    module_description: str = ""  # what it does in a joint module, where that is more than `description`
 
 
-SHARE = Amount("share of the messages", "1", 1.0, 0.0, 1.0)
+MESSAGE_FRACTION = FaultAmount("share of the messages", "1", 1.0, 0.0, 1.0)
 
-KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
+FAULT_KINDS: Mapping[TargetType, Mapping[str, FaultKind]] = {
     "process": {
-        "kill": Kind("SIGKILL: terminated immediately", ("supervisor",), once=True),
-        "stop": Kind("SIGTERM: ends in an orderly way", ("supervisor",), once=True),
-        "freeze": Kind("SIGSTOP until the end: the process exists and sends nothing", ("supervisor",)),
-        "hang": Kind(
+        "kill": FaultKind("SIGKILL: terminated immediately", ("supervisor",), is_instantaneous=True),
+        "stop": FaultKind("SIGTERM: ends in an orderly way", ("supervisor",), is_instantaneous=True),
+        "freeze": FaultKind("SIGSTOP until the end: the process exists and sends nothing", ("supervisor",)),
+        "hang": FaultKind(
             "its interpreter is busy until the end: connected, but does nothing",
             ("process",),
         ),
     },
     "key": {
-        "drop": Kind("messages are lost", ("writer",), SHARE),
-        "delay": Kind("messages arrive late", ("writer",), Amount("delay", "s", 0.05, 0.0, 10.0)),
-        "duplicate": Kind("messages arrive twice", ("writer",), SHARE),
-        "reorder": Kind("a message arrives after the one that follows it", ("writer",), SHARE),
-        "corrupt": Kind("bytes of messages are changed", ("writer",), SHARE),
-        "flood": Kind("the newest message is sent repeatedly", ("writer",), Amount("rate", "1/s", 5000.0, 1.0, 1e5)),
+        "drop": FaultKind("messages are lost", ("writer",), MESSAGE_FRACTION),
+        "delay": FaultKind("messages arrive late", ("writer",), FaultAmount("delay", "s", 0.05, 0.0, 10.0)),
+        "duplicate": FaultKind("messages arrive twice", ("writer",), MESSAGE_FRACTION),
+        "reorder": FaultKind("a message arrives after the one that follows it", ("writer",), MESSAGE_FRACTION),
+        "corrupt": FaultKind("bytes of messages are changed", ("writer",), MESSAGE_FRACTION),
+        "flood": FaultKind(
+            "the newest message is sent repeatedly", ("writer",), FaultAmount("rate", "1/s", 5000.0, 1.0, 1e5)
+        ),
     },
     "joint": {
-        "mute": Kind(
-            "sends nothing", ("module", "samples"), in_module="sends nothing, but still follows its setpoints"
+        "mute": FaultKind(
+            "sends nothing", ("module", "samples"), module_description="sends nothing, but still follows its setpoints"
         ),
-        "freeze": Kind(
+        "freeze": FaultKind(
             "repeats its last sample, whose age grows",
             ("module", "samples"),
-            in_module="its main loop hangs: repeats its last joint state, no heartbeat, passive after its watchdog",
+            module_description=(
+                "its main loop hangs: repeats its last joint state, no heartbeat, passive after its watchdog"
+            ),
         ),
-        "wrong": Kind("its angle is wrong", ("samples",), Amount("offset", "rad", 0.5, -6.3, 6.3)),
-        "nan": Kind("its angle is NaN", ("samples",)),
-        "reboot": Kind("its module restarts", ("module",), once=True),
-        "counter": Kind("joint states with a wrong count", ("module",)),
-        "checksum": Kind("joint states with a wrong checksum", ("module",)),
-        "duplicate": Kind(
+        "wrong": FaultKind("its angle is wrong", ("samples",), FaultAmount("offset", "rad", 0.5, -6.3, 6.3)),
+        "nan": FaultKind("its angle is NaN", ("samples",)),
+        "reboot": FaultKind("its module restarts", ("module",), is_instantaneous=True),
+        "counter": FaultKind("joint states with a wrong count", ("module",)),
+        "checksum": FaultKind("joint states with a wrong checksum", ("module",)),
+        "duplicate": FaultKind(
             "a second module or drive with the same id is on the bus",
             ("module",),
-            in_module="a second module or drive with the same id and another serial number is on the bus",
+            module_description="a second module or drive with the same id and another serial number is on the bus",
         ),
-        "overheat": Kind(
+        "overheat": FaultKind(
             "its winding is heated to 5 °C above `stop_at_c`, until the end of the fault if one is set",
             ("module",),
         ),
-        "leak": Kind("detects water inside", ("module",)),
-        "babble": Kind("sends its heartbeat as often as the bus allows", ("module",)),
-        "undervoltage": Kind("its supply falls to 12 V", ("module",)),
+        "leak": FaultKind("detects water inside", ("module",)),
+        "babble": FaultKind("sends its heartbeat as often as the bus allows", ("module",)),
+        "undervoltage": FaultKind("its supply falls to 12 V", ("module",)),
     },
     "bus": {
-        "cut": Kind("the interface goes down; it comes up again at the end", ("driver",)),
-        "bus_off": Kind("the controller leaves the bus; it restarts at the end", ("driver",)),
-        "error_passive": Kind("the controller has counted more than 127 errors", ("driver",), once=True),
-        "overflow": Kind("received frames are lost", ("driver",), once=True),
-        "full": Kind("the transmit queue is full", ("driver",)),
-        "slow": Kind("each reading of it takes longer", ("driver",), Amount("by", "s", 0.02, 0.0, 1.0)),
+        "cut": FaultKind("the interface goes down; it comes up again at the end", ("driver",)),
+        "bus_off": FaultKind("the controller leaves the bus; it restarts at the end", ("driver",)),
+        "error_passive": FaultKind(
+            "the controller has counted more than 127 errors", ("driver",), is_instantaneous=True
+        ),
+        "overflow": FaultKind("received frames are lost", ("driver",), is_instantaneous=True),
+        "full": FaultKind("the transmit queue is full", ("driver",)),
+        "slow": FaultKind("each reading of it takes longer", ("driver",), FaultAmount("by", "s", 0.02, 0.0, 1.0)),
     },
     "simulator": {
-        "slow": Kind("runs at a share of real time", ("host",), Amount("share of real time", "1", 0.1, 0.001, 1.0)),
-        "diverge": Kind("its state becomes impossible", ("simulator",), once=True),
+        "slow": FaultKind(
+            "runs at a share of real time", ("host",), FaultAmount("share of real time", "1", 0.1, 0.001, 1.0)
+        ),
+        "diverge": FaultKind("its state becomes impossible", ("simulator",), is_instantaneous=True),
     },
     "clock": {
-        "step": Kind(
+        "step": FaultKind(
             "the wall clock jumps, with CAP_SYS_TIME",
             ("supervisor",),
-            Amount("by", "s", 3600.0, -1e6, 1e6),
-            once=True,
+            FaultAmount("by", "s", 3600.0, -1e6, 1e6),
+            is_instantaneous=True,
         ),
     },
 }
@@ -148,24 +156,24 @@ class Injection:
     @property
     def target_type(self) -> TargetType:
         """Return what sort of thing the fault happens to."""
-        return target_type(self.target)
+        return infer_target_type(self.target)
 
     @property
-    def about(self) -> Kind:
+    def kind_info(self) -> FaultKind:
         """Return the kind of fault, from the registry."""
-        return KINDS[self.target_type][self.kind]
+        return FAULT_KINDS[self.target_type][self.kind]
 
     @property
-    def number(self) -> int:
+    def target_index(self) -> int:
         """Return the index of the joint or bus that is the target: from 0, joints from the tail."""
-        match = _numbered.fullmatch(self.target)
+        match = _NUMBERED_TARGET_PATTERN.fullmatch(self.target)
         assert match is not None, f"{self.target} has no number"
         return int(match["number"]) - 1
 
     @property
-    def part(self) -> str:
+    def executing_part(self) -> str:
         """Return the part of a run that carries it out: the supervisor `run`, the host `hal`, or a service by name."""
-        match self.about.by[0]:
+        match self.kind_info.executors[0]:
             case "supervisor":
                 return RUN
             case "process":
@@ -184,9 +192,9 @@ class Injection:
         return text
 
 
-def target_type(target: str) -> TargetType:
+def infer_target_type(target: str) -> TargetType:
     """Return what sort of thing a target is, by its name."""
-    numbered = _numbered.fullmatch(target)
+    numbered = _NUMBERED_TARGET_PATTERN.fullmatch(target)
     if numbered is not None:
         return "joint" if numbered["type"] == "joint" else "bus"
     if "/" in target:
@@ -196,11 +204,11 @@ def target_type(target: str) -> TargetType:
     return "process"
 
 
-OUTSIDE = ("operator", "preview")  # writers that are no part of a run
+EXTERNAL_WRITERS = ("operator", "preview")  # writers that are no part of a run
 
 
 def find_writer(key: str) -> str:
-    """Return the part of a run that writes a key.
+    """Return the part of a run that writes a key: HAL, CONTROL or the name of another service.
 
     Raises:
         ConfigError: No part of a run writes the key.
@@ -225,23 +233,31 @@ def find_writer(key: str) -> str:
 
 def _is_written_by_run(row: keys.KeyRow) -> bool:
     """Return whether a part of a run publishes messages under the keys of a row."""
-    return row.kind in ("stream", "latched") and row.writer not in OUTSIDE
+    return row.kind in ("stream", "latched") and row.writer not in EXTERNAL_WRITERS
 
 
 def parse_injection(text: str) -> Injection:
-    """Return the injected fault that a text describes, such as `mute:joint_3@2-3.5`.
+    """Parse the text form of an injected fault, such as `mute:joint_3@2-3.5`, and validate the fault.
+
+    Args:
+        text: Text in the form `TEXT_FORMAT`.
+
+    Returns:
+        The fault, with the default of its amount filled in if the text has no amount.
 
     Raises:
         ConfigError: The text is not valid, or the fault is not allowed.
     """
-    if len(text) > LONGEST_TEXT:
+    if len(text) > MAX_TEXT_LENGTH:
         raise ConfigError(
-            f"fault {text[:40]!r}...: {len(text)} characters, at most {LONGEST_TEXT}: give {FORM}",
+            f"fault {text[:40]!r}...: {len(text)} characters, at most {MAX_TEXT_LENGTH}: give {TEXT_FORMAT}",
             code="injection/unknown-fault",
         )
-    match = _text.fullmatch(text.strip())
+    match = _TEXT_PATTERN.fullmatch(text.strip())
     if match is None:
-        raise ConfigError(f"fault {text!r}: give {FORM}. Kinds: {kinds_in_short()}", code="injection/unknown-fault")
+        raise ConfigError(
+            f"fault {text!r}: give {TEXT_FORMAT}. Kinds: {summarize_fault_kinds()}", code="injection/unknown-fault"
+        )
     amount: float | None = None
     try:
         start_s = float(match["start"])
@@ -257,25 +273,25 @@ def parse_injection(text: str) -> Injection:
             f"fault {text!r}: it ends at {end_s:g} s, which must be later than its start, {start_s:g} s",
             code="injection/unknown-fault",
         )
-    return check_injection(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
+    return validate_and_complete_injection(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
 
 
-def check_injection(injection: Injection, given_text: str | None = None) -> Injection:
-    """Return the injected fault with the default of its amount filled in, if it is allowed.
+def validate_and_complete_injection(injection: Injection, given_text: str | None = None) -> Injection:
+    """Check that an injected fault is allowed, and return it with the default of its amount filled in.
 
     Args:
-        injection: to check.
-        given_text: how the user wrote it, for errors; None: its own text form.
+        injection: Fault to check.
+        given_text: Text of the fault as the user wrote it, for errors. None for the text form of `injection`.
 
     Raises:
         ConfigError: The target has no such kind of fault, the key has no writer, or the amount is not allowed.
     """
     text = str(injection) if given_text is None else given_text
-    kind = KINDS[injection.target_type].get(injection.kind)
+    kind = FAULT_KINDS[injection.target_type].get(injection.kind)
     if kind is None:
         raise _unknown_kind_error(injection, text)
     if injection.target_type == "key":
-        find_writer(injection.target)  # raises for a key without a writer
+        find_writer(injection.target)  # raises ConfigError for a key without a writer
     if kind.amount is None:
         if injection.amount is not None:
             raise ConfigError(
@@ -284,10 +300,10 @@ def check_injection(injection: Injection, given_text: str | None = None) -> Inje
             )
         return injection
     amount = kind.amount.default if injection.amount is None else injection.amount
-    if not isfinite(amount) or not kind.amount.low <= amount <= kind.amount.high:
+    if not isfinite(amount) or not kind.amount.min_value <= amount <= kind.amount.max_value:
         raise ConfigError(
-            f"fault {text!r}: {kind.amount.description} = {amount:g} must be from {kind.amount.low:g} to "
-            f"{kind.amount.high:g} {kind.amount.unit}",
+            f"fault {text!r}: {kind.amount.description} = {amount:g} must be from {kind.amount.min_value:g} to "
+            f"{kind.amount.max_value:g} {kind.amount.unit}",
             code="injection/unknown-fault",
         )
     return replace(injection, amount=amount)
@@ -296,24 +312,26 @@ def check_injection(injection: Injection, given_text: str | None = None) -> Inje
 def _unknown_kind_error(injection: Injection, text: str) -> ConfigError:
     """Return the error for a kind that the target does not have; it names the targets that have this kind."""
     sort = injection.target_type
-    others = [other for other in get_args(TargetType) if injection.kind in KINDS[other]]
+    others = [other for other in get_args(TargetType) if injection.kind in FAULT_KINDS[other]]
     plurals = ["processes" if other == "process" else f"{other}s" for other in others]
     hint = f"; {injection.kind} is for {' and '.join(plurals)}" if plurals else ""
     return ConfigError(
         f"fault {text!r}: a {sort} such as {injection.target} knows no {injection.kind!r}, only "
-        f"{', '.join(KINDS[sort])}{hint}",
+        f"{', '.join(FAULT_KINDS[sort])}{hint}",
         code="injection/unknown-fault",
     )
 
 
-def check_targets(injections: Iterable[Injection], *, services: Iterable[str], joints: int, buses: int) -> None:
-    """Check that a run has every target of its injected faults.
+def validate_injection_targets(
+    injections: Iterable[Injection], *, services: Iterable[str], joints: int, buses: int
+) -> None:
+    """Raise ConfigError unless a run has every target of its injected faults.
 
     Args:
-        injections: the faults.
-        services: names of the services that the run starts.
-        joints: number of joints.
-        buses: number of buses.
+        injections: Injected faults.
+        services: Names of the services that the run starts.
+        joints: Number of joints of the robot.
+        buses: Number of buses of the backend.
 
     Raises:
         ConfigError: The run has no such joint, bus, process or key, or the router does not support the fault.
@@ -322,45 +340,45 @@ def check_targets(injections: Iterable[Injection], *, services: Iterable[str], j
     for injection in injections:
         match injection.target_type:
             case "joint":
-                _check_number(injection, "joint", joints)
+                _validate_target_index(injection, "joint", joints)
             case "bus":
-                _check_number(injection, "bus", buses)
+                _validate_target_index(injection, "bus", buses)
             case "process":
-                _check_process(injection, processes)
+                _validate_target_process(injection, processes)
             case "key":
-                _check_writer(injection, processes)
+                _validate_key_writer(injection, processes)
             case "simulator" | "clock":
                 pass
 
 
-def _check_number(injection: Injection, sort: str, count: int) -> None:
-    """Raise ConfigError if the number of a joint or bus is above their count."""
-    if injection.number >= count:
-        has = f"{sort}_1 to {sort}_{count}" if count else f"no {sort}"
+def _validate_target_index(injection: Injection, target_type: str, count: int) -> None:
+    """Raise ConfigError if there is no joint or bus of this number."""
+    if injection.target_index >= count:
+        available = f"{target_type}_1 to {target_type}_{count}" if count else f"no {target_type}"
         raise ConfigError(
-            f"fault {str(injection)!r}: there is no {injection.target}; this run has {has}",
+            f"fault {str(injection)!r}: there is no {injection.target}; this run has {available}",
             code="injection/unknown-target",
         )
 
 
-def _check_process(injection: Injection, processes: list[str]) -> None:
-    """Raise ConfigError if the run has no such process, or the router cannot do it."""
+def _validate_target_process(injection: Injection, processes: list[str]) -> None:
+    """Raise ConfigError if the run has no such process, or if the router does not support the fault."""
     if injection.target not in processes:
         raise ConfigError(
             f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has {', '.join(processes)}",
             code="injection/unknown-target",
         )
-    if injection.target == ROUTER and injection.part != RUN:
-        possible = [name for name, kind in KINDS["process"].items() if "supervisor" in kind.by]
+    if injection.target == ROUTER and injection.executing_part != RUN:
+        possible = [name for name, kind in FAULT_KINDS["process"].items() if "supervisor" in kind.executors]
         raise ConfigError(
             f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(possible)}",
             code="injection/not-supported",
         )
 
 
-def _check_writer(injection: Injection, processes: list[str]) -> None:
+def _validate_key_writer(injection: Injection, processes: list[str]) -> None:
     """Raise ConfigError if the run does not start the process that writes the key."""
-    writer = injection.part
+    writer = injection.executing_part
     if writer not in processes and writer != HAL:
         raise ConfigError(
             f"fault {str(injection)!r}: {writer} writes {injection.target}, and this run does not start it",
@@ -369,51 +387,51 @@ def _check_writer(injection: Injection, processes: list[str]) -> None:
 
 
 @dataclass(frozen=True)
-class Change:
-    """The time at which an injected fault begins or ends."""
+class FaultTransition:
+    """The time at which an injected fault starts or ends."""
 
-    at_s: float
+    time_s: float
     injection: Injection
-    begins: bool
+    is_start: bool
 
 
 class InjectionPlan:
-    """The beginnings and ends of injected faults, in the order of time."""
+    """The starts and ends of injected faults, in the order of time."""
 
     def __init__(self, injections: Iterable[Injection] = ()) -> None:
-        self._changes: list[Change] = []
+        self._transitions: list[FaultTransition] = []
         for injection in injections:
             self.add(injection)
 
     def add(self, injection: Injection) -> None:
         """Add an injected fault to the plan."""
-        self._changes.append(Change(injection.start_s, injection, True))
-        if injection.end_s != inf and not injection.about.once:
-            self._changes.append(Change(injection.end_s, injection, False))
-        self._changes.sort(key=lambda change: change.at_s)
+        self._transitions.append(FaultTransition(injection.start_s, injection, True))
+        if injection.end_s != inf and not injection.kind_info.is_instantaneous:
+            self._transitions.append(FaultTransition(injection.end_s, injection, False))
+        self._transitions.sort(key=lambda transition: transition.time_s)
 
-    def next_s(self) -> float:
-        """Return the time of the next change; inf if there is none left."""
-        return self._changes[0].at_s if self._changes else inf
+    def next_transition_s(self) -> float:
+        """Return the time of the next transition; inf if none is left."""
+        return self._transitions[0].time_s if self._transitions else inf
 
-    def until(self, now_s: float) -> list[Change]:
-        """Remove the changes that are due by now from the plan, and return them."""
-        due = [change for change in self._changes if change.at_s <= now_s]
-        self._changes = self._changes[len(due) :]
-        return due
+    def pop_due_transitions(self, now_s: float) -> list[FaultTransition]:
+        """Remove the transitions that are due by now from the plan, and return them."""
+        due_transitions = [transition for transition in self._transitions if transition.time_s <= now_s]
+        self._transitions = self._transitions[len(due_transitions) :]
+        return due_transitions
 
 
-def explain_kinds() -> str:
+def describe_fault_kinds() -> str:
     """Return a list of every kind, for a command's help."""
     lines: list[str] = []
-    for sort, kinds in KINDS.items():
+    for sort, kinds in FAULT_KINDS.items():
         lines.append(f"{sort}:")
         for name, kind in kinds.items():
-            lines.append(f"  {name:<14} {kind.description}{_explain_amount(kind.amount)}")
+            lines.append(f"  {name:<14} {kind.description}{_describe_amount(kind.amount)}")
     return "\n".join(lines)
 
 
-def _explain_amount(amount: Amount | None) -> str:
+def _describe_amount(amount: FaultAmount | None) -> str:
     """Return what the amount of a kind is, and its default; empty if the kind has none."""
     if amount is None:
         return ""
@@ -421,6 +439,6 @@ def _explain_amount(amount: Amount | None) -> str:
     return f"; amount: {amount.description}, {amount.default:g}{unit} by default"
 
 
-def kinds_in_short() -> str:
+def summarize_fault_kinds() -> str:
     """Return the names of all kinds in one line, by the sort of target."""
-    return "; ".join(f"{sort}: {', '.join(kinds)}" for sort, kinds in KINDS.items())
+    return "; ".join(f"{sort}: {', '.join(kinds)}" for sort, kinds in FAULT_KINDS.items())

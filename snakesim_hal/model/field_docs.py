@@ -33,8 +33,8 @@ class FieldDoc:
 
 def document_fields(struct: type[msgspec.Struct]) -> list[FieldDoc]:
     """Return the documentation of all fields of a Struct in their order; the tag of a Struct comes first."""
-    info = type_info_of(struct)
-    descriptions = describe_fields(struct)
+    info = inspect_struct_type(struct)
+    descriptions = collect_field_descriptions(struct)
     docs = [_document_field(field, descriptions.get(field.encode_name, "")) for field in info.fields]
     if info.tag_field is None:
         return docs
@@ -42,7 +42,7 @@ def document_fields(struct: type[msgspec.Struct]) -> list[FieldDoc]:
 
 
 @cache
-def type_info_of(struct: type[msgspec.Struct]) -> inspect.StructType:
+def inspect_struct_type(struct: type[msgspec.Struct]) -> inspect.StructType:
     """Return the fields of a Struct with their types."""
     info = inspect.type_info(struct)
     assert isinstance(info, inspect.StructType)
@@ -74,59 +74,62 @@ def _document_field(field: inspect.Field, description: str) -> FieldDoc:
 
 
 @cache
-def describe_fields(struct: type[msgspec.Struct]) -> dict[str, str]:
-    """Return the descriptions of a Struct's fields by name, those of inherited fields included.
+def collect_field_descriptions(struct: type[msgspec.Struct]) -> dict[str, str]:
+    """Collect the descriptions of a Struct's fields by name, including inherited fields.
 
-    A field without a description is missing, and so are all fields of a class whose source file cannot be read.
+    Fields without a description are missing, and so are all fields of a class whose source file cannot be read.
+
+    Args:
+        struct: Struct class.
     """
     descriptions: dict[str, str] = {}
-    for field in type_info_of(struct).fields:
-        description = _description_of_type(field.type)
+    for field in inspect_struct_type(struct).fields:
+        description = _get_type_description(field.type)
         if description:
             descriptions[field.encode_name] = description
     if issubclass(struct, FileStruct):
         for section in struct.exceptions_to:
-            descriptions |= _describe_exceptions(section)
+            descriptions |= _collect_exception_descriptions(section)
     for base in reversed(struct.__mro__):
         if issubclass(base, msgspec.Struct) and base is not msgspec.Struct:
-            descriptions |= _read_docstrings(base)
-    names = [field.encode_name for field in type_info_of(struct).fields]
+            descriptions |= _read_field_docstrings(base)
+    names = [field.encode_name for field in inspect_struct_type(struct).fields]
     return {name: descriptions[name] for name in names if name in descriptions}
 
 
-def _describe_exceptions(section: type[msgspec.Struct]) -> dict[str, str]:
+def _collect_exception_descriptions(section: type[msgspec.Struct]) -> dict[str, str]:
     """Return the descriptions of a section for all as they are for an exception to it: None has another meaning."""
     descriptions: dict[str, str] = {}
-    for name, description in describe_fields(section).items():
+    for name, description in collect_field_descriptions(section).items():
         meaning, _, _ = description.partition(" None:")
         descriptions[name] = f"{meaning.removesuffix('.')}. None: as in the section for all."
     return descriptions
 
 
-def _description_of_type(info: inspect.Type) -> str:
+def _get_type_description(info: inspect.Type) -> str:
     if not isinstance(info, inspect.Metadata):
         return ""
     extra = info.extra_json_schema or {}
     return str(extra.get("description", ""))
 
 
-def _read_docstrings(struct: type) -> dict[str, str]:
+def _read_field_docstrings(struct: type) -> dict[str, str]:
     """Return the string literals after the fields in the body of a class, each as one line, by the field's name."""
-    definition = _find_class(struct)
+    definition = _find_class_definition(struct)
     if definition is None:
         return {}
     docstrings: dict[str, str] = {}
-    for statement, following in zip(definition.body, definition.body[1:], strict=False):
+    for statement, next_statement in zip(definition.body, definition.body[1:], strict=False):
         if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
             continue
-        if not isinstance(following, ast.Expr) or not isinstance(following.value, ast.Constant):
+        if not isinstance(next_statement, ast.Expr) or not isinstance(next_statement.value, ast.Constant):
             continue
-        if isinstance(following.value.value, str):
-            docstrings[statement.target.id] = " ".join(following.value.value.split())
+        if isinstance(next_statement.value.value, str):
+            docstrings[statement.target.id] = " ".join(next_statement.value.value.split())
     return docstrings
 
 
-def _find_class(struct: type) -> ast.ClassDef | None:
+def _find_class_definition(struct: type) -> ast.ClassDef | None:
     """Return the definition of a class in its source file, or None if there is no such file or definition."""
     module = sys.modules.get(struct.__module__)
     file = None if module is None else module.__file__
@@ -135,14 +138,14 @@ def _find_class(struct: type) -> ast.ClassDef | None:
     names = [name for name in struct.__qualname__.split(".") if name != "<locals>"]
     node: ast.AST = _parse_source(Path(file))
     for name in names:
-        found = next((child for child in ast.walk(node) if _defines(child, name)), None)
+        found = next((child for child in ast.walk(node) if _is_definition_of(child, name)), None)
         if found is None:
             return None
         node = found
     return node if isinstance(node, ast.ClassDef) else None
 
 
-def _defines(node: ast.AST, name: str) -> bool:
+def _is_definition_of(node: ast.AST, name: str) -> bool:
     return isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name
 
 

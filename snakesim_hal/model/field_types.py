@@ -11,56 +11,56 @@ from msgspec import inspect
 
 @dataclass(frozen=True)
 class Violation:
-    """The first place where a value is not what its type allows."""
+    """The first part of a value that its expected type does not allow."""
 
     kind: Literal["unknown", "missing", "wrong"]
-    steps: list[str]  # names and numbers that lead from the whole value to the place
+    key_path: list[str]  # names and list indices that lead from the whole value to the part
     value: Any = None  # if it is wrong
-    expected: Any = None  # the type that is expected there
-    why: str = ""  # the reason that msgspec gives
-    known: Sequence[str] = ()  # the allowed fields beside an unknown one
+    expected_type: Any = None  # the type that is expected there
+    reason: str = ""  # the reason that msgspec gives
+    known_fields: Sequence[str] = ()  # the allowed fields beside an unknown one
 
 
-def first_violation(value: Any, expected: Any, steps: Sequence[str] = ()) -> Violation | None:
+def find_first_violation(value: Any, expected_type: Any, key_path: Sequence[str] = ()) -> Violation | None:
     """Return the innermost part of a value that is wrong by itself, or None if the value has the expected type.
 
     Args:
-        value: as read from TOML or JSON.
-        expected: a type that msgspec can check.
-        steps: the way from the whole file to the value.
+        value: Value as read from TOML or JSON.
+        expected_type: Type that msgspec can check.
+        key_path: Names and list indices that lead from the whole file to the value.
     """
     try:
-        msgspec.convert(value, expected)
+        msgspec.convert(value, expected_type)
     except msgspec.ValidationError as error:
-        why = str(error)
+        reason = str(error)
     else:
         return None
     if isinstance(value, dict):
-        violation = _violation_of_section(value, expected, steps)
+        violation = _find_section_violation(value, expected_type, key_path)
         if violation is not None:
             return violation
-    for step, part, part_type in _parts(value, expected):
-        violation = first_violation(part, part_type, [*steps, step])
+    for step, part, part_type in _iterate_parts(value, expected_type):
+        violation = find_first_violation(part, part_type, [*key_path, step])
         if violation is not None:
             return violation
-    return Violation("wrong", list(steps), value, expected, why)
+    return Violation("wrong", list(key_path), value, expected_type, reason)
 
 
-def _violation_of_section(section: dict[str, Any], expected: Any, steps: Sequence[str]) -> Violation | None:
-    """Return a violation by the section's own fields, not by what is inside of them."""
-    structs = [option for option in _options(expected) if _is_struct(option)]
+def _find_section_violation(section: dict[str, Any], expected_type: Any, key_path: Sequence[str]) -> Violation | None:
+    """Return a violation by the names of the section's fields or its tag, or None if they are allowed."""
+    structs = [option for option in _list_type_alternatives(expected_type) if _is_struct_type(option)]
     if not structs:
         return None
     matching = [struct for struct in structs if _tag_matches(section, struct)]
     if not matching:
-        return _violation_of_tag(section, structs, steps)
-    return _violation_of_fields(section, matching[0], steps)
+        return _make_tag_violation(section, structs, key_path)
+    return _find_field_violation(section, matching[0], key_path)
 
 
-def _violation_of_fields(
-    section: dict[str, Any], struct: type[msgspec.Struct], steps: Sequence[str]
+def _find_field_violation(
+    section: dict[str, Any], struct: type[msgspec.Struct], key_path: Sequence[str]
 ) -> Violation | None:
-    """Return a field that the Struct does not have, or one that is required and missing."""
+    """Return the violation by an unknown field or a missing required field, or None if there is no such field."""
     config = struct.__struct_config__
     fields = msgspec.structs.fields(struct)
     known = [field.encode_name for field in fields]
@@ -69,66 +69,66 @@ def _violation_of_fields(
     if config.forbid_unknown_fields:
         for name in section:
             if name not in known:
-                return Violation("unknown", [*steps, name], known=known)
+                return Violation("unknown", [*key_path, name], known_fields=known)
     for field in fields:
         if field.required and field.encode_name not in section:
-            return Violation("missing", [*steps, field.encode_name], expected=field.type)
+            return Violation("missing", [*key_path, field.encode_name], expected_type=field.type)
     return None
 
 
-def _violation_of_tag(
-    section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], steps: Sequence[str]
+def _make_tag_violation(
+    section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], key_path: Sequence[str]
 ) -> Violation:
     """Return the violation of a section whose tag is missing, or belongs to none of the Structs."""
     tag_field = str(structs[0].__struct_config__.tag_field)
     tags = tuple(struct.__struct_config__.tag for struct in structs)
-    expected = Literal[tags]
+    allowed_tags = Literal[tags]
     if tag_field not in section:
-        return Violation("missing", [*steps, tag_field], expected=expected)
-    return Violation("wrong", [*steps, tag_field], section[tag_field], expected, "there is no such kind")
+        return Violation("missing", [*key_path, tag_field], expected_type=allowed_tags)
+    return Violation("wrong", [*key_path, tag_field], section[tag_field], allowed_tags, "there is no such kind")
 
 
-def _parts(value: Any, expected: Any) -> Iterator[tuple[str, Any, Any]]:
+def _iterate_parts(value: Any, expected_type: Any) -> Iterator[tuple[str, Any, Any]]:
     """Yield every field of a section and every entry of a dictionary, list or tuple inside of a value.
 
     Args:
-        value: as read from TOML or JSON.
-        expected: the expected type, which may be a union.
+        value: Value as read from TOML or JSON.
+        expected_type: Expected type of the value, which may be a union.
 
     Yields:
-        The name or number of the part, the part itself, and the type that is expected of it.
+        Name or list index of the part, the part, and the expected type of the part.
     """
-    for option in _options(expected):
-        container = get_origin(option)
-        arguments = get_args(option)
-        if isinstance(value, dict) and _is_struct(option) and _tag_matches(value, option):
+    for option in _list_type_alternatives(expected_type):
+        container_type = get_origin(option)
+        type_arguments = get_args(option)
+        if isinstance(value, dict) and _is_struct_type(option) and _tag_matches(value, option):
             for field in msgspec.structs.fields(option):
                 if field.encode_name in value:
                     yield field.encode_name, value[field.encode_name], field.type
-        elif container is dict and isinstance(value, dict):
-            _, value_type = arguments
+        elif container_type is dict and isinstance(value, dict):
+            _, value_type = type_arguments
             for key, part in value.items():
                 yield key, part, value_type
-        elif container is list and isinstance(value, list):
-            (item_type,) = arguments
+        elif container_type is list and isinstance(value, list):
+            (item_type,) = type_arguments
             for i, part in enumerate(value):
                 yield str(i), part, item_type
-        elif container is tuple and isinstance(value, list):
-            for i, (part, part_type) in enumerate(zip(value, arguments, strict=False)):
+        elif container_type is tuple and isinstance(value, list):
+            for i, (part, part_type) in enumerate(zip(value, type_arguments, strict=False)):
                 yield str(i), part, part_type
 
 
-def _options(expected: Any) -> list[Any]:
+def _list_type_alternatives(expected_type: Any) -> list[Any]:
     """Return the alternatives of a union, without annotations; for any other type, only that type."""
-    origin = get_origin(expected)
+    origin = get_origin(expected_type)
     if origin is Annotated:
-        return _options(get_args(expected)[0])
+        return _list_type_alternatives(get_args(expected_type)[0])
     if origin in (Union, UnionType):
-        return [leaf for option in get_args(expected) for leaf in _options(option)]
-    return [expected]
+        return [leaf for option in get_args(expected_type) for leaf in _list_type_alternatives(option)]
+    return [expected_type]
 
 
-def _is_struct(option: Any) -> bool:
+def _is_struct_type(option: Any) -> bool:
     return isinstance(option, type) and issubclass(option, msgspec.Struct)
 
 
@@ -140,22 +140,22 @@ def _tag_matches(section: dict[str, Any], struct: type[msgspec.Struct]) -> bool:
     return section.get(config.tag_field) == config.tag
 
 
-def alternatives(info: inspect.Type | None) -> list[inspect.Type]:
+def list_union_members(info: inspect.Type | None) -> list[inspect.Type]:
     """Return the alternatives of a union; for any other type, only that type."""
     if info is None:
         return []
     if isinstance(info, inspect.Metadata):
-        return alternatives(info.type)
+        return list_union_members(info.type)
     if isinstance(info, inspect.UnionType):
-        return [leaf for option in info.types for leaf in alternatives(option)]
+        return [leaf for option in info.types for leaf in list_union_members(option)]
     return [info]
 
 
-def unit_of(info: inspect.Type | None) -> str:
-    """Return the unit of a number; empty if it has no unit. Of a union, the first unit counts."""
+def find_declared_unit(info: inspect.Type | None) -> str:
+    """Return the unit that a number type declares, empty if it declares none. In a union, the first counts."""
     if isinstance(info, inspect.UnionType):
         for option in info.types:
-            unit = unit_of(option)
+            unit = find_declared_unit(option)
             if unit:
                 return unit
         return ""
@@ -165,19 +165,19 @@ def unit_of(info: inspect.Type | None) -> str:
     return ""
 
 
-def in_words(info: inspect.Type | None) -> str:
+def describe_type_in_words(info: inspect.Type | None) -> str:
     """Return the type of a field in words, such as "a number > 0 in m"."""
-    unit = unit_of(info)
+    unit = find_declared_unit(info)
     descriptions: list[str] = []
-    for option in alternatives(info):
-        description = _describe(option, unit)
+    for option in list_union_members(info):
+        description = _describe_single_type(option, unit)
         if description is not None:
             descriptions.append(description)
     return " or ".join(descriptions) or "another value"
 
 
-def _describe(option: inspect.Type, unit: str) -> str | None:
-    """Return one type that is not a union in words; None if a file cannot contain it."""
+def _describe_single_type(option: inspect.Type, unit: str) -> str | None:
+    """Describe a type that is not a union in words. Return None for a type that a file cannot contain, such as None."""
     match option:
         case inspect.FloatType() | inspect.IntType():
             return _describe_number(option, unit)
@@ -195,9 +195,9 @@ def _describe(option: inspect.Type, unit: str) -> str | None:
             names = [f"{option.tag_field} = {option.tag!r}", *(field.encode_name for field in fields)]
             return "a section with " + ", ".join(names)
         case inspect.ListType():
-            return f"a list, each {in_words(option.item_type)}"
+            return f"a list, each {describe_type_in_words(option.item_type)}"
         case inspect.TupleType():
-            return f"{len(option.item_types)} values, each {in_words(option.item_types[0])}"
+            return f"{len(option.item_types)} values, each {describe_type_in_words(option.item_types[0])}"
         case inspect.DictType():
             return "a section"
         case _:

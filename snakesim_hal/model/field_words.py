@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from snakesim_hal.model.field_types import alternatives, unit_of
+from snakesim_hal.model.field_types import find_declared_unit, list_union_members
 
 # Units by the end of a field's name, for numbers whose type has no unit; a longer end comes before a shorter one.
 UNITS_BY_SUFFIX = {
@@ -37,15 +37,15 @@ UNIT_WORDS = {"per", "turns", *(word for suffix in UNITS_BY_SUFFIX for word in s
 def describe_type(info: inspect.Type) -> str:
     """Return the type of a value in a few words. Whether a field may be left out is not part of it."""
     words: list[str] = []
-    for option in alternatives(info):
-        name = _name_type(option)
+    for option in list_union_members(info):
+        name = _get_type_name(option)
         if name and name not in words:
             words.append(name)
     return " or ".join(words) or "any value"
 
 
-def _name_type(option: inspect.Type) -> str:
-    """Return the name of a type that is not a union; empty for None, which no TOML file contains."""
+def _get_type_name(option: inspect.Type) -> str:
+    """Return the name of a type that is not a union. It is empty for None, which no TOML file contains."""
     match option:
         case inspect.NoneType():
             return ""
@@ -62,27 +62,27 @@ def _name_type(option: inspect.Type) -> str:
         case inspect.StructType():
             return "table"
         case _:
-            return _name_container(option)
+            return _get_container_type_name(option)
 
 
-def _name_container(option: inspect.Type) -> str:
+def _get_container_type_name(option: inspect.Type) -> str:
     """Return the name of a type that holds other values."""
     match option:
         case inspect.DictType(value_type=inspect.AnyType()):
             return "table"
         case inspect.DictType(value_type=value_type):
-            return f"{_plural(describe_type(value_type))} by name"
+            return f"{_pluralize(describe_type(value_type))} by name"
         case inspect.ListType(item_type=inspect.AnyType()):
             return "list"
         case inspect.ListType(item_type=item_type):
-            return f"list of {_plural(describe_type(item_type))}"
+            return f"list of {_pluralize(describe_type(item_type))}"
         case inspect.TupleType():
-            return f"{len(option.item_types)} {_plural(describe_type(option.item_types[0]))}"
+            return f"{len(option.item_types)} {_pluralize(describe_type(option.item_types[0]))}"
         case _:
             return "any value"
 
 
-def _plural(words: str) -> str:
+def _pluralize(words: str) -> str:
     if words[0].isdigit():  # such as `2 numbers`
         return f"[{words}]"
     return " or ".join(f"{word}s" for word in words.split(" or "))
@@ -91,7 +91,7 @@ def _plural(words: str) -> str:
 def describe_range(info: inspect.Type) -> str:
     """Return what a value is limited to beyond its type; empty if all values are allowed."""
     limits: list[str] = []
-    for option in alternatives(info):
+    for option in list_union_members(info):
         limit = _describe_limits(option)
         if limit and limit not in limits:
             limits.append(limit)
@@ -99,7 +99,7 @@ def describe_range(info: inspect.Type) -> str:
 
 
 def _describe_limits(option: inspect.Type) -> str:
-    """Return the allowed values of a type in words, such as ">= 0, < 1"; empty for a type without limits."""
+    """Describe the allowed values of a type in words, such as ">= 0, < 1". Empty for a type without limits."""
     match option:
         case inspect.FloatType() | inspect.IntType():
             bounds = ((">=", option.ge), (">", option.gt), ("<=", option.le), ("<", option.lt))
@@ -124,8 +124,8 @@ def _describe_limits(option: inspect.Type) -> str:
 
 def _join_limits(limits: str, item_type: inspect.Type) -> str:
     """Return the limits of a container, followed by those of its items."""
-    of_each = describe_range(item_type)
-    return ", each ".join(part for part in (limits, of_each) if part)
+    item_limits = describe_range(item_type)
+    return ", each ".join(part for part in (limits, item_limits) if part)
 
 
 def _describe_length(minimum: int | None, maximum: int | None, noun: str) -> str:
@@ -142,10 +142,10 @@ def _format_number(number: float) -> str:
 
 def find_unit(name: str, info: inspect.Type) -> str:
     """Return the unit of a field's number or numbers, from its type or else from its name; empty if there is none."""
-    unit = unit_of_type(info)
+    unit = find_unit_in_type(info)
     if unit == "1":
         return ""
-    if unit or not _holds_numbers(info):
+    if unit or not _contains_numbers(info):
         return unit
     return find_unit_in_name(name)
 
@@ -159,31 +159,32 @@ def find_unit_in_name(name: str) -> str:
     return ""
 
 
-def unit_of_type(info: inspect.Type) -> str:
+def find_unit_in_type(info: inspect.Type) -> str:
     """Return the first unit in a type, also inside of unions, lists and tuples."""
-    unit = unit_of(info)
+    unit = find_declared_unit(info)
     if unit:
         return unit
     if isinstance(info, inspect.Metadata):
-        return unit_of_type(info.type)
-    inner_types = info.types if isinstance(info, inspect.UnionType) else item_types(info)
+        return find_unit_in_type(info.type)
+    inner_types = info.types if isinstance(info, inspect.UnionType) else list_item_types(info)
     for inner in inner_types:
-        unit = unit_of_type(inner)
+        unit = find_unit_in_type(inner)
         if unit:
             return unit
     return ""
 
 
-def _holds_numbers(info: inspect.Type) -> bool:
-    for option in alternatives(info):
+def _contains_numbers(info: inspect.Type) -> bool:
+    """Return whether values of a type are numbers or contain numbers."""
+    for option in list_union_members(info):
         if isinstance(option, inspect.FloatType | inspect.IntType):
             return True
-        if any(_holds_numbers(inner) for inner in item_types(option)):
+        if any(_contains_numbers(inner) for inner in list_item_types(option)):
             return True
     return False
 
 
-def item_types(option: inspect.Type) -> tuple[inspect.Type, ...]:
+def list_item_types(option: inspect.Type) -> tuple[inspect.Type, ...]:
     """Return the types of the entries of a list, a tuple or a table by name; of any other type, none."""
     match option:
         case inspect.ListType(item_type=item_type):

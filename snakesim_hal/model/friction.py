@@ -1,7 +1,8 @@
 """Friction that depends on the direction of sliding: scales, skins and passive wheels of a robot, and their surfaces.
 
 A link that slides along its axis may rub less than one that slides sideways. The coefficients of a link on a surface
-are products of a value of the surface, from `surface_friction`, and a factor of the link, from `link_factors`.
+are products of a value of the surface, from `compute_surface_friction`, and a factor of the link, from
+`compute_link_factors`.
 
 Source: D. L. Hu, J. Nirody, T. Scott and M. J. Shelley, "The mechanics of slithering locomotion", PNAS 106, 2009.
 """
@@ -128,16 +129,17 @@ class Wheels(FileStruct, frozen=True, kw_only=True):
         return self.bearing_friction * self.bearing_radius_m / self.radius_m + self.rolling_resistance
 
 
-def surface_friction(
+def compute_surface_friction(
     friction: float, surface: Surface | None, skin: Skin | None, wheels: Wheels | None
 ) -> DirectionalFriction:
-    """Return the coefficients between a surface and the underside of a link without exceptions.
+    """Compute the friction coefficients between a surface and the underside of a link without exceptions.
 
     Args:
         friction: Coulomb coefficient of the surface.
-        surface: its coefficients along a link; None: it has none of its own.
-        skin: of the robot; None: the robot has none.
-        wheels: of the robot; None: the robot has none. Wheels that would not roll slide instead.
+        surface: Coefficients of the surface along a link, which have precedence over the skin. None if it has none.
+        skin: Skin of the robot. None if the robot has no skin.
+        wheels: Wheels of the robot. None if the robot has no wheels. Wheels whose rolling resistance is higher than
+            their sliding friction slide instead.
     """
     if wheels is not None:
         sideways = friction if wheels.tire_friction is None else wheels.tire_friction
@@ -155,21 +157,21 @@ def surface_friction(
     return DirectionalFriction(forward, backward, friction)
 
 
-def link_factors(skin: Skin | None, link_count: int) -> list[DirectionalFriction]:
+def compute_link_factors(skin: Skin | None, link_count: int) -> list[DirectionalFriction]:
     """Return the factors of every link on the coefficients of a surface, tail to head."""
     factors = [SAME_IN_ALL_DIRECTIONS] * link_count
     if skin is None:
         return factors
     for name, link in skin.links.items():
-        factors[_link_number(name)] = DirectionalFriction(
-            _ratio(link.forward, skin.forward),
-            _ratio(link.backward, skin.backward),
-            _ratio(link.sideways, skin.sideways),
+        factors[_parse_link_index(name)] = DirectionalFriction(
+            _compute_friction_ratio(link.forward, skin.forward),
+            _compute_friction_ratio(link.backward, skin.backward),
+            _compute_friction_ratio(link.sideways, skin.sideways),
         )
     return factors
 
 
-def check_skin(skin: Skin | None, wheels: Wheels | None, link_names: Sequence[str]) -> None:
+def validate_skin(skin: Skin | None, wheels: Wheels | None, link_names: Sequence[str]) -> None:
     """Raise ValueError if a skin has exceptions for a link that does not exist, or a robot has a skin and wheels."""
     if skin is None:
         return
@@ -180,12 +182,12 @@ def check_skin(skin: Skin | None, wheels: Wheels | None, link_names: Sequence[st
             raise ValueError(f"[skin.links.{name}]: this robot has {link_names[0]} (tail) to {link_names[-1]} (head)")
 
 
-def _link_number(name: str) -> int:
+def _parse_link_index(name: str) -> int:
     """Return the number of a link that is called `link_0` or onwards."""
     return int(name.removeprefix("link_"))
 
 
-def _ratio(of_link: float | None, of_all: float) -> float:
+def _compute_friction_ratio(of_link: float | None, of_all: float) -> float:
     """Return the factor of a link; 1 if it has no coefficient of its own."""
     if of_link is None:
         return 1.0

@@ -79,9 +79,9 @@ class Limits(FileStruct, frozen=True, kw_only=True):
     """Supply voltage below which the robot stops with a fault."""
 
     def __post_init__(self) -> None:
-        """Check the limits against each other. Raises ValueError, for the file reader.
+        """Raise ValueError for limits that contradict each other. The file reader turns it into a ConfigError.
 
-        Derating must begin before the robot stops, the joint must have travel, and its cable must allow all of it.
+        Derating must start before the robot stops, the joint must have travel, and its cable must allow all of it.
         """
         if self.stop_at_c <= self.derate_from_c:
             raise ValueError(
@@ -93,8 +93,8 @@ class Limits(FileStruct, frozen=True, kw_only=True):
                 f"it may turn from {self.lower_rad:g} to {self.upper_rad:g} rad, which leaves no travel: "
                 f"`angle_min_rad` (or minus `angle_rad`) must be below `angle_max_rad` (or `angle_rad`)"
             )
-        limit_turns = max(-self.lower_rad, self.upper_rad) / (2 * math.pi)
-        if self.cable_turns is not None and self.cable_turns < limit_turns:
+        max_turns = max(-self.lower_rad, self.upper_rad) / (2 * math.pi)
+        if self.cable_turns is not None and self.cable_turns < max_turns:
             raise ValueError(
                 f"`cable_turns` = {self.cable_turns:g} turns is less than its limits of {self.lower_rad:g} to "
                 f"{self.upper_rad:g} rad: narrow the limits"
@@ -234,10 +234,10 @@ _exception_fields = [
     for field in msgspec.structs.fields(section)
     if field.name != "ambient_c"
 ]
-_of_one: Any = msgspec.defstruct("_OfOne", _exception_fields, bases=(_Id,), frozen=True, kw_only=True)
+_exceptions_base: Any = msgspec.defstruct("_OfOne", _exception_fields, bases=(_Id,), frozen=True, kw_only=True)
 
 
-class JointExceptions(_of_one):
+class JointExceptions(_exceptions_base):
     """What differs in one joint from the sections for all: their fields, and the drive's id."""
 
     exceptions_to = (Limits, Motor, Drive, Heat, Supply)
@@ -277,17 +277,17 @@ def make_joints(
     """Return every joint as built, tail to head.
 
     Args:
-        axes: axis of every joint, tail to head.
-        exceptions: what differs in single joints, by the joint's name.
-        limits: of every joint without exceptions; likewise the other sections.
-        motor: see `limits`.
-        drive: see `limits`.
-        heat: see `limits`.
-        supply: see `limits`.
+        axes: Axis of every joint, tail to head.
+        exceptions: Values that differ in single joints, by the name of the joint.
+        limits: Limits of every joint without exceptions.
+        motor: Motor of every joint without exceptions.
+        drive: Drive of every joint without exceptions.
+        heat: Heat parameters of every joint without exceptions.
+        supply: Electrical supply of every joint without exceptions.
 
     Raises:
-        ValueError: There is no joint of that name, or a joint has values that contradict each other. The error names
-            the joint.
+        ValueError: `exceptions` names a joint that does not exist, or a joint has values that contradict each other.
+            The error names the joint.
     """
     names = [f"joint_{i + 1}" for i in range(len(axes))]
     for name in exceptions:
@@ -295,39 +295,41 @@ def make_joints(
             raise ValueError(f"[joints.{name}]: this robot has {names[0]} to {names[-1]}, by [chain]")
     joints: list[Joint] = []
     for i, (name, axis) in enumerate(zip(names, axes, strict=True)):
-        differing = exceptions.get(name, JointExceptions())
+        joint_exceptions = exceptions.get(name, JointExceptions())
         try:
             joint = Joint(
                 name=name,
                 axis=axis,
-                id=i + 1 if differing.id is None else differing.id,
-                limits=_limits_with(limits, differing),
-                motor=_with(motor, differing),
-                drive=_with(drive, differing),
-                heat=_with(heat, differing),
-                supply=_with(supply, differing),
+                id=i + 1 if joint_exceptions.id is None else joint_exceptions.id,
+                limits=_apply_limit_exceptions(limits, joint_exceptions),
+                motor=_apply_exceptions(motor, joint_exceptions),
+                drive=_apply_exceptions(drive, joint_exceptions),
+                heat=_apply_exceptions(heat, joint_exceptions),
+                supply=_apply_exceptions(supply, joint_exceptions),
             )
-            _check(joint)
+            _validate_joint(joint)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         joints.append(joint)
-    _check_response_times(joints)
-    _check_ids(joints)
+    _validate_response_times(joints)
+    _validate_drive_ids(joints)
     return joints
 
 
-def _limits_with(common: Limits, differing: JointExceptions) -> Limits:
+def _apply_limit_exceptions(common: Limits, joint_exceptions: JointExceptions) -> Limits:
     """Return the limits of one joint. Its `angle_rad` replaces all angle limits of the section for all joints."""
-    if differing.angle_rad is not None:
-        common = msgspec.structs.replace(common, angle_rad=differing.angle_rad, angle_min_rad=None, angle_max_rad=None)
-    return _with(common, differing)
+    if joint_exceptions.angle_rad is not None:
+        common = msgspec.structs.replace(
+            common, angle_rad=joint_exceptions.angle_rad, angle_min_rad=None, angle_max_rad=None
+        )
+    return _apply_exceptions(common, joint_exceptions)
 
 
-def _with(section: SectionT, differing: JointExceptions) -> SectionT:
+def _apply_exceptions(section: SectionT, joint_exceptions: JointExceptions) -> SectionT:
     """Return a section in which one joint's exceptions replace the values for all joints."""
     replacements: dict[str, Any] = {}
     for name in section.__struct_fields__:
-        value = getattr(differing, name, None)
+        value = getattr(joint_exceptions, name, None)
         if value is not None:
             replacements[name] = value
     if not replacements:
@@ -335,8 +337,8 @@ def _with(section: SectionT, differing: JointExceptions) -> SectionT:
     return msgspec.structs.replace(section, **replacements)
 
 
-def _check(joint: Joint) -> None:
-    """Check values of one joint that are in different sections. Raises ValueError."""
+def _validate_joint(joint: Joint) -> None:
+    """Raise ValueError for values of one joint that contradict each other across sections."""
     limits = joint.limits
     peak_nm = joint.motor.peak_nm
     if peak_nm is not None and limits.torque_nm > peak_nm:
@@ -356,8 +358,8 @@ def _check(joint: Joint) -> None:
         )
 
 
-def _check_response_times(joints: Sequence[Joint]) -> None:
-    """Raise ValueError if some joints have a motor lag, and others have none."""
+def _validate_response_times(joints: Sequence[Joint]) -> None:
+    """Raise ValueError if some joints have a motor lag, and other joints have none."""
     without_lag = [joint for joint in joints if joint.motor.response_time_s <= 0]
     if without_lag and len(without_lag) < len(joints):
         raise ValueError(
@@ -366,15 +368,15 @@ def _check_response_times(joints: Sequence[Joint]) -> None:
         )
 
 
-def _check_ids(joints: Sequence[Joint]) -> None:
+def _validate_drive_ids(joints: Sequence[Joint]) -> None:
     """Raise ValueError if several drives on one bus have the same id."""
     names_by_address: dict[tuple[str, str, int], list[str]] = {}
     for joint in joints:
         address = (joint.drive.driver, joint.drive.port, joint.id)
         names_by_address.setdefault(address, []).append(joint.name)
-    for (_, port, number), names in names_by_address.items():
+    for (_, port, drive_id), names in names_by_address.items():
         if len(names) > 1:
-            where = f"port {port!r}" if port else "one bus"
+            bus_name = f"port {port!r}" if port else "one bus"
             raise ValueError(
-                f"{', '.join(names)}: all have the id {number} on {where}; without an `id` a joint has its number"
+                f"{', '.join(names)}: all have the id {drive_id} on {bus_name}; without an `id` a joint has its number"
             )

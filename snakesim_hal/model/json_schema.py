@@ -7,9 +7,9 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from snakesim_hal.model.field_docs import describe_fields, type_info_of
-from snakesim_hal.model.field_types import alternatives
-from snakesim_hal.model.field_words import find_unit, get_default, item_types, unit_of_type
+from snakesim_hal.model.field_docs import collect_field_descriptions, inspect_struct_type
+from snakesim_hal.model.field_types import list_union_members
+from snakesim_hal.model.field_words import find_unit, find_unit_in_type, get_default, list_item_types
 
 
 def make_schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
@@ -28,8 +28,8 @@ def make_schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
 
 def _complete_definition(definition: dict[str, Any], struct: type[msgspec.Struct]) -> None:
     """Add descriptions, defaults and units to the properties of one Struct."""
-    descriptions = describe_fields(struct)
-    for field in type_info_of(struct).fields:
+    descriptions = collect_field_descriptions(struct)
+    for field in inspect_struct_type(struct).fields:
         name = field.encode_name
         added = definition["properties"][name]
         if name in descriptions:
@@ -37,21 +37,21 @@ def _complete_definition(definition: dict[str, Any], struct: type[msgspec.Struct
         if not field.required and "default" not in added:
             added["default"] = get_default(field)
         unit = find_unit(name, field.type)
-        if unit and not unit_of_type(field.type):
+        if unit and not find_unit_in_type(field.type):
             added["unit"] = unit
 
 
 def list_structs(struct: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
     """Return a Struct and all Structs inside of it, each once."""
     found: dict[type[msgspec.Struct], None] = {}
-    waiting: list[inspect.Type] = [type_info_of(struct)]
+    waiting: list[inspect.Type] = [inspect_struct_type(struct)]
     while waiting:
         option = waiting.pop()
         if isinstance(option, inspect.StructType):
             if option.cls in found:
                 continue
             found[option.cls] = None
-            waiting += [alternative for field in option.fields for alternative in alternatives(field.type)]
-        for inner in item_types(option):
-            waiting += alternatives(inner)
+            waiting += [alternative for field in option.fields for alternative in list_union_members(field.type)]
+        for inner in list_item_types(option):
+            waiting += list_union_members(inner)
     return list(found)

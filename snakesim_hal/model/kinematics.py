@@ -35,7 +35,7 @@ def quaternion_from_yaw(yaw_rad: float) -> tuple[float, float, float, float]:
 
 
 def quaternions_from_rotations(rotations: Floats) -> Floats:
-    """Return unit quaternions wxyz (n, 4) of rotation matrices (n, 3, 3).
+    """Convert rotation matrices (n, 3, 3) to unit quaternions wxyz (n, 4).
 
     The elements of a rotation matrix give all products 4 q_i q_j of two quaternion components. Every row of the
     matrix of these products is a multiple of the quaternion. The row of the largest component is the most precise one,
@@ -72,7 +72,7 @@ def yaw_from_rotation(rotation: Floats) -> float:
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
-def joint_rotation(axis: str, angle_rad: float) -> Floats:
+def compute_joint_rotation(axis: str, angle_rad: float) -> Floats:
     """Return the rotation (3, 3) of one joint about its own axis."""
     cosine = np.cos(angle_rad)
     sine = np.sin(angle_rad)
@@ -81,27 +81,29 @@ def joint_rotation(axis: str, angle_rad: float) -> Floats:
     return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
 
-def link_frames(
+def compute_link_frames(
     base_position_w: ArrayLike,
     base_rotation: Floats,
     angles_rad: Sequence[float] | Floats,
     axes: Sequence[str],
     link_lengths_m: Sequence[float],
 ) -> tuple[Floats, Floats]:
-    """Return the frames of all links in the world, tail to head.
+    """Compute the frames of all links in the world, tail to head (forward kinematics).
 
     Args:
-        base_position_w: (3,) the tail end, m.
-        base_rotation: (3, 3) world_from_base.
-        angles_rad: (n_joints,) joint angles, tail to head.
-        axes: axis of every joint, tail to head.
-        link_lengths_m: n_joints + 1 lengths, tail to head.
+        base_position_w: Position of the tail end, (3,), m.
+        base_rotation: Rotation matrix world_from_base, (3, 3).
+        angles_rad: Joint angles, (n_joints,), tail to head.
+        axes: Axis of every joint, "yaw" or "pitch", tail to head.
+        link_lengths_m: Length of every link, tail to head. There is one link more than joints.
 
     Returns:
-        Origins (n_links, 3) in m, and rotations world_from_link (n_links, 3, 3).
+        Origins of the links, (n_links, 3) in m, and their rotation matrices world_from_link, (n_links, 3, 3).
     """
     if "pitch" not in axes:
-        return _yaw_only_frames(np.asarray(base_position_w), base_rotation, np.asarray(angles_rad), link_lengths_m)
+        return _compute_planar_link_frames(
+            np.asarray(base_position_w), base_rotation, np.asarray(angles_rad), link_lengths_m
+        )
     link_count = len(axes) + 1
     origins = np.empty((link_count, 3))
     rotations = np.empty((link_count, 3, 3))
@@ -109,61 +111,64 @@ def link_frames(
     rotations[0] = base_rotation
     for i, axis in enumerate(axes):
         origins[i + 1] = origins[i] + rotations[i][:, 0] * link_lengths_m[i]
-        rotations[i + 1] = rotations[i] @ joint_rotation(axis, float(angles_rad[i]))
+        rotations[i + 1] = rotations[i] @ compute_joint_rotation(axis, float(angles_rad[i]))
     return origins, rotations
 
 
-def find_nodes_w(
+def compute_body_points_w(
     robot: Description, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats
 ) -> Floats:
-    """Return tail end, joints and head end of one pose in the world, (joints + 2, 3).
+    """Compute tail end, joints and head end of one pose in the world, (n_joints + 2, 3) in m.
 
     Args:
-        robot: gives the lengths of the links and the axes of the joints.
-        position_w: (3,) the tail end, m.
-        wxyz: orientation of the base.
-        angles_rad: (n_joints,) joint angles, tail to head.
+        robot: Description of the robot, with the lengths of the links and the axes of the joints.
+        position_w: Position of the tail end, (3,), m.
+        wxyz: Orientation of the base as a quaternion, (4,).
+        angles_rad: Joint angles, (n_joints,), tail to head.
     """
     lengths_m = [link.length_m for link in robot.links]
     axes = [joint.axis for joint in robot.joints]
-    origins, rotations = link_frames(position_w, rotation_from_quaternion(wxyz), angles_rad, axes, lengths_m)
+    origins, rotations = compute_link_frames(position_w, rotation_from_quaternion(wxyz), angles_rad, axes, lengths_m)
     head_end_w = origins[-1] + lengths_m[-1] * rotations[-1][:, 0]
     return np.vstack([origins, head_end_w])
 
 
-class NodeFinder:
-    """Computes what `find_nodes_w` does for many poses of robots with equal links, with the same bits."""
+class ForwardKinematics:
+    """Computes the body points of many poses at once, for robots with equal links.
+
+    The results are equal to those of the function `compute_body_points_w` to the last bit.
+    """
 
     def __init__(self, robot: Description) -> None:
         """Read the lengths of the links and the axes of the joints."""
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._axes = [joint.axis for joint in robot.joints]
 
-    def find(self, positions_w: Floats, wxyz: Floats, angles_rad: Floats) -> Floats:
-        """Return tail ends, joints and head ends in the world, (n, joints + 2, 3).
+    def compute_body_points_w(self, positions_w: Floats, wxyz: Floats, angles_rad: Floats) -> Floats:
+        """Compute tail end, joints and head end of every pose in the world, (n, n_joints + 2, 3) in m.
 
         Args:
-            positions_w: (n, 3) the tail ends, m.
-            wxyz: (n, 4) orientations of the bases.
-            angles_rad: (n, n_joints) joint angles, tail to head.
+            positions_w: Positions of the tail ends, (n, 3), m.
+            wxyz: Orientations of the bases as quaternions, (n, 4).
+            angles_rad: Joint angles, (n, n_joints), tail to head.
         """
         lengths_m = self._lengths_m
         rotations = _rotations_from_quaternions(wxyz)
-        nodes = np.empty((len(positions_w), len(self._axes) + 2, 3))
-        nodes[:, 0] = positions_w
+        body_points_w = np.empty((len(positions_w), len(self._axes) + 2, 3))
+        body_points_w[:, 0] = positions_w
         if "pitch" not in self._axes:
-            forward = self._find_forward_in_plane(rotations, angles_rad)
+            forward = self._compute_planar_link_axes(rotations, angles_rad)
             link_vectors = forward[:, :-1] * lengths_m[:-1, None]
-            nodes[:, 1:-1] = positions_w[:, None] + link_vectors.cumsum(axis=1)
-            nodes[:, -1] = nodes[:, -2] + lengths_m[-1] * forward[:, -1]
-            return nodes
+            body_points_w[:, 1:-1] = positions_w[:, None] + link_vectors.cumsum(axis=1)
+            body_points_w[:, -1] = body_points_w[:, -2] + lengths_m[-1] * forward[:, -1]
+            return body_points_w
         for i, axis in enumerate(self._axes):
-            nodes[:, i + 1] = nodes[:, i] + rotations[:, :, 0] * lengths_m[i]
-            rotations = rotations @ _joint_rotations(axis, angles_rad[:, i])
-        nodes[:, -1] = nodes[:, -2] + lengths_m[-1] * rotations[:, :, 0]
-        return nodes
+            body_points_w[:, i + 1] = body_points_w[:, i] + rotations[:, :, 0] * lengths_m[i]
+            rotations = rotations @ _compute_joint_rotations(axis, angles_rad[:, i])
+        body_points_w[:, -1] = body_points_w[:, -2] + lengths_m[-1] * rotations[:, :, 0]
+        return body_points_w
 
-    def _find_forward_in_plane(self, rotations: Floats, angles_rad: Floats) -> Floats:
+    def _compute_planar_link_axes(self, rotations: Floats, angles_rad: Floats) -> Floats:
         """Return the x axes of all links, (n, n_links, 3), of robots whose joints all yaw."""
         yaw_rad = np.zeros((len(angles_rad), len(self._axes) + 1))  # of each link, relative to the base
         angles_rad.cumsum(axis=1, out=yaw_rad[:, 1:])
@@ -174,8 +179,8 @@ class NodeFinder:
 
 # Each element of a rotation matrix, row by row, is twice a sum of two products of components of the quaternion.
 # On the diagonal that is subtracted from 1.
-FIRST_PRODUCT = [10, 6, 7, 6, 5, 11, 7, 11, 5]  # index 4 i + j of the product of components i and j
-SECOND_PRODUCT = [15, 3, 2, 3, 15, 1, 2, 1, 10]
+FIRST_PRODUCT_INDEX = [10, 6, 7, 6, 5, 11, 7, 11, 5]  # index 4 i + j of the product of components i and j
+SECOND_PRODUCT_INDEX = [15, 3, 2, 3, 15, 1, 2, 1, 10]
 SECOND_SIGN = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
 DIAGONAL = slice(0, 9, 4)
 
@@ -184,12 +189,12 @@ def _rotations_from_quaternions(wxyz: Floats) -> Floats:
     """Return the rotation matrices (n, 3, 3) of quaternions (n, 4), which are normalized first."""
     unit = wxyz / np.sqrt(np.vecdot(wxyz, wxyz))[:, None]
     products = (unit[:, :, None] * unit[:, None, :]).reshape(-1, 16)
-    elements = 2 * (products[:, FIRST_PRODUCT] + SECOND_SIGN * products[:, SECOND_PRODUCT])
+    elements = 2 * (products[:, FIRST_PRODUCT_INDEX] + SECOND_SIGN * products[:, SECOND_PRODUCT_INDEX])
     elements[:, DIAGONAL] = 1 - elements[:, DIAGONAL]
     return elements.reshape(-1, 3, 3)
 
 
-def _joint_rotations(axis: str, angles_rad: Floats) -> Floats:
+def _compute_joint_rotations(axis: str, angles_rad: Floats) -> Floats:
     """Return the rotations (n, 3, 3) of one joint at many angles about its own axis."""
     rotations = np.zeros((len(angles_rad), 3, 3))
     cosine = np.cos(angles_rad)
@@ -203,21 +208,21 @@ def _joint_rotations(axis: str, angles_rad: Floats) -> Floats:
     return rotations
 
 
-def _yaw_only_frames(
+def _compute_planar_link_frames(
     base_w: Floats, base_rotation: Floats, angles_rad: Floats, link_lengths_m: Sequence[float]
 ) -> tuple[Floats, Floats]:
-    """Return the frames of all links of a chain whose joints all rotate about the base's vertical axis.
+    """Compute the frames of all links of a chain whose joints all rotate about the base's vertical axis.
 
     The angles of such joints add up, so that no loop over the links is needed.
 
     Args:
-        base_w: (3,) the tail end, m.
-        base_rotation: (3, 3) world_from_base.
-        angles_rad: (n_joints,) joint angles, tail to head.
-        link_lengths_m: n_joints + 1 lengths, tail to head.
+        base_w: Position of the tail end, (3,), m.
+        base_rotation: Rotation matrix world_from_base, (3, 3).
+        angles_rad: Joint angles, (n_joints,), tail to head.
+        link_lengths_m: Length of every link, tail to head. There is one link more than joints.
 
     Returns:
-        Origins (n_links, 3) in m, and rotations world_from_link (n_links, 3, 3).
+        Origins of the links, (n_links, 3) in m, and their rotation matrices world_from_link, (n_links, 3, 3).
     """
     yaw_rad = np.concatenate(([0.0], np.cumsum(angles_rad)))  # of each link, relative to the base
     cosine = np.cos(yaw_rad)[:, None]
@@ -237,8 +242,8 @@ def _yaw_only_frames(
     return origins, rotations
 
 
-def tangents(normal: Vector) -> tuple[Vector, Vector]:
-    """Return two unit tangents of a contact, in the link's frame.
+def compute_contact_tangents(normal: Vector) -> tuple[Vector, Vector]:
+    """Compute two unit tangents of a contact, in the link's frame.
 
     The first is the tangent that is closest to the link's x axis, and the second is the cross product of the normal
     and the first. If the normal is along x, the y axis is the first.

@@ -37,7 +37,7 @@ class Link(FileStruct, frozen=True, kw_only=True):
         """Check that a rigid body can have this inertia. Raises ValueError, which the file reader explains."""
         if self.inertia_kg_m2 is None:
             return
-        smallest, middle, largest = principal_moments(self.inertia_kg_m2)
+        smallest, middle, largest = compute_principal_moments(self.inertia_kg_m2)
         if smallest <= 0 or smallest + middle < largest * (1 - ROUNDING_TOLERANCE):
             raise ValueError(
                 f"`inertia_kg_m2` has the principal moments {smallest:.3g}, {middle:.3g} and {largest:.3g} kg·m², and "
@@ -64,10 +64,10 @@ class Link(FileStruct, frozen=True, kw_only=True):
         """
         if self.inertia_kg_m2 is not None:
             return self.inertia_kg_m2
-        return capsule_inertia(self.length_m, radius_m, self.mass_kg)
+        return compute_capsule_inertia(self.length_m, radius_m, self.mass_kg)
 
 
-def principal_moments(inertia: tuple[float, ...]) -> tuple[float, float, float]:
+def compute_principal_moments(inertia: tuple[float, ...]) -> tuple[float, float, float]:
     """Return the principal moments of ixx, iyy, izz, ixy, ixz, iyz, in ascending order, in kg·m²."""
     xx, yy, zz, xy, xz, yz = inertia
     matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -75,8 +75,8 @@ def principal_moments(inertia: tuple[float, ...]) -> tuple[float, float, float]:
     return smallest, middle, largest
 
 
-def capsule_inertia(length_m: float, radius_m: float, mass_kg: float) -> tuple[float, ...]:
-    """Return the inertia of a solid capsule along x about its center: ixx, iyy, izz, ixy, ixz, iyz in kg·m².
+def compute_capsule_inertia(length_m: float, radius_m: float, mass_kg: float) -> tuple[float, ...]:
+    """Compute the inertia of a solid capsule along x about its center: ixx, iyy, izz, ixy, ixz, iyz in kg·m².
 
     A capsule is a tube (a solid cylinder) with a hemisphere at each end; both have the same density. With the radius r,
     the tube's length l and mass m_t, and the mass m_b of both hemispheres:
@@ -87,16 +87,17 @@ def capsule_inertia(length_m: float, radius_m: float, mass_kg: float) -> tuple[f
     The center of a hemisphere is 3/8 of the radius from its flat side.
 
     Args:
-        length_m: length of the tube, without the hemispheres.
-        radius_m: radius of the tube and the hemispheres.
-        mass_kg: mass of the whole capsule.
+        length_m: Length of the tube, without the hemispheres.
+        radius_m: Radius of the tube and the hemispheres.
+        mass_kg: Mass of the whole capsule.
     """
-    # Volumes, divided by the area of the cross-section.
-    tube_m = length_m
-    ball_m = 4 * radius_m / 3
-    tube_kg = mass_kg * tube_m / (tube_m + ball_m)
-    ball_kg = mass_kg * ball_m / (tube_m + ball_m)
-    along = (tube_kg / 2 + ball_kg * 2 / 5) * radius_m**2
-    across = tube_kg * (radius_m**2 / 4 + length_m**2 / 12)
-    across += ball_kg * (2 * radius_m**2 / 5 + length_m**2 / 4 + 3 * length_m * radius_m / 8)
-    return along, across, across, 0.0, 0.0, 0.0
+    # Volumes of the tube and of both hemispheres, divided by the area of the cross-section.
+    tube_volume_m = length_m
+    ball_volume_m = 4 * radius_m / 3
+    tube_mass_kg = mass_kg * tube_volume_m / (tube_volume_m + ball_volume_m)
+    ball_mass_kg = mass_kg * ball_volume_m / (tube_volume_m + ball_volume_m)
+    ixx = (tube_mass_kg / 2 + ball_mass_kg * 2 / 5) * radius_m**2
+    iyy = tube_mass_kg * (radius_m**2 / 4 + length_m**2 / 12)
+    iyy += ball_mass_kg * (2 * radius_m**2 / 5 + length_m**2 / 4 + 3 * length_m * radius_m / 8)
+    izz = iyy
+    return ixx, iyy, izz, 0.0, 0.0, 0.0

@@ -14,20 +14,21 @@ FORCE_WINDOW_S = 0.05  # duration of the mean
 class MeasuredForce:
     """Moving averages of contact forces over FORCE_WINDOW_S; before the first sample all forces were 0."""
 
-    def __init__(self, every_s: float) -> None:
-        """Start without samples.
+    def __init__(self, sample_period_s: float) -> None:
+        """Create averages of no samples.
 
         Args:
-            every_s: time between two samples.
+            sample_period_s: Time between two samples.
         """
-        self._count = max(round(FORCE_WINDOW_S / every_s), 1)
+        self._count = max(round(FORCE_WINDOW_S / sample_period_s), 1)
         self._samples: deque[Mapping[Any, float]] = deque()
 
-    def add(self, forces_n: Mapping[Any, float]) -> None:
+    def add_sample(self, forces_n: Mapping[Any, float]) -> None:
         """Add a sample.
 
         Args:
-            forces_n: force of each contact, such as a pair of link and obstacle, since the last sample.
+            forces_n: Mean force of each contact since the last sample. The keys identify contacts, such as pairs
+                of link and obstacle.
         """
         self._samples.append(forces_n)
         if len(self._samples) > self._count:

@@ -22,7 +22,7 @@ from snakesim_hal.wire.quantities import above, bounded, from_zero
 LINK_FRACTIONS = (np.arange(5) + 0.5) / 5
 
 # Corners and edge middles of a rectangle, in units of its half length and half width.
-CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
+UNIT_RIM_POINTS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
 
 ROUNDING_ERROR_M = 1e-6  # more than that of any distance in a scene
 MIN_SEGMENT_M = 1e-12  # avoids a division by zero for a segment whose ends coincide
@@ -61,30 +61,30 @@ class Outlines:
 
     @classmethod
     def from_segments(cls, from_w: Floats, to_w: Floats, rounding_m: float = 0.0) -> Self:
-        """Return the outlines of straight segments.
+        """Return the outlines of straight segments, which may be rounded.
 
         Args:
-            from_w: (m, 2) first ends, m.
-            to_w: (m, 2) second ends, m.
-            rounding_m: half of the thickness of every segment.
+            from_w: First end of every segment, (m, 2), m.
+            to_w: Second end of every segment, (m, 2), m.
+            rounding_m: Half of the thickness of every segment.
         """
-        run = to_w - from_w
-        length = np.hypot(*run.T)
-        direction = run / np.maximum(length, MIN_SEGMENT_M)[:, None]
+        segments_w = to_w - from_w
+        length = np.hypot(*segments_w.T)
+        direction = segments_w / np.maximum(length, MIN_SEGMENT_M)[:, None]
         half_m = np.column_stack([0.5 * length, np.zeros_like(length)])
         return cls(
             center_w=0.5 * (from_w + to_w),
             direction=np.where(length[:, None] > 0, direction, [1.0, 0.0]),
             half_m=half_m,
-            rounding_m=np.full(len(run), rounding_m),
+            rounding_m=np.full(len(segments_w), rounding_m),
         )
 
     def __len__(self) -> int:
         return len(self.center_w)
 
-    def select(self, which: NDArray[np.intp]) -> "Outlines":
-        """Return some of the outlines."""
-        return Outlines(self.center_w[which], self.direction[which], self.half_m[which], self.rounding_m[which])
+    def select(self, indices: NDArray[np.intp]) -> "Outlines":
+        """Return the outlines with these indices."""
+        return Outlines(self.center_w[indices], self.direction[indices], self.half_m[indices], self.rounding_m[indices])
 
     def append(self, others: "Outlines") -> "Outlines":
         """Return these outlines and others after them."""
@@ -103,7 +103,7 @@ class Outlines:
     @property
     def rims_w(self) -> Floats:
         """Return the corners and edge middles of the rectangles in the world, (m, 8, 2)."""
-        local = CORNERS * self.half_m[:, None, :]
+        local = UNIT_RIM_POINTS * self.half_m[:, None, :]
         x = local[..., 0]
         y = local[..., 1]
         cosine = self.direction[:, None, 0]
@@ -111,55 +111,57 @@ class Outlines:
         rotated = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
         return self.center_w[:, None, :] + rotated
 
-    def distance_m(self, points_w: Floats) -> Floats:
+    def compute_distances_m(self, points_w: Floats) -> Floats:
         """Return the distances from points (..., 2) to every outline, (..., m); negative inside.
 
         With q = |p| - h, where p is the point in the rectangle's frame and h its half size, the distance is
         |max(q, 0)| + min(max(q_x, q_y), 0) - rounding.
         """
-        local_x, local_y = self._in_local_frames(points_w)
+        local_x, local_y = self._transform_to_local_frames(points_w)
         over_x = np.abs(local_x) - self.half_m[:, 0]
         over_y = np.abs(local_y) - self.half_m[:, 1]
         outside = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
         return outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m
 
-    def distance_and_normal(self, points_w: Floats, which: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        """Return the distance of each point from one outline, and the outward normal there.
+    def compute_distances_and_normals(
+        self, points_w: Floats, outline_indices: NDArray[np.intp]
+    ) -> tuple[Floats, Floats]:
+        """Compute the distance of each point from one outline, and the outward normal there.
 
-        The normal points away from the nearest point of the rectangle; inside of the rectangle, out of its nearest
-        edge.
+        Outside of the rectangle, the normal points away from the nearest point of the rectangle. Inside, it points out
+        of the nearest edge.
 
         Args:
-            points_w: (..., 2) points in the world, m.
-            which: (...) index of the outline for each point.
+            points_w: Points in the world, (..., 2), m.
+            outline_indices: Index of an outline for each point, (...).
 
         Returns:
-            Distances (...) in m, negative inside, and unit normals (..., 2) in the world.
+            Distances in m, (...), negative inside, and unit normals in the world, (..., 2).
         """
-        cosine = self.direction[which, 0]
-        sine = self.direction[which, 1]
-        dx = points_w[..., 0] - self.center_w[which, 0]
-        dy = points_w[..., 1] - self.center_w[which, 1]
+        cosine = self.direction[outline_indices, 0]
+        sine = self.direction[outline_indices, 1]
+        dx = points_w[..., 0] - self.center_w[outline_indices, 0]
+        dy = points_w[..., 1] - self.center_w[outline_indices, 1]
         local_x = cosine * dx + sine * dy
         local_y = cosine * dy - sine * dx
 
-        over_x = np.abs(local_x) - self.half_m[which, 0]
-        over_y = np.abs(local_y) - self.half_m[which, 1]
-        out_x = np.maximum(over_x, 0.0)
-        out_y = np.maximum(over_y, 0.0)
-        outside = np.hypot(out_x, out_y)
-        distance = outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m[which]
+        over_x = np.abs(local_x) - self.half_m[outline_indices, 0]
+        over_y = np.abs(local_y) - self.half_m[outline_indices, 1]
+        outside_x = np.maximum(over_x, 0.0)
+        outside_y = np.maximum(over_y, 0.0)
+        outside_distance = np.hypot(outside_x, outside_y)
+        distance = outside_distance + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m[outline_indices]
 
-        is_outside = outside > 0
-        length = np.where(is_outside, outside, 1.0)
+        is_outside = outside_distance > 0
+        length = np.where(is_outside, outside_distance, 1.0)
         sign_x = np.where(local_x < 0, -1.0, 1.0)
         sign_y = np.where(local_y < 0, -1.0, 1.0)
-        normal_x = np.where(is_outside, out_x / length, over_x >= over_y) * sign_x
-        normal_y = np.where(is_outside, out_y / length, over_x < over_y) * sign_y
+        normal_x = np.where(is_outside, outside_x / length, over_x >= over_y) * sign_x
+        normal_y = np.where(is_outside, outside_y / length, over_x < over_y) * sign_y
         normal_w = np.stack([cosine * normal_x - sine * normal_y, sine * normal_x + cosine * normal_y], axis=-1)
         return distance, normal_w
 
-    def _in_local_frames(self, points_w: Floats) -> tuple[Floats, Floats]:
+    def _transform_to_local_frames(self, points_w: Floats) -> tuple[Floats, Floats]:
         """Return x and y of points (..., 2) in the frame of every rectangle, each (..., m)."""
         offset_x = points_w[..., None, 0] - self.center_w[:, 0]
         offset_y = points_w[..., None, 1] - self.center_w[:, 1]
@@ -170,10 +172,10 @@ class Outlines:
         return local_x, local_y
 
 
-def gaps_m(single: Outlines, others: Outlines) -> Floats:
+def compute_gaps_m(single: Outlines, others: Outlines) -> Floats:
     """Return the gaps (m,) between a single outline and each of the others; exact while they do not overlap."""
-    from_single = others.distance_m(single.rims_w[0]).min(axis=0) - single.rounding_m[0]
-    from_others = single.distance_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
+    from_single = others.compute_distances_m(single.rims_w[0]).min(axis=0) - single.rounding_m[0]
+    from_others = single.compute_distances_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
     return np.minimum(from_single, from_others)
 
 
@@ -188,15 +190,15 @@ def has_gap_below(single: Outlines, others: Outlines, limit_m: float) -> bool:
     near = np.flatnonzero(min_gaps_m < limit_m + ROUNDING_ERROR_M)
     if not len(near):
         return False
-    return bool(gaps_m(single, others.select(near)).min() < limit_m)
+    return bool(compute_gaps_m(single, others.select(near)).min() < limit_m)
 
 
-def nearest_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.intp], Floats, Floats]:
+def find_nearest_points_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Return the point of a chain that is nearest to each outline, among `LINK_FRACTIONS` of every link.
 
     Args:
-        nodes_w: (n, 2) tail end, joints and head end, m.
-        outlines: m outlines.
+        nodes_w: Tail end, joints and head end of the chain, (n, 2), m.
+        outlines: Outlines of m obstacles.
 
     Returns:
         Index of the point among all `LINK_FRACTIONS` of all links (m,), the point itself (m, 2), and its distance (m,).
@@ -204,7 +206,7 @@ def nearest_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.in
     rear = nodes_w[:-1, None]
     run = np.diff(nodes_w, axis=0)[:, None]
     points = (rear + LINK_FRACTIONS[:, None] * run).reshape(-1, 2)
-    distances = outlines.distance_m(points)
+    distances = outlines.compute_distances_m(points)
     nearest = distances.argmin(axis=0)
     return nearest, points[nearest], distances[nearest, np.arange(len(outlines))]
 
@@ -218,7 +220,7 @@ class Capsule(FileStruct, frozen=True, kw_only=True):
     radius_m: float
 
 
-def outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
+def compute_outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
     """Return the distance from a point on the ground to an obstacle's outline from above; negative inside."""
     offset = np.asarray(point, dtype=np.float64) - np.array(obstacle.position_w[:2])
     if obstacle.shape != "box":

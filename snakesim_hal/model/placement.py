@@ -1,6 +1,6 @@
 """The obstacles of a scene at their places: peg rows and random fields are expanded into plain obstacles.
 
-`check_clear` rejects a scene in which an obstacle overlaps the snake at its start pose.
+`validate_start_clearance` rejects a scene in which an obstacle overlaps the snake at its start pose.
 """
 
 import math
@@ -12,52 +12,58 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.outlines import Capsule, Outlines
-from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, make_solids, place_random_obstacles
+from snakesim_hal.model.random_field import (
+    MAX_RANDOM_OBSTACLES,
+    RandomField,
+    place_random_obstacles,
+    sample_materials_and_leans,
+)
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scene import Box, Cylinder, PegsAlongRoute, SceneFile, Sphere, Step, Wall, make_route
-from snakesim_hal.model.solids import Solid, Upright, make_block, make_peg, material_fields
+from snakesim_hal.model.solids import Solid, Upright, get_material_fields, make_block, make_peg
 from snakesim_hal.wire.messages import Obstacle
 
-SAMPLES = 24  # points along a link's axis at which the distance to obstacles is computed
-OVERLAP_M = 1e-4  # a smaller overlap of an obstacle and a link is a rounding error
+SAMPLES_PER_LINK = 24  # points along a link's axis at which the distance to obstacles is computed
+OVERLAP_TOLERANCE_M = 1e-4  # a smaller overlap of an obstacle and a link is a rounding error
 MAX_OBSTACLES = 4096  # bound of the message World
 
 
-class Placed(Upright, frozen=True, kw_only=True):
+class PlacedObstacle(Upright, frozen=True, kw_only=True):
     """A placed obstacle, with parameters that only the simulator needs."""
 
     obstacle: Obstacle
     walkable: bool = False  # a step: part of the ground, so the snake does not push off from it
 
 
-def place_scene(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Placed]:
-    """Return all obstacles of a scene, with peg rows and random fields expanded, each with a unique name.
+def place_scene_obstacles(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[PlacedObstacle]:
+    """Place all obstacles of a scene. Peg rows and random fields are expanded into single obstacles with unique names.
 
     Args:
-        scene: the scene file.
-        keep_clear: links of the snake at its start, from which random obstacles keep a distance.
+        scene: Scene file.
+        keep_clear: Outlines of the snake's links at its start, from which random obstacles keep a distance. None if
+            they need not.
 
     Raises:
         ConfigError: There are too many obstacles, one cannot be placed, or two have the same name.
     """
-    _check_count(scene)
-    placed: list[Placed] = [
-        *(_placed_cylinder(i, cylinder) for i, cylinder in enumerate(scene.cylinder)),
-        *(_placed_box(i, box) for i, box in enumerate(scene.box)),
-        *(_placed_sphere(i, sphere) for i, sphere in enumerate(scene.sphere)),
-        *(_placed_wall(scene, i, wall) for i, wall in enumerate(scene.wall)),
-        *(_placed_step(i, step) for i, step in enumerate(scene.step)),
+    _validate_obstacle_count(scene)
+    placed: list[PlacedObstacle] = [
+        *(_place_cylinder(i, cylinder) for i, cylinder in enumerate(scene.cylinder)),
+        *(_place_box(i, box) for i, box in enumerate(scene.box)),
+        *(_place_sphere(i, sphere) for i, sphere in enumerate(scene.sphere)),
+        *(_place_wall(scene, i, wall) for i, wall in enumerate(scene.wall)),
+        *(_place_step(i, step) for i, step in enumerate(scene.step)),
     ]
     route = make_route(scene)
     for i, row in enumerate(scene.pegs_along_route):
-        placed += _pegs_along_route(scene, i, row, route)
+        placed += _place_pegs_along_route(scene, i, row, route)
     for i, field in enumerate(scene.random_field):
-        placed += _obstacles_of_field(scene, i, field, route, placed, keep_clear or [])
-    _check_names(scene, placed)
+        placed += _place_random_field(scene, i, field, route, placed, keep_clear or [])
+    _validate_unique_names(scene, placed)
     return placed
 
 
-def _check_count(scene: SceneFile) -> None:
+def _validate_obstacle_count(scene: SceneFile) -> None:
     """Raise ConfigError if the scene has more obstacles than a message can hold."""
     single_obstacles = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
     count = sum(len(obstacles) for obstacles in single_obstacles)
@@ -69,7 +75,7 @@ def _check_count(scene: SceneFile) -> None:
         )
 
 
-def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
+def _validate_unique_names(scene: SceneFile, placed: list[PlacedObstacle]) -> None:
     """Raise ConfigError if two obstacles have the same name."""
     counts = Counter(item.obstacle.name for item in placed)
     duplicates = sorted(name for name, count in counts.items() if count > 1)
@@ -80,24 +86,24 @@ def _check_names(scene: SceneFile, placed: list[Placed]) -> None:
         )
 
 
-def _with_material(obstacle: Obstacle, solid: Solid) -> Placed:
+def _add_material(obstacle: Obstacle, solid: Solid) -> PlacedObstacle:
     """Return a placed obstacle with the material and the lean that its section in the scene file gives."""
-    return Placed(obstacle=obstacle, **material_fields(solid))
+    return PlacedObstacle(obstacle=obstacle, **get_material_fields(solid))
 
 
-def _placed_cylinder(index: int, cylinder: Cylinder) -> Placed:
+def _place_cylinder(index: int, cylinder: Cylinder) -> PlacedObstacle:
     name = cylinder.name or f"cylinder_{index}"
     obstacle = make_peg(name, cylinder.position_m, cylinder.radius_m, cylinder.height_m)
-    return _with_material(obstacle, cylinder)
+    return _add_material(obstacle, cylinder)
 
 
-def _placed_box(index: int, box: Box) -> Placed:
+def _place_box(index: int, box: Box) -> PlacedObstacle:
     name = box.name or f"box_{index}"
     obstacle = make_block(name, box.position_m, box.size_m, box.yaw_rad)
-    return _with_material(obstacle, box)
+    return _add_material(obstacle, box)
 
 
-def _placed_sphere(index: int, sphere: Sphere) -> Placed:
+def _place_sphere(index: int, sphere: Sphere) -> PlacedObstacle:
     obstacle = Obstacle(
         name=sphere.name or f"sphere_{index}",
         shape="sphere",
@@ -105,10 +111,10 @@ def _placed_sphere(index: int, sphere: Sphere) -> Placed:
         radius_m=sphere.radius_m,
         height_m=2 * sphere.radius_m,
     )
-    return _with_material(obstacle, sphere)
+    return _add_material(obstacle, sphere)
 
 
-def _placed_wall(scene: SceneFile, index: int, wall: Wall) -> Placed:
+def _place_wall(scene: SceneFile, index: int, wall: Wall) -> PlacedObstacle:
     """Return a wall as a block whose length is along the wall."""
     from_x, from_y = wall.from_m
     to_x, to_y = wall.to_m
@@ -123,14 +129,14 @@ def _placed_wall(scene: SceneFile, index: int, wall: Wall) -> Placed:
     middle_m = ((from_x + to_x) / 2, (from_y + to_y) / 2)
     size_m = (length_m, wall.thickness_m, wall.height_m)
     obstacle = make_block(name, middle_m, size_m, math.atan2(run_y, run_x))
-    return _with_material(obstacle, wall)
+    return _add_material(obstacle, wall)
 
 
-def _placed_step(index: int, step: Step) -> Placed:
+def _place_step(index: int, step: Step) -> PlacedObstacle:
     name = step.name or f"step_{index}"
     size_m = (*step.size_m, step.height_m)
     platform = make_block(name, step.position_m, size_m, step.yaw_rad)
-    return Placed(
+    return PlacedObstacle(
         obstacle=platform,
         friction=step.friction,
         forward_friction=step.forward_friction,
@@ -139,70 +145,80 @@ def _placed_step(index: int, step: Step) -> Placed:
     )
 
 
-def _pegs_along_route(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None) -> list[Placed]:
-    """Return the pegs of one `[[pegs_along_route]]`: one at each inflection, on the side from which it pushes forward.
+def _place_pegs_along_route(
+    scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None
+) -> list[PlacedObstacle]:
+    """Place the pegs of one `[[pegs_along_route]]`: one at each inflection, on the side from which it pushes forward.
+
+    Args:
+        scene: Scene file, whose name is in errors.
+        index: Index of this row of pegs in the scene file.
+        row: Section of the row.
+        route: Route of the scene, or None if it has none.
 
     Raises:
         ConfigError: The scene has no route, or the route has too few inflections.
     """
-    where = f"scene {scene.name!r}: `pegs_along_route.{index}`"
+    context = f"scene {scene.name!r}: `pegs_along_route.{index}`"
     if route is None:
-        raise ConfigError(f"{where}: the scene has no route; add a [route] section", code="scene/no-route")
-    inflections_s_m = route.inflections_s_m()
+        raise ConfigError(f"{context}: the scene has no route; add a [route] section", code="scene/no-route")
+    inflections_s_m = route.find_inflections_s_m()
     used_s_m = inflections_s_m[row.first : row.first + row.count]
     if len(used_s_m) < row.count:
-        available = len(inflections_s_m)
+        available_count = len(inflections_s_m)
         raise ConfigError(
-            f"{where}: `count` = {row.count} pegs from inflection {row.first} on, but the route has {available} "
-            f"inflections; make the route longer or `count` at most {max(available - row.first, 0)}",
+            f"{context}: `count` = {row.count} pegs from inflection {row.first} on, but the route has "
+            f"{available_count} inflections; make the route longer or `count` at most "
+            f"{max(available_count - row.first, 0)}",
             code="scene/invalid",
         )
-    start_w, end_w = route.position_w(np.array([0.0, route.length_m]))
-    forward = (end_w - start_w) / np.linalg.norm(end_w - start_w)
-    pegs: list[Placed] = []
-    for number, s_m in enumerate(used_s_m, start=row.first):
+    start_w, end_w = route.compute_positions_w(np.array([0.0, route.length_m]))
+    forward_w = (end_w - start_w) / np.linalg.norm(end_w - start_w)
+    pegs: list[PlacedObstacle] = []
+    for inflection, s_m in enumerate(used_s_m, start=row.first):
         tangent = route.tangent_w(s_m)
-        left = np.array([-tangent[1], tangent[0]])
-        is_forward = left @ forward > 0
-        push_direction = left if is_forward else -left  # of the force from the peg on the body
-        center = route.position_w(s_m) - push_direction * (row.corridor_m + row.radius_m)
-        center_m = (float(center[0]), float(center[1]))
-        obstacle = make_peg(f"peg_{index}_{number}", center_m, row.radius_m, row.height_m)
-        pegs.append(_with_material(obstacle, row))
+        left_w = np.array([-tangent[1], tangent[0]])
+        is_forward = left_w @ forward_w > 0
+        push_direction_w = left_w if is_forward else -left_w  # of the force from the peg on the body
+        center_w = route.compute_positions_w(s_m) - push_direction_w * (row.corridor_m + row.radius_m)
+        center_m = (float(center_w[0]), float(center_w[1]))
+        obstacle = make_peg(f"peg_{index}_{inflection}", center_m, row.radius_m, row.height_m)
+        pegs.append(_add_material(obstacle, row))
     return pegs
 
 
-def _obstacles_of_field(
+def _place_random_field(
     scene: SceneFile,
     index: int,
     field: RandomField,
     route: Route | None,
-    placed: list[Placed],
+    placed: list[PlacedObstacle],
     keep_clear: list[Capsule],
-) -> list[Placed]:
-    """Return the obstacles of one random field, between those that are placed already."""
-    where = f"scene {scene.name!r}: `random_field.{index}`"
-    standing = [item.obstacle for item in placed if not item.walkable]
-    obstacles = place_random_obstacles(field, where, index, route, standing, keep_clear)
-    solids = make_solids(field, index, len(obstacles))
-    return [_with_material(obstacle, solid) for obstacle, solid in zip(obstacles, solids, strict=True)]
+) -> list[PlacedObstacle]:
+    """Place the obstacles of one random field, with a gap to those that are placed already."""
+    context = f"scene {scene.name!r}: `random_field.{index}`"
+    existing_obstacles = [item.obstacle for item in placed if not item.walkable]
+    obstacles = place_random_obstacles(field, context, index, route, existing_obstacles, keep_clear)
+    solids = sample_materials_and_leans(field, index, len(obstacles))
+    return [_add_material(obstacle, solid) for obstacle, solid in zip(obstacles, solids, strict=True)]
 
 
-def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) -> None:
-    """Check that no obstacle overlaps the snake at its start.
+def validate_start_clearance(scene: SceneFile, placed: list[PlacedObstacle], snake: list[Capsule]) -> None:
+    """Raise ConfigError if an obstacle overlaps the snake at its start.
 
     Args:
-        scene: named in the error.
-        placed: all obstacles; the snake may lie on walkable ones.
-        snake: outlines of the links.
+        scene: Scene file, whose name is in the error.
+        placed: All obstacles of the scene. The snake may lie on walkable ones.
+        snake: Outlines of the snake's links.
 
     Raises:
-        ConfigError: An obstacle overlaps a link. It names both, and how far they overlap.
+        ConfigError: An obstacle overlaps a link. The error names both, and how far they overlap.
     """
     height_m = max(link.radius_m for link in snake)
-    obstacles = [_at_height(item, height_m) for item in placed if not item.walkable]
-    overlaps_m = _overlaps_m(snake, obstacles)
-    overlapping_pairs = np.argwhere(overlaps_m.T > OVERLAP_M)  # (k, 2) indices of obstacle and link
+    obstacles = [_move_to_height(item, height_m) for item in placed if not item.walkable]
+    overlaps_m = _compute_overlaps_m(snake, obstacles)
+    # Transposed, so that the error is about the first obstacle in the order of the scene.
+    overlapping_pairs = np.argwhere(overlaps_m.T > OVERLAP_TOLERANCE_M)  # (k, 2) indices of obstacle and link
     for obstacle_index, link_index in overlapping_pairs[:1]:
         overlap_mm = overlaps_m[link_index, obstacle_index] * 1000
         raise ConfigError(
@@ -213,26 +229,26 @@ def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) ->
         )
 
 
-def _overlaps_m(snake: list[Capsule], obstacles: list[Obstacle]) -> Floats:
+def _compute_overlaps_m(snake: list[Capsule], obstacles: list[Obstacle]) -> Floats:
     """Return how far every link and obstacle overlap, (links, obstacles); negative where there is a gap.
 
     The distance of a link's axis from an obstacle's center is exact, which suffices for round obstacles. For boxes the
-    distances from `SAMPLES` points along the axis are taken, too, and the smallest one counts.
+    distances from `SAMPLES_PER_LINK` points along the axis are taken, too, and the smallest one counts.
     """
     outlines = Outlines.from_obstacles(obstacles)
     rear_w = np.array([link.rear_m for link in snake])
     front_w = np.array([link.front_m for link in snake])
     radius_m = np.array([link.radius_m for link in snake])
-    fractions = np.linspace(0.0, 1.0, SAMPLES)[:, None]
-    points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]  # (links, SAMPLES, 2)
-    from_points_m = outlines.distance_m(points_w).min(axis=1)
-    from_axes_m = Outlines.from_segments(rear_w, front_w).distance_m(outlines.center_w).T - outlines.rounding_m
+    fractions = np.linspace(0.0, 1.0, SAMPLES_PER_LINK)[:, None]
+    points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]  # (links, SAMPLES_PER_LINK, 2)
+    from_points_m = outlines.compute_distances_m(points_w).min(axis=1)
+    from_axes_m = Outlines.from_segments(rear_w, front_w).compute_distances_m(outlines.center_w).T - outlines.rounding_m
     gaps_m = np.minimum(from_points_m, from_axes_m)
     return radius_m[:, None] - gaps_m
 
 
-def _at_height(item: Placed, height_m: float) -> Obstacle:
-    """Return an obstacle at the position where its axis, which may lean, passes a height above the ground."""
+def _move_to_height(item: PlacedObstacle, height_m: float) -> Obstacle:
+    """Return an obstacle moved to where its axis, which may lean, is at a height above the ground."""
     x, y, z = item.obstacle.position_w
     offset_m = height_m * math.tan(item.lean_rad)
     lean_x = x + offset_m * math.cos(item.lean_towards_rad)

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
-from snakesim_hal.model.files import Table, decode, expand_home
+from snakesim_hal.model.files import ConfigTable, decode_table, expand_home
 from snakesim_hal.model.sibling_modules import find_siblings_of
 from snakesim_hal.model.textfiles import read_bytes
 
@@ -33,88 +33,88 @@ FILMS = "snakesim.films"
 PHYSICS_MODELS = "snakesim.physics_models"
 SENSORS = "snakesim.sensors"
 SERVICES = "snakesim.services"
-_offered: dict[tuple[str, str], Any] = {}
+_registered_plugins: dict[tuple[str, str], Any] = {}
 
 
 @contextlib.contextmanager
-def offer_plugin(group: str, name: str, plugin: Any) -> Iterator[None]:
+def register_plugin_temporarily(group: str, name: str, plugin: Any) -> Iterator[None]:
     """Register an object as a plugin in this process, for as long as the context lasts.
 
     It has precedence over an installed plugin of the same name.
 
     Args:
-        group: one of the groups of entry points.
-        name: of the plugin.
-        plugin: the object that `find_plugin` returns for the name.
+        group: Group of entry points, such as CONTROLLERS.
+        name: Name of the plugin.
+        plugin: Object that `load_plugin` returns for the name.
     """
-    previously_offered = _offered.copy()
-    _offered[group, name] = plugin
+    previous_plugins = _registered_plugins.copy()
+    _registered_plugins[group, name] = plugin
     try:
         yield
     finally:
-        _offered.clear()
-        _offered.update(previously_offered)
+        _registered_plugins.clear()
+        _registered_plugins.update(previous_plugins)
 
 
-def anything_offered() -> bool:
-    """Return whether this process has a plugin that no other process could find."""
-    return bool(_offered)
+def has_registered_plugins() -> bool:
+    """Return whether plugins are registered in this process, which no other process could find."""
+    return bool(_registered_plugins)
 
 
-def list_installed(group: str) -> list[str]:
+def list_installed_plugins(group: str) -> list[str]:
     """Return the names of all installed plugins of a group."""
-    return sorted({entry.name for entry in _installed(*sys.path).select(group=group)})
+    return sorted({entry.name for entry in _read_entry_points(*sys.path).select(group=group)})
 
 
 @cache
-def _installed(*_path: str) -> EntryPoints:
+def _read_entry_points(*_path: str) -> EntryPoints:
     """Return every entry point on a path. Reading them takes 7 ms, and a run looks up a dozen, so they are cached."""
     all_entries: Any = entry_points()  # before Python 3.12 of another class, which has the same `select`
     return all_entries
 
 
-def find_plugin(group: str, name: str) -> Any:
-    """Return the plugin of a name. A file is loaded, which runs its code.
+def load_plugin(group: str, name: str) -> Any:
+    """Load a plugin: a registered object, a class in a file, or an installed entry point. The code of a file is run.
 
     Args:
-        group: one of the groups of entry points.
-        name: of an entry point, or `./file.py:Class`.
+        group: Group of entry points, such as CONTROLLERS.
+        name: Name of an entry point, or `./file.py:Class`.
 
     Raises:
         ConfigError: There is no such plugin, or it cannot be loaded. The error lists the installed plugins.
     """
-    kind = _kind(group)
-    if (group, name) in _offered:
-        return _offered[group, name]
-    if in_file(name):
-        return _from_file(name, kind)
-    entry = _find_entry(group, name, kind)
+    kind_name = _get_kind_name(group)
+    if (group, name) in _registered_plugins:
+        return _registered_plugins[group, name]
+    if is_file_plugin(name):
+        return _load_from_file(name, kind_name)
+    entry = _find_entry_point(group, name, kind_name)
     try:
         return entry.load()
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"{kind} {name!r} cannot be loaded: {error}.{_install_hint(entry)}", code="extra/not-installed"
+            f"{kind_name} {name!r} cannot be loaded: {error}.{_make_install_hint(entry)}", code="extra/not-installed"
         ) from error
     except (ImportError, AttributeError) as error:
         raise ConfigError(
-            f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}", code="plugin/not-loadable"
+            f"{kind_name} {name!r} ({entry.value}) cannot be loaded: {error}", code="plugin/not-loadable"
         ) from error
 
 
-def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
-    """Return the only entry point of a name. Raises ConfigError if there is none, or if packages disagree."""
-    entries = list(_installed(*sys.path).select(group=group, name=name))
+def _find_entry_point(group: str, name: str, kind: str) -> EntryPoint:
+    """Return the entry point of a name. Raises ConfigError if there is none, or if packages disagree."""
+    entries = list(_read_entry_points(*sys.path).select(group=group, name=name))
     if not entries:
         raise ConfigError(
             f"no {kind} called {shorten(name)!r} is installed; "
-            f"{suggest_word(name, list_installed(group))}installed are "
-            f"{', '.join(list_installed(group)) or 'none'}. "
+            f"{suggest_word(name, list_installed_plugins(group))}installed are "
+            f"{', '.join(list_installed_plugins(group)) or 'none'}. "
             f"A package adds one by an entry point in the group {group!r}",
             code="plugin/not-found",
         )
     different_objects = {entry.value for entry in entries}
     if len(different_objects) > 1:
-        packages = " and ".join(f"{_package(entry)} ({entry.value})" for entry in entries)
+        packages = " and ".join(f"{_get_package_name(entry)} ({entry.value})" for entry in entries)
         raise ConfigError(
             f"{kind} {name!r} is in several installed packages: {packages}; uninstall all but one, or name a file "
             f"and a class in it, ./file.py:Class",
@@ -123,49 +123,51 @@ def _find_entry(group: str, name: str, kind: str) -> EntryPoint:
     return entries[0]
 
 
-def _package(entry: EntryPoint) -> str:
+def _get_package_name(entry: EntryPoint) -> str:
     return entry.dist.name if entry.dist is not None else "an unknown package"
 
 
-def _install_hint(entry: EntryPoint) -> str:
+def _make_install_hint(entry: EntryPoint) -> str:
     """Return how to install what a plugin needs, if its entry point names its extras: `module:Class [extra]`."""
     if entry.dist is None or not entry.extras:
         return ""
-    return f" Install it with: {pip_install(*entry.extras, package=entry.dist.name)}"
+    return f" Install it with: {make_pip_install_command(*entry.extras, package=entry.dist.name)}"
 
 
-def pip_install(*extras: str, package: str = "snakesim") -> str:
+def make_pip_install_command(*extras: str, package: str = "snakesim") -> str:
     """Return the command that installs extras of a package in the environment of this process."""
     return f"{sys.executable} -m pip install '{package}[{','.join(extras)}]'"
 
 
-def in_file(name: str) -> bool:
+def is_file_plugin(name: str) -> bool:
     """Return whether a name is the path of a Python file, with or without a class; loading it runs its code."""
     return ".py:" in name or name.endswith(".py")
 
 
-def find_installed(group: str, name: str) -> Any | None:
-    """Return an installed plugin; for a file only check that the class exists, without running it, and return None.
+def load_plugin_unless_file(group: str, name: str) -> Any | None:
+    """Load an installed plugin. For a class in a file, only check that the class exists, and return None.
+
+    The code of a file is not run.
 
     Raises:
         ConfigError: There is no such plugin, or it cannot be loaded.
     """
-    if not in_file(name):
-        return find_plugin(group, name)
-    kind = _kind(group)
-    _, attribute, tree = _parse_file(name, kind)
-    defined = set(_names(tree))
-    if attribute not in defined and "*" not in defined:  # `from x import *` may define any name
-        raise _missing_class_error(name, kind, tree)
+    if not is_file_plugin(name):
+        return load_plugin(group, name)
+    kind = _get_kind_name(group)
+    _, attribute, tree = _parse_plugin_file(name, kind)
+    defined_names = set(_iterate_defined_names(tree))
+    if attribute not in defined_names and "*" not in defined_names:  # `from x import *` may define any name
+        raise _make_missing_class_error(name, kind, tree)
     return None
 
 
-def _kind(group: str) -> str:
+def _get_kind_name(group: str) -> str:
     """Return what a plugin of a group is called in messages, such as `controller`."""
     return group.rpartition(".")[2].removesuffix("s")
 
 
-def _split_name(name: str) -> tuple[str, str]:
+def _split_plugin_name(name: str) -> tuple[str, str]:
     """Return file and class of `./file.py:Class`; the class is empty if the name has none."""
     if ".py:" not in name:
         return name, ""
@@ -173,9 +175,9 @@ def _split_name(name: str) -> tuple[str, str]:
     return path, attribute
 
 
-def _parse_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
+def _parse_plugin_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
     """Return the file, the class name, and the parsed code, which is not run. Raises ConfigError."""
-    path_text, attribute = _split_name(name)
+    path_text, attribute = _split_plugin_name(name)
     try:
         path = expand_home(path_text).absolute()
         tree = ast.parse(read_bytes(path), str(path))
@@ -183,13 +185,13 @@ def _parse_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
         why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
         raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {why}", code="plugin/not-loadable") from None
     if not attribute:
-        raise _missing_class_error(name, kind, tree)
+        raise _make_missing_class_error(name, kind, tree)
     return path, attribute, tree
 
 
-def _missing_class_error(name: str, kind: str, tree: ast.Module) -> ConfigError:
+def _make_missing_class_error(name: str, kind: str, tree: ast.Module) -> ConfigError:
     """Return the error for a file without the class that a name asks for; it lists the classes in the file."""
-    path, attribute = _split_name(name)
+    path, attribute = _split_plugin_name(name)
     classes = [statement.name for statement in tree.body if isinstance(statement, ast.ClassDef)]
     problem = f"the file has no {attribute!r}" if attribute else "the name of a class must follow"
     if classes:
@@ -204,7 +206,7 @@ def _missing_class_error(name: str, kind: str, tree: ast.Module) -> ConfigError:
     )
 
 
-def _names(tree: ast.Module) -> Iterator[str]:
+def _iterate_defined_names(tree: ast.Module) -> Iterator[str]:
     """Yield all names that a file may define."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
@@ -215,9 +217,17 @@ def _names(tree: ast.Module) -> Iterator[str]:
             yield node.id
 
 
-def _from_file(name: str, kind: str) -> Any:
-    """Run a Python file, and return the object that a name asks for. Raises ConfigError."""
-    path, attribute, tree = _parse_file(name, kind)
+def _load_from_file(name: str, kind: str) -> Any:
+    """Run a Python file, and return the class that a plugin name asks for.
+
+    Args:
+        name: `./file.py:Class`.
+        kind: What the plugin is called in errors, such as `controller`.
+
+    Raises:
+        ConfigError: The file cannot be run, or has no such class.
+    """
+    path, attribute, tree = _parse_plugin_file(name, kind)
     spec = importlib.util.spec_from_file_location(f"snakesim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python", code="plugin/not-loadable")
@@ -231,26 +241,27 @@ def _from_file(name: str, kind: str) -> Any:
             f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}", code="plugin/not-loadable"
         ) from error
     if not hasattr(module, attribute):
-        raise _missing_class_error(name, kind, tree)
+        raise _make_missing_class_error(name, kind, tree)
     return getattr(module, attribute)
 
 
 def require_base_class(plugin: Any, base: type[BaseT], label: str) -> type[BaseT]:
-    """Return a plugin that is a class derived from a base class, and that implements its abstract methods.
+    """Check that a plugin is a class that implements an interface, and return it.
 
     Args:
-        plugin: the object that `find_plugin` has returned.
-        base: the class that describes the interface, such as `Controller`.
-        label: kind and name of the plugin, with which the error begins, such as "controller 'wave'".
+        plugin: Object that `load_plugin` has returned.
+        base: Base class that declares the interface, such as `Controller`.
+        label: Kind and name of the plugin, which the error begins with, such as "controller 'wave'".
 
     Raises:
-        ConfigError: it is not. The text names the class, its file, and what to write instead.
+        ConfigError: The plugin is not derived from the base class, or does not implement all of its abstract methods.
+            The error names the class, its file, and what to write instead.
     """
-    where = f"{label}: {describe_plugin(plugin)}"
+    context = f"{label}: {describe_plugin(plugin)}"
     if not (isinstance(plugin, type) and issubclass(plugin, base)):
         class_name = plugin.__name__ if isinstance(plugin, type) else "Name"
         raise ConfigError(
-            f"{where} does not derive from {base.__name__}. Write `class {class_name}({base.__name__}):`, after "
+            f"{context} does not derive from {base.__name__}. Write `class {class_name}({base.__name__}):`, after "
             f"`from {base.__module__} import {base.__name__}`",
             code="plugin/not-loadable",
         )
@@ -258,7 +269,7 @@ def require_base_class(plugin: Any, base: type[BaseT], label: str) -> type[BaseT
     if missing:
         methods = ", ".join(f"`{name}`" for name in missing)
         raise ConfigError(
-            f"{where} has no {methods}: implement it as {base.__name__} in {base.__module__} describes",
+            f"{context} has no {methods}: implement it as {base.__name__} in {base.__module__} describes",
             code="plugin/not-loadable",
         )
     return plugin
@@ -275,25 +286,25 @@ def describe_plugin(plugin: Any) -> str:
     return f"class {plugin.__name__} in {location}"
 
 
-def plugin_settings(
-    plugin: Any, section: dict[str, Any], source: str, where: str, origin: dict[str, str] | None = None
+def decode_plugin_settings(
+    plugin: Any, section: dict[str, Any], source: str, section_key: str, origin_by_key: dict[str, str] | None = None
 ) -> Any:
-    """Return a plugin's section of the configuration, checked by the plugin's own `Settings`.
+    """Check the configuration section of a plugin, and convert it to the plugin's own Struct `Settings`.
 
     Args:
-        plugin: a class with a Struct `Settings`.
-        section: the values as read.
-        source: file that contains them, for errors.
-        where: dotted key of the section, for errors.
-        origin: file or flag of each dotted key, as far as known.
+        plugin: Class with a Struct `Settings`.
+        section: Values of the section as read.
+        source: File that contains the section, for errors.
+        section_key: Dotted key of the section, for errors.
+        origin_by_key: File or flag that each value comes from, by dotted key. None if this is not known.
 
     Raises:
         ConfigError: The plugin has no `Settings`, or a value is not allowed.
     """
-    settings = getattr(plugin, "Settings", None)
-    if not (isinstance(settings, type) and issubclass(settings, msgspec.Struct)):
+    settings_type = getattr(plugin, "Settings", None)
+    if not (isinstance(settings_type, type) and issubclass(settings_type, msgspec.Struct)):
         raise ConfigError(
             f"{plugin!r} has no `Settings` Struct; every plugin needs one, even if it is empty",
             code="plugin/not-loadable",
         )
-    return decode(Table(section, source, origin or {}), settings, where)
+    return decode_table(ConfigTable(section, source, origin_by_key or {}), settings_type, section_key)

@@ -11,12 +11,12 @@ from numpy.random import Generator
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, has_gap_below
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, make_block, make_peg, material_fields
+from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, get_material_fields, make_block, make_peg
 from snakesim_hal.wire.messages import Obstacle
 
 MAX_RANDOM_OBSTACLES = 1000
-TRIES = 200  # random positions that are tried for each obstacle
-LEANING = 1  # third part of the seed of the leans, so that they do not change the positions
+MAX_TRIES_PER_OBSTACLE = 200  # random positions that are tried for each obstacle
+LEAN_SEED = 1  # third part of the seed of the leans, so that they do not change the positions
 
 
 class RandomField(Solid, frozen=True, kw_only=True):
@@ -65,17 +65,17 @@ class RandomField(Solid, frozen=True, kw_only=True):
         return round(self.density_per_m2 * area_m2)
 
 
-def make_solids(field: RandomField, index: int, count: int) -> list[Upright]:
-    """Return the material and the random lean of every obstacle of a field.
+def sample_materials_and_leans(field: RandomField, index: int, count: int) -> list[Upright]:
+    """Return the material and a random lean for every obstacle of a random field.
 
     Args:
-        field: the random field.
-        index: its number in the scene, which is part of the seed.
-        count: number of its obstacles.
+        field: Section of the random field.
+        index: Index of the field in the scene, which is part of the seed.
+        count: Number of obstacles in the field.
     """
-    random = np.random.default_rng([field.seed, index, LEANING])
-    leans = random.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
-    material = material_fields(field)
+    rng = np.random.default_rng([field.seed, index, LEAN_SEED])
+    leans = rng.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
+    material = get_material_fields(field)
     return [
         Upright(**material, lean_rad=lean_rad, lean_towards_rad=towards_rad) for lean_rad, towards_rad in leans.tolist()
     ]
@@ -83,77 +83,77 @@ def make_solids(field: RandomField, index: int, count: int) -> list[Upright]:
 
 def place_random_obstacles(
     field: RandomField,
-    where: str,
+    context: str,
     index: int,
     route: Route | None,
-    standing: Sequence[Obstacle],
-    keep_clear: Sequence[Capsule],
+    existing_obstacles: Sequence[Obstacle],
+    snake_capsules: Sequence[Capsule],
 ) -> list[Obstacle]:
     """Place the obstacles of a random field by rejection sampling.
 
     Args:
-        field: the random field.
-        where: names the field in errors.
-        index: number of the field in the scene, which is part of the seed.
-        route: route of the scene.
-        standing: obstacles that are placed already.
-        keep_clear: outlines of the snake at its start.
+        field: Section of the random field.
+        context: Place of the field in the scene file, which errors begin with.
+        index: Index of the field in the scene, which is part of the seed.
+        route: Route of the scene, or None if it has none.
+        existing_obstacles: Obstacles that are placed already.
+        snake_capsules: Outlines of the snake's links at its start.
 
     Raises:
         ConfigError: A value of the field is not allowed, or too few obstacles fit.
     """
-    _check(field, where, route)
-    random = np.random.default_rng([field.seed, index])
-    free_areas = _areas_to_keep_free(field, route, keep_clear)
+    _validate_field(field, context, route)
+    rng = np.random.default_rng([field.seed, index])
+    exclusion_zones = _make_exclusion_zones(field, route, snake_capsules)
     placed: list[Obstacle] = []
-    others = Outlines.from_obstacles(standing)
-    for _ in range(TRIES * field.target_count):
+    placed_outlines = Outlines.from_obstacles(existing_obstacles)
+    for _ in range(MAX_TRIES_PER_OBSTACLE * field.target_count):
         if len(placed) == field.target_count:
             return placed
-        candidate = _random_obstacle(field, random, f"random_{index}_{len(placed)}")
+        candidate = _sample_obstacle(field, rng, f"random_{index}_{len(placed)}")
         outline = Outlines.from_obstacles([candidate])
-        if len(others) and has_gap_below(outline, others, field.clearance_m):
+        if len(placed_outlines) and has_gap_below(outline, placed_outlines, field.clearance_m):
             continue
-        if any(has_gap_below(outline, area, 0.0) for area in free_areas):
+        if any(has_gap_below(outline, zone, 0.0) for zone in exclusion_zones):
             continue
         placed.append(candidate)
-        others = others.append(outline)
+        placed_outlines = placed_outlines.append(outline)
     if len(placed) < field.target_count:
         raise ConfigError(
-            f"{where}: only {len(placed)} of {field.target_count} pegs fit; lower `density_per_m2` = "
+            f"{context}: only {len(placed)} of {field.target_count} pegs fit; lower `density_per_m2` = "
             f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}",
             code="scene/invalid",
         )
     return placed
 
 
-def _areas_to_keep_free(field: RandomField, route: Route | None, snake: Sequence[Capsule]) -> list[Outlines]:
+def _make_exclusion_zones(field: RandomField, route: Route | None, snake: Sequence[Capsule]) -> list[Outlines]:
     """Return the outlines that no obstacle may overlap: snake and route, each grown by its clearance."""
-    areas: list[Outlines] = []
+    zones: list[Outlines] = []
     if snake:
         rear_w = np.array([link.rear_m for link in snake])
         front_w = np.array([link.front_m for link in snake])
         radius_m = max(link.radius_m for link in snake)
-        areas.append(Outlines.from_segments(rear_w, front_w, radius_m + field.clearance_m))
+        zones.append(Outlines.from_segments(rear_w, front_w, radius_m + field.clearance_m))
     if route is not None and field.route_clearance_m is not None:
-        areas.append(Outlines.from_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
-    return areas
+        zones.append(Outlines.from_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
+    return zones
 
 
-def _check(field: RandomField, where: str, route: Route | None) -> None:
-    """Check values of a random field that depend on one another.
+def _validate_field(field: RandomField, context: str, route: Route | None) -> None:
+    """Raise ConfigError for values of a random field that contradict each other.
 
     Args:
-        field: the random field.
-        where: names the field in errors.
-        route: route of the scene, if it has one.
+        field: Section of the random field.
+        context: Place of the field in the scene file, which errors begin with.
+        route: Route of the scene, or None if it has none.
 
     Raises:
-        ConfigError: corners or sizes are out of order, a route is missing, or there would be too many obstacles.
+        ConfigError: Corners or sizes are out of order, a route is missing, or there would be too many obstacles.
     """
     if not np.all(np.array(field.max_corner_m) > np.array(field.min_corner_m)):
         raise ConfigError(
-            f"{where}: `max_corner_m` = {field.max_corner_m} must exceed `min_corner_m` = "
+            f"{context}: `max_corner_m` = {field.max_corner_m} must exceed `min_corner_m` = "
             f"{field.min_corner_m} in x and y",
             code="scene/invalid",
         )
@@ -161,29 +161,29 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
         sizes = getattr(field, name)
         min_size, max_size = sizes
         if max_size < min_size:
-            raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest", code="scene/invalid")
+            raise ConfigError(f"{context}: `{name}` = {sizes}: smallest first, then largest", code="scene/invalid")
     if field.route_clearance_m is not None and route is None:
         raise ConfigError(
-            f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section",
+            f"{context}: `route_clearance_m` is set but the scene has no route; add a [route] section",
             code="scene/no-route",
         )
     if field.target_count > MAX_RANDOM_OBSTACLES:
         raise ConfigError(
-            f"{where}: `density_per_m2` = {field.density_per_m2} means {field.target_count} pegs on this area; at most "
-            f"{MAX_RANDOM_OBSTACLES}",
+            f"{context}: `density_per_m2` = {field.density_per_m2} means {field.target_count} pegs on this area; at "
+            f"most {MAX_RANDOM_OBSTACLES}",
             code="scene/invalid",
         )
 
 
-def _random_obstacle(field: RandomField, random: Generator, name: str) -> Obstacle:
-    """Return a peg or a block at a random position in the field.
+def _sample_obstacle(field: RandomField, rng: Generator, name: str) -> Obstacle:
+    """Sample a peg or a block at a random position in the field.
 
     The order of the random numbers is part of the result: a scene is the same for the same seed.
     """
-    x, y = random.uniform(field.min_corner_m, field.max_corner_m).tolist()
-    radius_m = float(random.uniform(*field.radius_m))
-    if field.box_fraction == 0 or random.uniform() >= field.box_fraction:
+    x, y = rng.uniform(field.min_corner_m, field.max_corner_m).tolist()
+    radius_m = float(rng.uniform(*field.radius_m))
+    if field.box_fraction == 0 or rng.uniform() >= field.box_fraction:
         return make_peg(name, (x, y), radius_m, field.height_m)
-    length_m, width_m = random.uniform(*field.box_size_m, size=2).tolist()
-    yaw_rad = float(random.uniform(0.0, math.pi))
+    length_m, width_m = rng.uniform(*field.box_size_m, size=2).tolist()
+    yaw_rad = float(rng.uniform(0.0, math.pi))
     return make_block(name, (x, y), (length_m, width_m, field.height_m), yaw_rad)

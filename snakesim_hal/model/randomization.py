@@ -30,47 +30,54 @@ class Randomization(FileStruct, frozen=True, kw_only=True):
         if not are_finite or self.low > self.high:
             raise ValueError(f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite")
 
-    def overrides_for_scene(self, field: int, origin: str = "[[randomize]]") -> list[Override]:
-        """Return the value of every key for one random scene.
+    def sample_overrides(self, scene_number: int, origin: str = "[[randomize]]") -> list[Override]:
+        """Sample the random value for one scene, and return an override with it for every key.
 
         Only the number of the scene and the first key seed the value, so that an additional `Randomization` does not
         change the values of the others.
 
         Args:
-            field: number of the random scene.
-            origin: where the distribution comes from, for error messages.
+            scene_number: Number of the random scene.
+            origin: File or flag that the distribution comes from, for error messages.
         """
         first_key = self.set[0]
-        random = np.random.default_rng([field, *first_key.encode()])
-        value = round(float(random.uniform(self.low, self.high)), 6)
+        rng = np.random.default_rng([scene_number, *first_key.encode()])
+        value = round(float(rng.uniform(self.low, self.high)), 6)
         return [Override(key, value, origin) for key in self.set]
 
 
-def make_randomizations(bounds_by_keys: Mapping[str, Sequence[Any]] | None) -> list[Randomization]:
-    """Return the distributions of `{"key": (low, high)}`; keys that a comma separates get the same value.
+def parse_randomizations(bounds_by_keys: Mapping[str, Sequence[Any]] | None) -> list[Randomization]:
+    """Parse the argument `randomize` of environments, `{"key": (low, high)}`, into uniform distributions.
+
+    Args:
+        bounds_by_keys: Lower and upper bound of each distribution. Comma-separated keys share one sampled value. None
+            is the same as an empty mapping.
 
     Raises:
         ConfigError: The bounds of a key are not two finite numbers in order.
     """
     randomizations: list[Randomization] = []
-    for keys, bounds in (bounds_by_keys or {}).items():
+    for joined_keys, bounds in (bounds_by_keys or {}).items():
         try:
             low, high = (float(bound) for bound in bounds)
-            key_list = [key.strip() for key in keys.split(",")]
-            randomizations.append(Randomization(set=key_list, low=low, high=high))
+            keys = [key.strip() for key in joined_keys.split(",")]
+            randomizations.append(Randomization(set=keys, low=low, high=high))
         except (TypeError, ValueError):
             raise ConfigError(
-                f"randomize {keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite",
+                f"randomize {joined_keys}: {shorten(str(bounds))}: give the lowest and the highest number, both finite",
                 code="command/invalid-option",
             ) from None
     return randomizations
 
 
-def parse_randomization(text: str) -> tuple[str, list[str]]:
-    """Return keys and bounds of the `key=low:high` of a --randomize option, for `make_randomizations`.
+def parse_randomize_option(text: str) -> tuple[str, list[str]]:
+    """Split the text `key=low:high` of a --randomize option into keys and bounds, for `parse_randomizations`.
+
+    Returns:
+        The comma-separated keys, and the texts of the bounds.
 
     Raises:
-        ConfigError: A part of it is missing.
+        ConfigError: A part of the text is missing.
     """
     keys, equals, bounds = (part.strip() for part in text.partition("="))
     if not (keys and equals and bounds):

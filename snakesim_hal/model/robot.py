@@ -15,10 +15,10 @@ from msgspec import Meta
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.checked import StartCheckRecord
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.friction import Skin, Wheels, check_skin
+from snakesim_hal.model.friction import Skin, Wheels, validate_skin
 from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, make_joints
 from snakesim_hal.model.links import Link
-from snakesim_hal.model.plugins import SENSORS, find_plugin, require_base_class
+from snakesim_hal.model.plugins import SENSORS, load_plugin, require_base_class
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import CustomSensor, LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
@@ -140,11 +140,11 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
                 f"[[links]] has {len(self.links)} entries, and {joint_count} joints connect {joint_count + 1} links; "
                 f"list each, tail to head, or none"
             )
-        check_skin(self.skin, self.wheels, [f"link_{i}" for i in range(joint_count + 1)])
+        validate_skin(self.skin, self.wheels, [f"link_{i}" for i in range(joint_count + 1)])
         for sensor in (*self.sensors.depth, *self.sensors.range, *self.sensors.custom):
-            self._check_place(sensor)
+            self._validate_sensor_placement(sensor)
 
-    def _check_place(self, sensor: Mounted) -> None:
+    def _validate_sensor_placement(self, sensor: Mounted) -> None:
         """Raise ValueError if a sensor is on a link that does not exist, or would be inside of its link."""
         link = self.link_index(sensor.link)
         head = self.chain.modules
@@ -174,21 +174,21 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     @property
     def joint_table(self) -> list[Joint]:
         """Return every joint as built, tail to head."""
-        return [*_make_joint_table(self)]
+        return [*_get_joint_table(self)]
 
     @property
     def link_lengths_m(self) -> list[float]:
         """Return the length of every link, tail to head."""
         if self.links:
             return [link.length_m for link in self.links]
-        return [self.module.length_m * part for part in self._module_parts]
+        return [self.module.length_m * part for part in self._modules_per_link]
 
     @property
     def link_masses_kg(self) -> list[float]:
         """Return the mass of every link, tail to head."""
         if self.links:
             return [link.mass_kg for link in self.links]
-        return [self.module.mass_kg * part for part in self._module_parts]
+        return [self.module.mass_kg * part for part in self._modules_per_link]
 
     @property
     def length_m(self) -> float:
@@ -198,22 +198,22 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
         return self.chain.modules * self.module.length_m
 
     @property
-    def _module_parts(self) -> list[float]:
+    def _modules_per_link(self) -> list[float]:
         """Return how many modules make up each link: half a module the tail and the head, and one module the others."""
         return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
 
 
-_newest_joint_table: tuple[RobotFile, list[Joint]] | None = None
+_cached_joint_table: tuple[RobotFile, list[Joint]] | None = None
 
 
-def _make_joint_table(robot: RobotFile) -> list[Joint]:
-    """Return every joint of a robot. That of the newest robot is kept: a simulator asks for it many times."""
-    global _newest_joint_table
-    newest = _newest_joint_table
-    if newest is not None and newest[0] is robot:
-        return newest[1]
+def _get_joint_table(robot: RobotFile) -> list[Joint]:
+    """Return every joint of a robot. The result for the last robot is cached, because simulators read it many times."""
+    global _cached_joint_table
+    cached = _cached_joint_table
+    if cached is not None and cached[0] is robot:
+        return cached[1]
     joints = make_joints(robot.axes, robot.joints, robot.limits, robot.motor, robot.drive, robot.heat, robot.supply)
-    _newest_joint_table = (robot, joints)
+    _cached_joint_table = (robot, joints)
     return joints
 
 
@@ -223,7 +223,7 @@ def describe_joints(robot: RobotFile) -> list[JointDescription]:
 
 
 def _describe_joint(joint: Joint) -> JointDescription:
-    """Return what the HAL publishes of one joint."""
+    """Return the description of one joint that the HAL publishes."""
     limits = joint.limits
     motor = joint.motor
     drive_modes = [mode for mode in Mode if mode.name.lower() in joint.drive.modes]
@@ -252,29 +252,29 @@ def _describe_joint(joint: Joint) -> JointDescription:
     )
 
 
-def with_modes(robot: RobotFile, modes: Collection[DriveMode]) -> RobotFile:
-    """Return the robot with drives that have at most these modes, whatever else its file gives for its joints."""
+def restrict_drive_modes(robot: RobotFile, modes: Collection[DriveMode]) -> RobotFile:
+    """Return the robot with drives that have only those of their control modes that are in `modes`."""
     all_drives = msgspec.structs.replace(robot.drive, modes=[mode for mode in robot.drive.modes if mode in modes])
     joints: dict[str, JointExceptions] = {}
-    for name, differing in robot.joints.items():
-        if differing.modes is None:
-            joints[name] = differing
+    for name, exceptions in robot.joints.items():
+        if exceptions.modes is None:
+            joints[name] = exceptions
         else:
-            common_modes = [mode for mode in differing.modes if mode in modes]
-            joints[name] = msgspec.structs.replace(differing, modes=common_modes)
+            common_modes = [mode for mode in exceptions.modes if mode in modes]
+            joints[name] = msgspec.structs.replace(exceptions, modes=common_modes)
     return msgspec.structs.replace(robot, drive=all_drives, joints=joints)
 
 
-def without_measurements(robot: RobotFile, missing: Collection[Measurement]) -> RobotFile:
-    """Return the robot with drives that do not measure these quantities, whatever its file gives for its joints."""
+def remove_measurements(robot: RobotFile, missing: Collection[Measurement]) -> RobotFile:
+    """Return the robot with drives that do not measure the quantities in `missing`."""
     measured = [quantity for quantity in robot.drive.measures if quantity not in missing]
     joints: dict[str, JointExceptions] = {}
-    for name, differing in robot.joints.items():
-        if differing.measures is None:
-            joints[name] = differing
+    for name, exceptions in robot.joints.items():
+        if exceptions.measures is None:
+            joints[name] = exceptions
         else:
-            kept = [quantity for quantity in differing.measures if quantity not in missing]
-            joints[name] = msgspec.structs.replace(differing, measures=kept)
+            kept = [quantity for quantity in exceptions.measures if quantity not in missing]
+            joints[name] = msgspec.structs.replace(exceptions, measures=kept)
     return msgspec.structs.replace(robot, drive=msgspec.structs.replace(robot.drive, measures=measured), joints=joints)
 
 
@@ -291,13 +291,13 @@ def describe_robot(
     """Return the description of a robot that the HAL publishes.
 
     Args:
-        robot: the robot file.
-        backend: name of the backend.
-        period_ns: of the control cycle.
-        lease_ns: term of a lease.
-        config_hash: of the whole configuration.
-        emulated: whether no real motor moves.
-        simulated_time: whether any wall-clock time may pass between two ticks.
+        robot: Robot file.
+        backend: Name of the backend.
+        period_ns: Duration of the control cycle.
+        lease_ns: Duration of a command lease.
+        config_hash: Hash of the whole configuration.
+        emulated: Whether no real motor moves.
+        simulated_time: Whether any wall-clock time may pass between two ticks.
 
     Raises:
         ConfigError: The class of a custom sensor cannot be loaded, or has no message.
@@ -307,7 +307,7 @@ def describe_robot(
         robot=robot.name,
         # Host and run.
         backend=backend,
-        layout=layout_hash(joints),
+        layout=compute_layout_hash(joints),
         config_hash=config_hash,
         period_ns=period_ns,
         lease_ns=lease_ns,
@@ -326,7 +326,7 @@ def describe_robot(
 
 
 def _describe_links(robot: RobotFile) -> list[LinkDescription]:
-    """Return what the HAL publishes of the links, tail to head."""
+    """Return the descriptions of all links that the HAL publishes, tail to head."""
     radius_m = robot.module.radius_m
     links: list[LinkDescription] = []
     for i, (length_m, mass_kg) in enumerate(zip(robot.link_lengths_m, robot.link_masses_kg, strict=True)):
@@ -335,11 +335,11 @@ def _describe_links(robot: RobotFile) -> list[LinkDescription]:
 
 
 def _describe_sensors(robot: RobotFile, period_ns: int) -> list[SensorDescription]:
-    """Return what the HAL publishes of the sensors. No sensor has a higher rate than the control cycle."""
+    """Return the descriptions of all sensors that the HAL publishes. No rate exceeds that of the control cycle."""
     cycle_rate_hz = 1e9 / period_ns
     joint_sensor = SensorDescription(key=keys.JOINTS, rate_hz=cycle_rate_hz, delay_s=robot.sensors.joints.delay_s)
     sensors = [joint_sensor]
-    for key, sensor in robot.sensors.published():
+    for key, sensor in robot.sensors.iterate_published():
         delay_s = sensor.delay_s
         if isinstance(sensor, Mounted):  # its sample arrives at least one period after the measurement
             delay_s = max(delay_s, period_ns * 1e-9)
@@ -347,13 +347,13 @@ def _describe_sensors(robot: RobotFile, period_ns: int) -> list[SensorDescriptio
     return sensors
 
 
-def with_serials(robot: Description, serials: Sequence[str], firmware: Sequence[str]) -> Description:
+def add_drive_identities(robot: Description, serials: Sequence[str], firmware: Sequence[str]) -> Description:
     """Return a description with the serial number and the firmware version of every drive.
 
     Args:
-        robot: the description without them.
-        serials: serial numbers, tail to head.
-        firmware: versions, tail to head.
+        robot: Description without serial numbers and firmware versions.
+        serials: Serial number of every drive, tail to head.
+        firmware: Firmware version of every drive, tail to head.
     """
     joints = [
         msgspec.structs.replace(joint, serial=serial, firmware=version)
@@ -364,13 +364,13 @@ def with_serials(robot: Description, serials: Sequence[str], firmware: Sequence[
 
 def _make_custom_schema(sensor: CustomSensor) -> str:
     """Return the schema of a custom sensor's message. Raises ConfigError if its class cannot be loaded or has none."""
-    model = find_plugin(SENSORS, sensor.model)
+    model = load_plugin(SENSORS, sensor.model)
     label = f"sensor {sensor.name!r}: model {shorten(sensor.model)}"
     require_base_class(model, SensorModel, label)
     return make_message_schema(model.message, label)
 
 
-def layout_hash(joints: list[JointDescription]) -> str:
-    """Return a hash of names, order and axes of the joints: robots with the same hash take the same vectors."""
+def compute_layout_hash(joints: list[JointDescription]) -> str:
+    """Return a hash of names, order and axes of the joints. Commands fit every robot with the same hash."""
     text = ";".join(f"{joint.name}:{joint.axis}" for joint in joints)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -13,7 +13,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.friction import Surface, Viscous
 from snakesim_hal.model.outlines import Coordinate, Friction, Heading, Point, Size
 from snakesim_hal.model.random_field import RandomField
-from snakesim_hal.model.route import Route, sine_points
+from snakesim_hal.model.route import Route, sample_sine_curve
 from snakesim_hal.model.solids import Solid, Upright
 from snakesim_hal.wire.quantities import Name, above
 
@@ -242,7 +242,7 @@ def make_route(scene: SceneFile) -> Route | None:
         case None:
             return None
         case SineRoute(amplitude_m=amplitude, wavelength_m=wavelength, length_m=length):
-            return Route(sine_points(amplitude, wavelength, length))
+            return Route(sample_sine_curve(amplitude, wavelength, length))
         case WaypointRoute(points_m=points):
             try:
                 return Route(np.asarray(points))

@@ -43,7 +43,7 @@ class SensorModel(ABC):
 
     @abstractmethod
     def read(self, tick: int, timestamp_ns: int) -> Message:
-        """Return the sample of the present state.
+        """Return the sample of the current state.
 
         Called at the rate of the robot file. The caller applies the delay, and in real time drops a sample that takes
         longer than the delay, or than one control period if that is longer.

@@ -257,7 +257,7 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
                 if names.count(name) > 1:
                     raise ValueError(f"two entries of [[sensors.{kind}]] have the name {name!r}; give each its own")
 
-    def published(self) -> Iterator[tuple[str, AnySensor]]:
+    def iterate_published(self) -> Iterator[tuple[str, AnySensor]]:
         """Yield every sensor except for the joint sensor, with the key under which its samples are published."""
         if self.contacts is not None:
             yield keys.CONTACTS, self.contacts
@@ -267,9 +267,9 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
             yield keys.POSE, self.pose
         if self.power is not None:
             yield keys.POWER, self.power
-        yield from self.mounted()
+        yield from self.iterate_mounted()
 
-    def mounted(self) -> Iterator[tuple[str, AnyMounted]]:
+    def iterate_mounted(self) -> Iterator[tuple[str, AnyMounted]]:
         """Yield the sensors at positions on links, with their keys. A color camera has two keys, so it comes twice."""
         for camera in self.depth:
             yield keys.depth_key(camera.name), camera

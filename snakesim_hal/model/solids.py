@@ -30,12 +30,12 @@ class Solid(Surface, frozen=True, kw_only=True):
     """Coulomb friction between the obstacle and the ground on which it slides."""
 
     @property
-    def yields(self) -> bool:
+    def can_move(self) -> bool:
         """Return whether the obstacle moves when it is pushed."""
         return self.stiffness_n_per_m is not None or self.mass_kg is not None
 
     @property
-    def slides_at_n(self) -> float | None:
+    def sliding_force_n(self) -> float | None:
         """Return the smallest force that moves the obstacle along the ground; None if it is fixed."""
         if self.mass_kg is None:
             return None
@@ -52,39 +52,46 @@ class Upright(Solid, frozen=True, kw_only=True):
     """Direction in which its top leans, seen from above. 0: along x."""
 
 
-def material_fields(solid: Solid) -> dict[str, Any]:
+def get_material_fields(solid: Solid) -> dict[str, Any]:
     """Return the fields of `Solid`, and those of `Upright` if the obstacle is upright, without those of its shape."""
     struct = Upright if isinstance(solid, Upright) else Solid
     return {name: getattr(solid, name) for name in struct.__struct_fields__}
 
 
-def make_peg(name: str, position: Point, radius: float, height: float) -> Obstacle:
-    """Return an upright cylinder that stands on the ground; all lengths in m."""
-    x, y = position
+def make_peg(name: str, position_m: Point, radius_m: float, height_m: float) -> Obstacle:
+    """Return an upright cylinder that stands on the ground.
+
+    Args:
+        name: Name of the obstacle.
+        position_m: Center of the cylinder on the ground, as (x, y).
+        radius_m: Radius of the cylinder.
+        height_m: Height of the cylinder.
+    """
+    x, y = position_m
     return Obstacle(
         name=name,
         shape="cylinder",
-        position_w=(float(x), float(y), height / 2),
-        radius_m=radius,
-        height_m=height,
+        position_w=(float(x), float(y), height_m / 2),
+        radius_m=radius_m,
+        height_m=height_m,
     )
 
 
-def make_block(name: str, position: Point, size: tuple[float, float, float], yaw: float) -> Obstacle:
+def make_block(name: str, position_m: Point, size_m: tuple[float, float, float], yaw_rad: float) -> Obstacle:
     """Return a box that stands on the ground.
 
     Args:
-        name: of the obstacle.
-        position: center of the box on the ground, m.
-        size: length, width and height, m.
-        yaw: rotation about the vertical, rad.
+        name: Name of the obstacle.
+        position_m: Center of the box on the ground, as (x, y).
+        size_m: Length, width and height of the box.
+        yaw_rad: Rotation about the vertical. 0 if the length is along x.
     """
-    length, width, height = size
+    length_m, width_m, height_m = size_m
     return Obstacle(
         name=name,
         shape="box",
-        position_w=(*position, height / 2),
-        yaw_rad=yaw,
-        half_size_m=(length / 2, width / 2, height / 2),
-        height_m=height,
+        position_w=(*position_m, height_m / 2),
+        yaw_rad=yaw_rad,
+        half_size_m=(length_m / 2, width_m / 2, height_m / 2),
+        height_m=height_m,
     )

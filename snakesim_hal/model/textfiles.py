@@ -21,17 +21,17 @@ from snakesim_hal.base.errors import ConfigError, find_nearest_word
 MB = 1024 * 1024
 
 # A route of 20,000 waypoints has 1.8 MB as formatted JSON, and 0.8 MB as TOML.
-MAX_BYTES = 8 * MB
-MAX_TOML = 2 * MB
+MAX_FILE_BYTES = 8 * MB
+MAX_TOML_CHARACTERS = 2 * MB
 
-MAX_LISTED = 1000  # files of a folder that are searched for a similar name
-MAX_SUGGESTED = 8  # files that an error lists
+MAX_SEARCHED_FILES = 1000  # files of a folder that are searched for a similar name
+MAX_SUGGESTED_FILES = 8  # files that an error lists
 MAX_DEPTH = 16  # sections within sections; a run's configuration has 6
-_KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_KEY_PATTERN = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 # A key of too many parts; tomllib would need quadratic time for it.
-_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")
-_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_KINDS = {
+_TOO_DEEP_KEY_PATTERN = re.compile(rf"(?<![\w-])(?:{_KEY_PATTERN}[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")
+_UTF16_BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_FILE_TYPE_NAMES = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe",
     stat.S_IFSOCK: "a socket",
@@ -44,7 +44,7 @@ _KINDS = {
 def read_text(path: Path) -> str:
     """Return a whole file as text, without a byte-order mark. Raises ConfigError if it is not UTF-8 text."""
     data = read_bytes(path)
-    if data.startswith(_UTF16) or b"\0" in data:
+    if data.startswith(_UTF16_BOMS) or b"\0" in data:
         raise ConfigError(f"{path}: is UTF-16 text, or not text; save it as UTF-8", code="file/invalid-syntax")
     try:
         return data.decode("utf-8-sig")
@@ -56,32 +56,39 @@ def read_text(path: Path) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the bytes of a whole file. Raises ConfigError if it is not a plain file, too large, or not readable."""
+    """Return the content of a whole regular file.
+
+    Args:
+        path: Path of the file. A symbolic link is followed.
+
+    Raises:
+        ConfigError: The file is missing, not a regular file, larger than MAX_FILE_BYTES, or not readable.
+    """
     try:
         mode = path.stat().st_mode
         data = b""
         if stat.S_ISREG(mode):  # opening a device may have side effects, opening a pipe blocks
             descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
             with os.fdopen(descriptor, "rb") as file:
-                data = file.read(MAX_BYTES + 1)
+                data = file.read(MAX_FILE_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file{_hint_for_missing(path)}", code="file/not-found") from None
+        raise ConfigError(f"{path}: no such file{_make_missing_file_hint(path)}", code="file/not-found") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", code="file/not-readable") from None
     except ValueError as error:  # a NUL in the name
         raise ConfigError(f"{path}: cannot be read: {error}", code="file/not-readable") from None
-    _check_plain(path, mode)
-    if len(data) > MAX_BYTES:
+    _require_regular_file(path, mode)
+    if len(data) > MAX_FILE_BYTES:
         raise ConfigError(
-            f"{path}: is larger than {MAX_BYTES // MB} MB, the limit of a settings file", code="file/too-large"
+            f"{path}: is larger than {MAX_FILE_BYTES // MB} MB, the limit of a settings file", code="file/too-large"
         )
     return data
 
 
-def _hint_for_missing(path: Path) -> str:
-    """Return which file the user may mean by the path of a file that does not exist."""
+def _make_missing_file_hint(path: Path) -> str:
+    """Return the end of the error about a missing file: which existing file the user may have meant."""
     try:
-        entries = itertools.islice(path.parent.iterdir(), MAX_LISTED)
+        entries = itertools.islice(path.parent.iterdir(), MAX_SEARCHED_FILES)
         names = sorted(entry.name for entry in entries)
     except OSError as error:
         return f"; its folder {path.parent} cannot be read: {error.strerror}"
@@ -91,40 +98,41 @@ def _hint_for_missing(path: Path) -> str:
     if not path.suffix:
         return ""
     folder = path.parent.absolute()
-    same_suffix = [name for name in names if name.endswith(path.suffix)][:MAX_SUGGESTED]
+    same_suffix = [name for name in names if name.endswith(path.suffix)][:MAX_SUGGESTED_FILES]
     if same_suffix:
         return f"; in {folder} are {', '.join(same_suffix)}"
     return f"; in {folder} is no file *{path.suffix}"
 
 
-def _check_plain(path: Path, mode: int) -> None:
+def _require_regular_file(path: Path, mode: int) -> None:
     """Raise ConfigError if a path is a folder, a pipe, a device or a symbolic link."""
     if not stat.S_ISREG(mode):
-        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
-        raise ConfigError(f"{path}: is {kind}, not a file; name a file", code="file/not-readable")
+        file_type = _FILE_TYPE_NAMES.get(stat.S_IFMT(mode), "something else")
+        raise ConfigError(f"{path}: is {file_type}, not a file; name a file", code="file/not-readable")
 
 
 def parse_json(text: str, source: str) -> Any:
     """Return the value of a JSON text. Raises ConfigError, which names the source."""
-    return _parsed(text, source, json.loads, "JSON")
+    return _parse(text, source, json.loads, "JSON")
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
     """Return the values of a TOML text. Raises ConfigError, which names the source."""
-    if len(text) > MAX_TOML:
+    if len(text) > MAX_TOML_CHARACTERS:
         raise ConfigError(
-            f"{source}: is larger than {MAX_TOML // MB} MB; make it smaller, or write it as JSON", code="file/too-large"
+            f"{source}: is larger than {MAX_TOML_CHARACTERS // MB} MB; make it smaller, or write it as JSON",
+            code="file/too-large",
         )
-    deep_key = _DEEP_KEY.search(text)
+    deep_key = _TOO_DEEP_KEY_PATTERN.search(text)
     if deep_key:
         raise ConfigError(
             f"{source}: key `{deep_key[0][:40]}...` has more than {MAX_DEPTH} parts", code="file/too-large"
         )
-    return _parsed(text, source, tomllib.loads, "TOML")
+    return _parse(text, source, tomllib.loads, "TOML")
 
 
-def _parsed(text: str, source: str, parse: Callable[[str], Any], language: str) -> Any:
-    """Return what a parser makes of a text. Raises ConfigError if the text is not valid, or nested too deep."""
+def _parse(text: str, source: str, parse: Callable[[str], Any], language: str) -> Any:
+    """Parse a text with a parser of its language. Raises ConfigError if it is not valid, or nested too deep."""
     try:
         value = parse(text)
     except RecursionError:
@@ -133,11 +141,11 @@ def _parsed(text: str, source: str, parse: Callable[[str], Any], language: str) 
         ) from None
     except ValueError as error:  # the parser's own; or a number of thousands of digits
         raise ConfigError(f"{source}: not valid {language}: {error}", code="file/invalid-syntax") from None
-    _check_depth(value, source)
+    _validate_value_depth(value, source)
     return value
 
 
-def check_brackets(text: str, source: str) -> None:
+def check_nesting_depth(text: str, source: str) -> None:
     """Check the nesting of a text that another library parses: Zenoh overflows its stack on deep nesting.
 
     Raises:
@@ -150,7 +158,7 @@ def check_brackets(text: str, source: str) -> None:
             raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels", code="file/too-large")
 
 
-def _check_depth(value: Any, source: str) -> None:
+def _validate_value_depth(value: Any, source: str) -> None:
     """Raise ConfigError if a value is nested too deep. Later code may then recurse through its levels safely."""
     containers: list[Any] = [value]
     for _ in range(MAX_DEPTH):
@@ -167,13 +175,20 @@ def _check_depth(value: Any, source: str) -> None:
 
 
 @contextlib.contextmanager
-def exported(path: Path) -> Iterator[Path]:
-    """Yield a temporary path for an export, file or folder; it becomes `path` when it is complete.
+def export_atomically(path: Path) -> Iterator[Path]:
+    """Yield a temporary path for an export. When the `with` block ends, the file or folder there is renamed to `path`.
 
     If `path` is a symbolic link, the file that it leads to is replaced.
 
+    Args:
+        path: Path of the exported file or folder. Missing parent folders are created.
+
+    Yields:
+        Path at which the caller writes the file or folder.
+
     Raises:
-        ConfigError: It cannot be written, for example because the disk is full. No half-written file is left then.
+        ConfigError: The export cannot be written, for example because the disk is full. What was at `path` before is
+            unchanged, and no incomplete file is left.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -181,14 +196,14 @@ def exported(path: Path) -> Iterator[Path]:
             yield partial
     except OSError as error:
         raise ConfigError(
-            f"{path}: cannot be written: {_reason(error)}. What was there before is unchanged. Make room, or choose "
-            "another place with --out",
+            f"{path}: cannot be written: {_get_error_reason(error)}. What was there before is unchanged. "
+            "Make room, or choose another place with --out",
             code="file/not-writable",
         ) from None
 
 
-def _reason(error: OSError) -> str:
-    """Return why an operation failed. Some libraries raise errors without a number, but with one in their text."""
+def _get_error_reason(error: OSError) -> str:
+    """Return why an operation failed. Some libraries raise errors whose number is only in their text."""
     if error.errno is not None:
         return os.strerror(error.errno)
     match = re.search(r"errno (\d+)", str(error))
@@ -206,8 +221,8 @@ def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
-            _check_plain(path, path.lstat().st_mode)
+            _require_regular_file(path, path.lstat().st_mode)
         write_atomically(path, text.encode(encoding))
     except OSError as error:
-        why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"{path}: cannot be written: {why}", code="file/not-writable") from None
+        reason = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"{path}: cannot be written: {reason}", code="file/not-writable") from None

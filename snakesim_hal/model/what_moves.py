@@ -8,20 +8,20 @@ UNKNOWN = "UNKNOWN"
 
 
 def describe_what_moves(robot: Description | None) -> str:
-    """Return one of the three words above, and what it means.
+    """Describe whether real motors move: one of the words EMULATED, REAL and UNKNOWN, with an explanation.
 
     Args:
-        robot: the description from the host; None: no description arrived, so a real robot cannot be excluded.
+        robot: Description from the host. None if no description has arrived, so that a real robot cannot be excluded.
     """
     if robot is None:
         return f"{UNKNOWN} whether motors move: the host has not described the robot; treat it as a real one"
-    where = f"backend {robot.backend}"
+    hardware = f"backend {robot.backend}"
     if robot.hardware:
-        where += f" on {robot.hardware}"
-    unguarded = describe_missing_watchdogs(robot)
+        hardware += f" on {robot.hardware}"
+    watchdog_clause = describe_missing_watchdogs(robot)
     if robot.emulated:
-        return f"{EMULATED}: nothing real moves ({where}){unguarded}"
-    return f"{REAL}: motors move ({where}){unguarded}"
+        return f"{EMULATED}: nothing real moves ({hardware}){watchdog_clause}"
+    return f"{REAL}: motors move ({hardware}){watchdog_clause}"
 
 
 def describe_missing_watchdogs(robot: Description) -> str:
@@ -29,7 +29,7 @@ def describe_missing_watchdogs(robot: Description) -> str:
     names = [joint.name for joint in robot.joints if not joint.watchdog]
     if not names:
         return ""
-    which = "no joint has a watchdog"
+    clause = "no joint has a watchdog"
     if len(names) < len(robot.joints):
-        which = f"no watchdog: {', '.join(names)}"
-    return f"; {which}: it holds its last angle if the host dies, until its supply is cut"
+        clause = f"no watchdog: {', '.join(names)}"
+    return f"; {clause}: it holds its last angle if the host dies, until its supply is cut"

@@ -1,7 +1,7 @@
 """The HAL client of guidance, navigation and control: ticks, samples, outputs, and the right to command.
 
-A service loops over `Client.ticks()`. At each tick it reads the samples that the clock names, so a lockstep run gives
-every service the same inputs, no matter how the operating system scheduled the processes.
+A service loops over `Client.iterate_ticks()`. At each tick it reads the samples that the clock names, so a lockstep run
+gives every service the same inputs, no matter how the operating system scheduled the processes.
 
 Threads: the service calls every public method from one thread, its own. Zenoh's threads call `_store_clock` and
 `_on_host_token` alone; these hand over a clock by a queue, and everything else by setting one attribute.
@@ -16,7 +16,7 @@ from snakesim_hal.base.errors import NotConnectedError, StalledError, WireError,
 from snakesim_hal.network.feed import Feed, RobotFilter
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.run_key import is_proven, own_run_key
+from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Arrival, Publisher
 from snakesim_hal.wire import keys
@@ -41,7 +41,7 @@ MISSING_SAMPLE_TIMEOUT_S = 2.0  # in lockstep, for a sample or a description tha
 SAMPLE_POLL_S = 0.0002  # between two looks for such a sample
 CLOCK_POLL_S = 0.001
 LEASE_RETRY_S = 0.25  # between two requests of the lease
-NO_TICK_COMMANDED = -1
+NO_COMMANDED_TICK = -1
 
 
 class Client:
@@ -50,12 +50,12 @@ class Client:
     Example:
         client = Client(session, "guidance")
         poses = client.subscribe(keys.POSE, Pose)
-        client.description()
+        client.wait_for_description()
         client.announce()
-        for clock in client.ticks():
+        for clock in client.iterate_ticks():
             pose = client.read(poses)
-            ...  # publish with client.put
-            client.done(clock.tick)
+            ...  # publish with client.publish
+            client.report_done(clock.tick)
     """
 
     def __init__(
@@ -64,10 +64,10 @@ class Client:
         """Subscribe to the robot's clock.
 
         Args:
-            session: a session in the robot's namespace.
-            service: name of this service.
-            decimation: the service acts on ticks that are multiples of this, and ignores the others.
-            clock_mode: clock mode of the run. In any other mode than lockstep, lockstep clocks are rejected: their
+            session: Session in the robot's namespace.
+            service: Name of this service.
+            decimation: Number of ticks between two ticks that the service processes. The other ticks are skipped.
+            clock_mode: Clock mode of the run. In any other mode than lockstep, lockstep clocks are rejected: their
                 publisher would wait for this service.
         """
         self.service = service
@@ -78,27 +78,30 @@ class Client:
         self._clocks: Mailbox[Clock] = Mailbox()
         self._last_clock_s = time.monotonic()
         self.newest_clock: Clock | None = None  # due or not
-        self._host_left = False
+        self._has_host_left = False
         self._clock_decoder = Decoder(Clock)
         self._clock: Clock | None = None  # of the current tick
-        self._next_clock: Clock | None = None  # taken from the queue, but of a later tick than the one returned
-        self._restarted = False  # robot time has started over since the last call of `new_description`
+        self._next_clock: Clock | None = None  # popped from the queue, but of a later tick than the one returned
+        self._has_restarted = False  # whether robot time has restarted since the last `fetch_changed_description`
         # Inputs and outputs.
         self._feeds: dict[str, Feed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._filter = RobotFilter(session.rejected)
-        self.commanded_tick = NO_TICK_COMMANDED
-        self.missing: set[str] = set()  # keys that were read at this tick, and had no sample
+        self.commanded_tick = NO_COMMANDED_TICK
+        self.missing_keys: set[str] = set()  # keys that were read in this tick, and had no sample
         session.on_urgent_arrival(keys.CLOCK, self._store_clock)
-        session.on_alive(self._on_host_token, keys.HOST_ALL)
+        session.on_token_change(self._on_host_token, keys.HOST_ALL)
 
     # --- the robot -------------------------------------------------------------------------------------------
 
-    def description(self, timeout_s: float = 10.0) -> Description:
-        """Return the robot's description. Waits for it at the first call.
+    def wait_for_description(self, timeout_s: float = 10.0) -> Description:
+        """Return the robot's description. The first call waits for it.
+
+        Args:
+            timeout_s: Maximum time to wait, in s.
 
         Raises:
-            NotConnectedError: no HAL host publishes one in time.
+            NotConnectedError: No HAL host publishes a description in time.
         """
         robot = self._filter.robot or self._fetch_description(timeout_s)
         if robot is None:
@@ -108,34 +111,40 @@ class Client:
         self._filter.robot = robot
         return robot
 
-    def new_description(self) -> Description | None:
-        """Return the robot's description if another HAL host may drive it than at the last call, or None.
+    def fetch_changed_description(self) -> Description | None:
+        """Fetch and return the robot's description if its HAL host may have been replaced since the last call.
 
-        Robot time that starts over is a sign of another host. So is the lost liveliness token of the old one, if this
-        service was disconnected while the host was replaced.
+        The host may have been replaced if robot time has restarted, or if the liveliness token of the host has vanished
+        while this service was disconnected.
+
+        Returns:
+            The new description, or None if the host is the same.
         """
-        replaced = self._host_left and self._clock is not None and self._clock.lifecycle != "armed"
-        if not self._restarted and not replaced:
+        is_host_replaced = self._has_host_left and self._clock is not None and self._clock.lifecycle != "armed"
+        if not self._has_restarted and not is_host_replaced:
             return None
-        self._restarted = False
-        self._host_left = False
+        self._has_restarted = False
+        self._has_host_left = False
         self._filter.robot = self._fetch_description(MISSING_SAMPLE_TIMEOUT_S) or self._filter.robot
         return self._filter.robot
 
     def _fetch_description(self, timeout_s: float) -> Description | None:
-        """Return the description of our own run's host; a forged one is ignored."""
-        run_key = own_run_key()
+        """Return the description that the host of this run publishes, or None after the timeout.
+
+        A description without the proof of this run is ignored.
+        """
+        run_key = read_own_run_key()
 
         def is_of_this_run(robot: Description) -> bool:
-            return is_proven(robot, run_key)
+            return has_valid_proof(robot, run_key)
 
-        return self.session.latest(keys.DESCRIPTION, Description, timeout_s, is_of_this_run)
+        return self.session.wait_for_latched(keys.DESCRIPTION, Description, timeout_s, is_of_this_run)
 
     def _on_host_token(self, key: str, present: bool) -> None:
-        """Note, in Zenoh's thread, that our host has vanished, or the network and with it our view of the host."""
+        """Set a flag, in Zenoh's thread, if the liveliness token of the robot's host has vanished."""
         robot = self._filter.robot
         if not present and robot is not None and keys.parse_service(key) == robot.host:
-            self._host_left = True
+            self._has_host_left = True
 
     # --- ticks -----------------------------------------------------------------------------------------------
 
@@ -143,51 +152,57 @@ class Client:
         """Declare the service's liveliness token. A lockstep run waits for its answers from the next tick on."""
         self.session.declare_alive(self.service)
 
-    def ticks(self, silence_s: float | None = None, *, pauses: bool = False) -> Iterator[Clock | None]:
-        """Iterate over the robot's clock, without an end.
+    def iterate_ticks(
+        self, silence_timeout_s: float | None = None, *, include_paused: bool = False
+    ) -> Iterator[Clock | None]:
+        """Iterate over the clocks of the ticks that this service processes, without an end.
+
+        Each tick first fetches the samples that have arrived.
 
         Args:
-            silence_s: how long to wait for a clock before None is yielded instead. None: wait without a limit.
-            pauses: also yield the clocks of a paused simulator (`Clock.paused`). They are no ticks. Do not answer them.
+            silence_timeout_s: Time in s to wait for a clock before None is yielded instead. None waits without a limit.
+            include_paused: Whether to yield also the clocks of a paused simulator (`Clock.paused`). They are not
+                ticks, and the service must not answer them.
 
         Yields:
-            Every due tick in lockstep, and the newest due tick otherwise. None after each `silence_s` without a clock.
+            The clock of every due tick in lockstep, and of the newest due tick otherwise. None after each
+            `silence_timeout_s` without a clock.
         """
         while True:
             try:
-                clock = self._take_next_clock(silence_s)
+                clock = self._pop_next_clock(silence_timeout_s)
             except Empty:
-                if silence_s is None or time.monotonic() - self._last_clock_s >= silence_s:
+                if silence_timeout_s is None or time.monotonic() - self._last_clock_s >= silence_timeout_s:
                     yield None
                 continue
             if clock.paused:
-                if pauses:
+                if include_paused:
                     yield clock
                 continue
-            self._begin_tick(clock)
+            self._start_tick(clock)
             yield clock
 
-    def _begin_tick(self, clock: Clock) -> None:
-        """Make a clock the current one, and fetch the samples that have arrived."""
+    def _start_tick(self, clock: Clock) -> None:
+        """Make a clock the current one, and store the samples that have arrived. Drop old samples after a restart."""
         if self._clock is not None and clock.tick < self._clock.tick:
-            self._restarted = True
+            self._has_restarted = True
             for feed in self._feeds.values():
                 feed.clear()
         self._clock = clock
-        self.commanded_tick = NO_TICK_COMMANDED
-        self.missing.clear()
+        self.commanded_tick = NO_COMMANDED_TICK
+        self.missing_keys.clear()
         newest_only = clock.clock_mode != "lockstep"
         for feed in self._feeds.values():
-            feed.store_arrived(newest_only=newest_only)
+            feed.store_arrived_samples(newest_only=newest_only)
 
-    def _take_next_clock(self, timeout_s: float | None) -> Clock:
-        """Return the next due clock from the queue, and drop the clocks that it replaces.
+    def _pop_next_clock(self, timeout_s: float | None) -> Clock:
+        """Pop the next due clock from the queue, and drop the clocks that it replaces.
 
         In lockstep this is the newest clock of the next tick, because the host repeats a tick's clock while time
         is paused. Otherwise it is the newest clock of all. A pause is never skipped.
 
         Raises:
-            Empty: no clock arrived in time.
+            Empty: No clock arrived in time.
         """
         clock = self._next_clock or self._clocks.get(timeout=timeout_s)
         self._next_clock = None
@@ -201,14 +216,14 @@ class Client:
         return clock
 
     def wait_for_clock(self, timeout_s: float) -> Clock | None:
-        """Return the newest clock, due or not. Waits for the first one. Returns None if none arrives in time."""
-        deadline = time.monotonic() + timeout_s
-        while self.newest_clock is None and time.monotonic() < deadline:
+        """Wait for the first clock, and return the newest one, due or not. Return None if none arrives in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while self.newest_clock is None and time.monotonic() < deadline_s:
             time.sleep(CLOCK_POLL_S)
         return self.newest_clock
 
     def _store_clock(self, arrival: Arrival) -> None:
-        """Store a clock, in Zenoh's thread. Wakes the service only for its due ticks."""
+        """Store a clock, in Zenoh's thread, and queue it if its tick is due for this service."""
         self._last_clock_s = arrival.monotonic_ns * 1e-9
         try:
             clock = arrival.decode(self._clock_decoder)
@@ -234,7 +249,7 @@ class Client:
         Returns:
             What `read` takes.
         """
-        feed = Feed(self.session.reader(key, message), key, self._filter.accepts)
+        feed = Feed(self.session.declare_reader(key, message), key, self._filter.accepts)
         self._feeds[key] = feed
         return feed
 
@@ -245,21 +260,21 @@ class Client:
         robot waits for it: a run must not depend on which process was faster.
 
         Raises:
-            StalledError: the clock of an armed robot in lockstep names a sample that does not arrive in time.
+            StalledError: The clock of an armed robot in lockstep names a sample that does not arrive in time.
         """
-        sample = self._find_sample(feed)
+        sample = self._find_current_sample(feed)
         if sample is None:
-            self.missing.add(feed.key)
+            self.missing_keys.add(feed.key)
         return sample
 
-    def _find_sample(self, feed: Feed[MessageT]) -> MessageT | None:
-        """Return the sample of a feed that the current tick refers to; None if there is none (yet).
+    def _find_current_sample(self, feed: Feed[MessageT]) -> MessageT | None:
+        """Return the sample of a feed that belongs to the current tick, or None if there is none yet.
 
-        In lockstep, `Clock.newest` names the tick of a sample, by its key or by the first part of its key. An armed
-        robot waits for the named sample.
+        In real time this is the newest sample. In lockstep, `Clock.newest` names the tick of the sample, by its key or
+        by the first part of its key. While the robot is armed, this waits for the named sample.
 
         Raises:
-            StalledError: a named sample does not arrive in time.
+            StalledError: A named sample does not arrive in time.
         """
         clock = self._clock
         if clock is None:
@@ -275,17 +290,17 @@ class Client:
                 # A delayed sensor has no sample yet at this tick. A sample in the feed is from a later tick.
                 return None
             return feed.newest()
-        sample = feed.at(sample_tick)
+        sample = feed.get_at_tick(sample_tick)
         if sample is None and clock.lifecycle == "armed":
             sample = self._wait_for_sample(feed, sample_tick, clock)
         return sample
 
     def _wait_for_sample(self, feed: Feed[MessageT], tick: int, clock: Clock) -> MessageT:
-        deadline = time.monotonic() + MISSING_SAMPLE_TIMEOUT_S
-        while time.monotonic() < deadline:
+        deadline_s = time.monotonic() + MISSING_SAMPLE_TIMEOUT_S
+        while time.monotonic() < deadline_s:
             time.sleep(SAMPLE_POLL_S)
-            feed.store_arrived()
-            sample = feed.at(tick)
+            feed.store_arrived_samples()
+            sample = feed.get_at_tick(tick)
             if sample is not None:
                 return sample
         raise StalledError(f"{feed.key} of tick {tick} was named by the clock of tick {clock.tick} and never came")
@@ -300,14 +315,14 @@ class Client:
             message: A message of this key's class.
 
         Raises:
-            WireError: no reader would accept the message. Nothing is sent.
+            WireError: No reader would accept the message. Nothing is sent.
         """
         try:
             payload = self._encode_for_robot(key, message)
         except WireError as error:
             output = _describe_output(key, message)
             raise WireError(error.reason, f"{output} cannot be published: {error.detail}") from None
-        self._publisher(key, type(message)).put(message, payload)
+        self._get_publisher(key, type(message)).put(message, payload)
 
     def _encode_for_robot(self, key: str, message: Message) -> bytes:
         """Return the encoded message. Raises WireError if it is not valid, or does not fit a known robot."""
@@ -323,14 +338,14 @@ class Client:
     def report_done(self, tick: int) -> None:
         """Report that all output for a tick is published. A command that answers the tick implies it."""
         if self.commanded_tick != tick:
-            self._publisher(keys.done_key(self.service), Done).put(Done(tick=tick))
+            self._get_publisher(keys.done_key(self.service), Done).put(Done(tick=tick))
 
-    def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
+    def _get_publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         """Return the publisher of a key, which is declared at its first message."""
         publisher = self._publishers.get(key)
         if publisher is None:
             lossless = self._clock is not None and self._clock.clock_mode == "lockstep"
-            publisher = self.session.publisher(key, message, lossless=lossless)
+            publisher = self.session.declare_publisher(key, message, lossless=lossless)
             self._publishers[key] = publisher
         return publisher
 
@@ -350,13 +365,18 @@ class Commander:
     """
 
     def __init__(self, client: Client, description: Description) -> None:
-        """Command through a client; description: the robot's, with the id of its host."""
+        """Start without the lease.
+
+        Args:
+            client: Client that sends the requests and commands.
+            description: Description of the robot, with the id of its host.
+        """
         self._client = client
         self._description = description
-        self._epoch = 0  # of our lease; 0: never held
+        self._lease_epoch = 0  # epoch of the lease of this service; 0 if it never held the lease
         self._sequence = 0
-        self._last_request_s = 0.0
-        self.refusal: str | None = None  # why the last request of the lease was refused
+        self._last_request_time_s = 0.0
+        self.lease_refusal: str | None = None  # why the last request for the lease was refused
 
     def ensure_lease(self, clock: Clock) -> bool:
         """Request the command lease if this service does not hold it.
@@ -365,49 +385,49 @@ class Commander:
         within LEASE_RETRY_S of the last request. If the host refuses, `refusal` has the reason.
 
         Args:
-            clock: of the current tick; it names the lease that the host considers valid.
+            clock: Clock of the current tick, which names the lease that the host considers valid.
 
         Returns:
             Whether this service holds the lease now.
         """
-        holds_lease = self._epoch and clock.lease_epoch == self._epoch
+        holds_lease = self._lease_epoch and clock.lease_epoch == self._lease_epoch
         if holds_lease:
             return True
         now_s = time.monotonic()
-        has_asked_recently = now_s - self._last_request_s < LEASE_RETRY_S
-        if clock.lifecycle == "armed" or has_asked_recently:
+        has_requested_recently = now_s - self._last_request_time_s < LEASE_RETRY_S
+        if clock.lifecycle == "armed" or has_requested_recently:
             return False
-        self._last_request_s = now_s
+        self._last_request_time_s = now_s
         request = LeaseRequest(action="acquire", holder=self._client.service)
         try:
-            answer: Answer = self._client.session.request(keys.LEASE, request, host=self._description.host)
+            answer: Answer = self._client.session.send_request(keys.LEASE, request, host=self._description.host)
         except NotConnectedError as error:
-            self.refusal = str(error)
+            self.lease_refusal = str(error)
             return False
         if answer.ok:
-            self.refusal = None
-            self._epoch = answer.epoch
+            self.lease_refusal = None
+            self._lease_epoch = answer.epoch
         else:
-            self.refusal = answer.reason
-            self._epoch = 0
+            self.lease_refusal = answer.reason
+            self._lease_epoch = 0
         return answer.ok
 
-    def send(self, clock: Clock, joints: JointState, setpoints: RequestedSetpoints) -> None:
+    def send_command(self, clock: Clock, joints: JointState, setpoints: RequestedSetpoints) -> None:
         """Publish setpoints that answer a joint state.
 
         They are valid for one lease period after the joint state was published.
 
         Args:
-            clock: of the current tick; it has the arm session.
-            joints: the joint state that the setpoints answer.
-            setpoints: one mode, target and torque limit per joint.
+            clock: Clock of the current tick, with the arm session.
+            joints: Joint state that the setpoints answer.
+            setpoints: One mode, target and torque limit for each joint.
         """
         self._sequence += 1
         command = JointCommand(
             tick=joints.tick,
             arm_session=clock.arm_session,
             sequence=self._sequence,
-            lease_epoch=self._epoch,
+            lease_epoch=self._lease_epoch,
             layout=self._description.layout,
             valid_for_ns=self._description.lease_ns,
             mode=setpoints.mode,
@@ -417,8 +437,8 @@ class Commander:
         self._client.publish(keys.JOINT_COMMAND, command)
         self._client.commanded_tick = joints.tick
 
-    def hold_position(self, joints: JointState) -> RequestedSetpoints:
-        """Return setpoints that hold every joint at its angle; a service sends them while the robot is not armed."""
+    def make_hold_setpoints(self, joints: JointState) -> RequestedSetpoints:
+        """Return setpoints that hold every joint at its measured angle, to be sent while the robot is not armed."""
         robot_joints = self._description.joints
         modes = [Mode.POSITION] * len(robot_joints)
         torque_limits_nm = [joint.torque_limit_nm for joint in robot_joints]

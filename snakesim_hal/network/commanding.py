@@ -4,7 +4,7 @@ It is a client like any other. The host's limiter limits each command; without c
 ms, and an armed robot goes into its stop mode.
 
 Threads: the thread that creates a `CommandingClient` makes every call. Commands are sent only while it is in a call,
-so it must call `wait` or `turn` in every tick.
+so it must call `wait` or `command_tick` in every tick.
 """
 
 import time
@@ -32,16 +32,16 @@ class CommandingClient:
         """Subscribe to the robot's samples, and wait until this client holds the command lease.
 
         Args:
-            session: a session in the robot's namespace.
-            robot: description of the robot.
-            clock_mode: clock mode of the run.
+            session: Session in the robot's namespace.
+            robot: Description of the robot.
+            clock_mode: Clock mode of the run.
 
         Raises:
-            RefusedError: another client commands the robot.
-            StalledError: the robot publishes no clock.
+            RefusedError: The robot has a controller already, or the lease is not granted.
+            StalledError: The robot publishes no clock.
         """
         self._silence_s = LOCKSTEP_SILENCE_S if clock_mode == "lockstep" else SILENCE_S
-        if session.present(keys.alive_key(CONTROL)):
+        if session.list_tokens(keys.alive_key(CONTROL)):
             raise RefusedError(
                 f"{robot.robot} has a controller already; to command it from here start it without one: "
                 "--set services.control.external=true",
@@ -51,27 +51,29 @@ class CommandingClient:
         self._feeds: dict[str, Feed] = {}
         for key, message in READABLE_KEYS.items():
             self._feeds[key] = self._client.subscribe(key, message)
-        self._client.description()
-        self._ticks = self._client.ticks(self._silence_s)
+        self._client.wait_for_description()
+        self._ticks = self._client.iterate_ticks(self._silence_s)
         self._commander = Commander(self._client, robot)
         self._last_setpoints: RequestedSetpoints | None = None
         self.clock: Clock | None = None  # of the current tick
         self._holds_lease = False
-        tune_garbage_collector()  # looking through all objects of a notebook may take longer than a lease
+        tune_garbage_collector()  # a collection of all objects of a notebook may take longer than a lease
         self._client.announce()
-        self.turn_until(
+        self.command_until(
             self._is_lease_shown,
             LEASE_TIMEOUT_S,
-            lambda: f"no right to command {robot.robot}: {self._commander.refusal or 'the host has not answered'}",
+            lambda: (
+                f"no right to command {robot.robot}: {self._commander.lease_refusal or 'the host has not answered'}"
+            ),
         )
 
-    def wait(self) -> Clock:
+    def wait_for_tick(self) -> Clock:
         """Wait for the next tick, and return its clock.
 
         If the last tick was not commanded, this reports it as done, because a lockstep host waits for its output.
 
         Raises:
-            StalledError: no clock arrived within SILENCE_S, or in lockstep LOCKSTEP_SILENCE_S.
+            StalledError: No clock arrived within SILENCE_S, or in lockstep LOCKSTEP_SILENCE_S.
         """
         if self.clock is not None:
             self._client.report_done(self.clock.tick)
@@ -82,64 +84,69 @@ class CommandingClient:
         self._holds_lease = self._commander.ensure_lease(clock)
         return clock
 
-    def host_changed(self) -> bool:
-        """Return whether another host drives the robot now, as after a restart. Acquire the lease again then."""
-        return self._client.new_description() is not None
+    def has_host_changed(self) -> bool:
+        """Return whether another host may drive the robot since the last call, so that the lease is lost."""
+        return self._client.fetch_changed_description() is not None
 
     def read(self, key: str) -> Message | None:
-        """Return the sample of a key in READ that is valid at this tick, or None if there is none."""
+        """Return the sample of a key in READABLE_KEYS that is valid at this tick, or None if there is none."""
         return self._client.read(self._feeds[key])
 
     @property
-    def mine(self) -> bool:
+    def holds_lease(self) -> bool:
         """Return whether this process holds the lease at this tick."""
         return self._holds_lease
 
-    def send(self, points: RequestedSetpoints) -> None:
-        """Command setpoints in this tick. Does nothing while no joint state has arrived.
+    def send_setpoints(self, points: RequestedSetpoints) -> None:
+        """Send setpoints in this tick. Nothing is sent while no joint state has arrived.
+
+        Args:
+            points: One mode, target and torque limit for each joint.
 
         Raises:
-            RefusedError: this process does not hold the lease.
+            RefusedError: This process does not hold the lease.
         """
         joints = self.read(keys.JOINTS)
         if not isinstance(joints, JointState) or self.clock is None:
             return
         if not self._holds_lease:
             raise RefusedError(
-                f"the right to command is lost: {self._commander.refusal or 'no command came in time'}",
+                f"the right to command is lost: {self._commander.lease_refusal or 'no command came in time'}",
                 code="robot/lease-lost",
             )
-        self._commander.send(self.clock, joints, points)
+        self._commander.send_command(self.clock, joints, points)
         self._last_setpoints = points
 
     def command_tick(self) -> None:
-        """Wait for the next tick, and command it as before: hold still while not armed, then the last setpoints."""
-        clock = self.wait()
+        """Wait for the next tick, and send the last setpoints. While the robot is not armed, hold the measured pose."""
+        clock = self.wait_for_tick()
         joints = self.read(keys.JOINTS)
         if not isinstance(joints, JointState) or not self._holds_lease:
             return
         if clock.lifecycle != "armed" or self._last_setpoints is None:
-            self._last_setpoints = self._commander.hold_position(joints)
-        self.send(self._last_setpoints)
+            self._last_setpoints = self._commander.make_hold_setpoints(joints)
+        self.send_setpoints(self._last_setpoints)
 
-    def turn_until(self, condition: Callable[[], bool], limit_s: float, why: Callable[[], str]) -> None:
-        """Command ticks as `turn` does until a condition is true.
+    def command_until(
+        self, condition: Callable[[], bool], timeout_s: float, describe_timeout: Callable[[], str]
+    ) -> None:
+        """Command ticks as `command_tick` does until a condition is true.
 
         Args:
-            condition: function that is called after each tick; True ends the wait.
-            limit_s: maximum wall time until the condition is true.
-            why: function that returns the text of the error.
+            condition: Function that is called after each tick. True ends the wait.
+            timeout_s: Maximum wall time in s until the condition is true.
+            describe_timeout: Function that returns the text of the error after a timeout.
 
         Raises:
-            RefusedError: the condition is not true within `limit_s`.
+            RefusedError: The condition is not true in time.
         """
-        deadline = time.monotonic() + limit_s
+        deadline_s = time.monotonic() + timeout_s
         while True:
             self.command_tick()
             if condition():
                 return
-            if time.monotonic() > deadline:
-                raise RefusedError(why())
+            if time.monotonic() > deadline_s:
+                raise RefusedError(describe_timeout())
 
     def _is_lease_shown(self) -> bool:
         """Return whether the host's clock shows the lease, one tick after it was granted."""

@@ -16,8 +16,8 @@ from typing import Any
 import zenoh
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_loopback
-from snakesim_hal.network.image_connection import set_unless_given
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, require_loopback_up
+from snakesim_hal.network.image_connection import set_if_default
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 
@@ -50,14 +50,14 @@ DEFAULT_SETTINGS: dict[str, Any] = {
 
 # Closing a frozen subscriber blocks a receiving thread of Zenoh, and by default it has two: three subscribers that
 # froze together blocked the controller's commands for long enough to end its lease.
-RECEIVERS_LISTENING = 16
+ROUTER_RECEIVING_THREADS = 16
 # A client reads one connection; with two threads each message would wake both. With Zenoh's `handover: app` no thread
 # is woken, but a full image link then ends the lease of control.
-RECEIVERS_CONNECTED = 1
-RUNTIME = "ZENOH_RUNTIME"  # environment variable that sets the number of Zenoh's threads
+CLIENT_RECEIVING_THREADS = 1
+ZENOH_RUNTIME_VARIABLE = "ZENOH_RUNTIME"  # environment variable that sets the number of Zenoh's threads
 
 _environment_lock = threading.Lock()
-_opening_counts: list[int] = []  # receiving threads of each session that is being opened
+_requested_thread_counts: list[int] = []  # receiving threads of each session that is being opened
 
 
 @dataclass(frozen=True)
@@ -76,27 +76,27 @@ class Link:
         """Return the link that a session file describes.
 
         Raises:
-            ConfigError: the file is for another namespace.
+            ConfigError: The file is for another namespace.
         """
-        return Link(session.endpoints[0], session.namespace_for(namespace), session=session)
+        return Link(session.endpoints[0], session.resolve_namespace(namespace), session=session)
 
 
 def open_zenoh(
     link: Link, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
 ) -> zenoh.Session:
-    """Open the Zenoh session under a `Session`.
+    """Open a session of Zenoh with the settings that SnakeSIM needs.
 
     Args:
-        link: where and how to connect.
-        connect_timeout_s: how long a client tries to connect.
-        change: edits the settings for this session alone, just before it is opened.
+        link: Endpoint, and whether to connect to it or listen on it.
+        connect_timeout_s: Time in s within which a client must be connected.
+        change: Function that edits the settings of this session just before it is opened. None to keep them.
 
     Raises:
-        NotConnectedError: the endpoint does not answer, or cannot be listened on.
-        RefusedError: the endpoint is on loopback, and that interface is down.
+        NotConnectedError: The endpoint does not answer, or cannot be listened on.
+        RefusedError: The endpoint is on loopback, and that interface is down.
     """
     if link.session is None:  # a session file may name other endpoints, too
-        check_loopback(link.endpoint)
+        require_loopback_up(link.endpoint)
     zenoh.init_log_from_env_or("off")
     config = _build_config(link, connect_timeout_s)
     if change is not None:
@@ -104,7 +104,7 @@ def open_zenoh(
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise _describe_failure(link, error) from error
+        raise _make_connection_error(link, error) from error
 
 
 def _build_config(link: Link, connect_timeout_s: float) -> zenoh.Config:
@@ -116,7 +116,7 @@ def _build_config(link: Link, connect_timeout_s: float) -> zenoh.Config:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     size_limit = {"transport/link/rx/max_message_size": link.max_bytes + ENVELOPE_BYTES}
-    set_unless_given(config, DEFAULT_SETTINGS | size_limit)
+    set_if_default(config, DEFAULT_SETTINGS | size_limit)
     return config
 
 
@@ -137,8 +137,8 @@ def _build_base_config(link: Link) -> zenoh.Config:
     return config
 
 
-def _describe_failure(link: Link, error: zenoh.ZError) -> NotConnectedError:
-    """Return the error that explains to a user why Zenoh did not open."""
+def _make_connection_error(link: Link, error: zenoh.ZError) -> NotConnectedError:
+    """Return the error that explains to a user why Zenoh could not open the session."""
     if link.listen:
         return NotConnectedError(
             f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
@@ -160,20 +160,23 @@ def _describe_failure(link: Link, error: zenoh.ZError) -> NotConnectedError:
 def limit_receiving_threads(count: int) -> Iterator[None]:
     """Limit the number of Zenoh's receiving threads in this process while the context opens a session.
 
-    The number is passed by an environment variable. If the user has set the variable, it remains unchanged. Child
-    processes do not inherit the setting. Any number of threads may open sessions at once; Zenoh reads the
-    environment variable when the first of them opens.
+    The number is passed by an environment variable, which is removed when the last session has been opened, so that
+    child processes do not inherit it. If the user has set the variable, it remains unchanged. Any number of threads may
+    open sessions at the same time. Zenoh reads the variable when the first session is opened.
+
+    Args:
+        count: Number of receiving threads.
     """
     with _environment_lock:
-        is_set_by_user = RUNTIME in os.environ and not _opening_counts
+        is_set_by_user = ZENOH_RUNTIME_VARIABLE in os.environ and not _requested_thread_counts
         if not is_set_by_user:
-            _opening_counts.append(count)
-            os.environ.setdefault(RUNTIME, f"(rx: (worker_threads: {count}))")
+            _requested_thread_counts.append(count)
+            os.environ.setdefault(ZENOH_RUNTIME_VARIABLE, f"(rx: (worker_threads: {count}))")
     try:
         yield
     finally:
         if not is_set_by_user:
             with _environment_lock:
-                _opening_counts.remove(count)
-                if not _opening_counts:
-                    del os.environ[RUNTIME]
+                _requested_thread_counts.remove(count)
+                if not _requested_thread_counts:
+                    del os.environ[ZENOH_RUNTIME_VARIABLE]

@@ -9,8 +9,8 @@ from snakesim_hal.base.errors import ConfigError, RefusedError, shorten
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
-VALID = "such as tcp/127.0.0.1:7447: PROTOCOL/HOST:PORT"
-_parts = re.compile(
+VALID_ENDPOINT = "such as tcp/127.0.0.1:7447: PROTOCOL/HOST:PORT"
+ENDPOINT_PATTERN = re.compile(
     r"(?P<protocol>[^/]*)/(?P<host>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,9})(?P<more>[?#].*)?"
 )
 
@@ -19,36 +19,46 @@ def check_endpoint(text: str, origin: str) -> str:
     """Return an endpoint if it is valid.
 
     Args:
-        text: the endpoint.
-        origin: the option or file that it came from, for the error.
+        text: Endpoint, such as tcp/127.0.0.1:7447.
+        origin: Option or file that the endpoint came from, for the error.
 
     Raises:
-        ConfigError: it is not valid.
+        ConfigError: The endpoint is not valid.
     """
-    where = f"{origin} {shorten(text)}"
+    context = f"{origin} {shorten(text)}"
     if text.startswith("unixsock-stream/") and len(text) > len("unixsock-stream/"):
         return text
-    parts = _parts.fullmatch(text)
+    parts = ENDPOINT_PATTERN.fullmatch(text)
     if parts is None:
-        raise ConfigError(f"{where}: this is not an endpoint; give one {VALID}", code="network/invalid-address")
+        raise ConfigError(
+            f"{context}: this is not an endpoint; give one {VALID_ENDPOINT}", code="network/invalid-address"
+        )
     if parts["protocol"] not in PROTOCOLS:
         raise ConfigError(
-            f"{where}: the protocol is one of {', '.join(PROTOCOLS)}; give an endpoint {VALID}",
+            f"{context}: the protocol is one of {', '.join(PROTOCOLS)}; give an endpoint {VALID_ENDPOINT}",
             code="network/invalid-address",
         )
     if not 1 <= int(parts["port"]) <= 65535:
         raise ConfigError(
-            f"{where}: the port is a number from 1 to 65535; give an endpoint {VALID}",
+            f"{context}: the port is a number from 1 to 65535; give an endpoint {VALID_ENDPOINT}",
             code="network/invalid-address",
         )
     return text
 
 
-def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, insecure: bool = False) -> None:
+def require_safe_listening_endpoint(
+    endpoint: str, origin: str, *, access_control: bool = False, insecure: bool = False
+) -> None:
     """Check that a robot may listen on an endpoint.
 
+    Args:
+        endpoint: Endpoint to listen on.
+        origin: Option or file that the endpoint came from, for the error.
+        access_control: Whether the listener denies everything that its rules do not allow.
+        insecure: Whether the user accepts that other machines can connect.
+
     Raises:
-        ConfigError: other machines could command the robot there, because no access control is set up.
+        ConfigError: Other machines could command the robot there, because no access control is set up.
     """
     if access_control or insecure or not is_exposed(endpoint):
         return
@@ -63,7 +73,7 @@ def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, i
 
 def is_exposed(endpoint: str) -> bool:
     """Return whether other machines may connect to an endpoint, because it is not on loopback."""
-    parts = _parts.fullmatch(endpoint)
+    parts = ENDPOINT_PATTERN.fullmatch(endpoint)
     if parts is None:
         return not endpoint.startswith("unixsock-stream/")
     host = parts["host"].strip("[]")
@@ -73,13 +83,16 @@ def is_exposed(endpoint: str) -> bool:
         return host != "localhost"
 
 
-def check_loopback(endpoint: str) -> None:
-    """Check that an endpoint on loopback can be reached at all: a new network namespace has that interface down.
+def require_loopback_up(endpoint: str) -> None:
+    """Check that the loopback interface is up, if an endpoint is on it. A new network namespace has it down.
+
+    Args:
+        endpoint: Endpoint to connect to or listen on. Any other endpoint passes.
 
     Raises:
-        RefusedError: it cannot; a client would wait there forever.
+        RefusedError: The interface is down, so that a client would wait forever.
     """
-    parts = _parts.fullmatch(endpoint)
+    parts = ENDPOINT_PATTERN.fullmatch(endpoint)
     if parts is None or is_exposed(endpoint):
         return
     host = parts["host"].strip("[]")
@@ -99,8 +112,12 @@ def check_loopback(endpoint: str) -> None:
 def check_namespace(text: str, origin: str) -> str:
     """Return a namespace if it is valid.
 
+    Args:
+        text: Namespace, such as planar13 or lab/planar13.
+        origin: Option or file that the namespace came from, for the error.
+
     Raises:
-        ConfigError: it is not valid.
+        ConfigError: The namespace is not valid.
     """
     if not re.fullmatch(r"[^/*$?#\s@]+(/[^/*$?#\s@]+)*", text) or not text.isprintable():
         raise ConfigError(

@@ -12,7 +12,7 @@ from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Description, Message
 
-KEPT_PER_KEY = 32  # samples
+MAX_SAMPLES_PER_KEY = 32  # samples
 NO_TICK = -1  # of messages without a tick, such as an intent: only the newest counts
 
 
@@ -20,56 +20,56 @@ class Feed(Generic[MessageT]):
     """The newest samples of one key, by tick."""
 
     def __init__(
-        self, reader: Reader[MessageT], key: str, fits: Callable[[Message], bool] = lambda _message: True
+        self, reader: Reader[MessageT], key: str, is_acceptable: Callable[[Message], bool] = lambda _message: True
     ) -> None:
-        """Keep the samples of a reader.
+        """Start without samples.
 
         Args:
-            reader: of the key.
-            key: the key itself.
-            fits: returns whether a message fits the robot; others are dropped.
+            reader: Reader of the key's samples.
+            key: Key of the samples.
+            is_acceptable: Function that returns whether a message fits the robot. Other messages are dropped.
         """
         self._reader = reader
-        self._fits = fits
-        self._kept: OrderedDict[int, MessageT] = OrderedDict()
+        self._is_acceptable = is_acceptable
+        self._samples_by_tick: OrderedDict[int, MessageT] = OrderedDict()
         self.key = key
 
-    def store_arrived(self, *, newest_only: bool = False) -> None:
+    def store_arrived_samples(self, *, newest_only: bool = False) -> None:
         """Store newly arrived samples.
 
         Args:
-            newest_only: store the newest sample alone, in place of all earlier ones.
+            newest_only: Whether to store only the newest sample, in place of all earlier ones.
         """
         if newest_only:
-            newest = self._reader.newest(self._fits)
-            if newest is not None:
-                self._kept.clear()
-                self._store(newest)
+            get_newest = self._reader.pop_newest(self._is_acceptable)
+            if get_newest is not None:
+                self._samples_by_tick.clear()
+                self._store(get_newest)
             return
         for message in self._reader.drain():
-            if self._fits(message):
+            if self._is_acceptable(message):
                 self._store(message)
-        while len(self._kept) > KEPT_PER_KEY:
-            self._kept.popitem(last=False)
+        while len(self._samples_by_tick) > MAX_SAMPLES_PER_KEY:
+            self._samples_by_tick.popitem(last=False)
 
     def _store(self, message: MessageT) -> None:
         tick: int = getattr(message, "tick", NO_TICK)
-        self._kept[tick] = message
-        self._kept.move_to_end(tick)
+        self._samples_by_tick[tick] = message
+        self._samples_by_tick.move_to_end(tick)
 
     def clear(self) -> None:
         """Drop all samples, because the HAL host has restarted."""
-        self._kept.clear()
+        self._samples_by_tick.clear()
 
     def newest(self) -> MessageT | None:
-        """Return the sample that arrived last."""
-        if not self._kept:
+        """Return the sample that arrived last, or None without any sample."""
+        if not self._samples_by_tick:
             return None
-        return self._kept[next(reversed(self._kept))]
+        return self._samples_by_tick[next(reversed(self._samples_by_tick))]
 
-    def at(self, tick: int) -> MessageT | None:
-        """Return the sample of exactly this tick."""
-        return self._kept.get(tick)
+    def get_at_tick(self, tick: int) -> MessageT | None:
+        """Return the sample of exactly this tick, or None if it is not stored."""
+        return self._samples_by_tick.get(tick)
 
 
 class RobotFilter:

@@ -26,15 +26,15 @@ CONNECT_TIMEOUT_S = 5.0
 class RawPublisher:
     """Publishes bytes on one key."""
 
-    _publisher: Any
+    _zenoh_publisher: Any
 
     def send(self, payload: bytes, attachment: bytes) -> None:
         """Send a payload. It is dropped if the network is too slow for it."""
-        self._publisher.put(payload, attachment=attachment)
+        self._zenoh_publisher.put(payload, attachment=attachment)
 
     def has_subscriber(self) -> bool:
         """Return whether the key has a subscriber now."""
-        return bool(self._publisher.matching_status.matching)
+        return bool(self._zenoh_publisher.matching_status.matching)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class RawReader:
             samples.append(self._arrivals.popleft())
         return samples
 
-    def newest(self) -> RawSample | None:
+    def pop_newest(self) -> RawSample | None:
         """Return the newest sample that has arrived since the last call; None if there is none."""
         samples = self.drain()
         return samples[-1] if samples else None
@@ -91,8 +91,8 @@ class RawQueryable:
 
     _queryable: Any
 
-    def take_next(self) -> RawQuery | None:
-        """Return the oldest query that waits; None if there is none."""
+    def pop_oldest_query(self) -> RawQuery | None:
+        """Remove the oldest waiting query from the queue and return it; None if there is none."""
         query = self._queryable.try_recv()
         if query is None:
             return None
@@ -109,32 +109,38 @@ class ForeignNetwork:
         self._declared: list[Any] = []
         self.id = str(zenoh_session.zid())
 
-    def publisher(self, key: str, *, latched: bool = False, background: bool = False) -> RawPublisher:
+    def declare_publisher(self, key: str, *, latched: bool = False, background: bool = False) -> RawPublisher:
         """Declare a publisher.
 
+        Samples are dropped if the network is too slow for them. `close` undeclares the publisher.
+
         Args:
-            key: where it publishes.
-            latched: later subscribers get the last value.
-            background: its samples are sent after all others, for images.
+            key: Key to publish on.
+            latched: Whether later subscribers get the last value.
+            background: Whether its samples have the lowest priority, as images do.
+
+        Returns:
+            The publisher, which sends bytes.
         """
         priority = zenoh.Priority.BACKGROUND if background else zenoh.Priority.DATA
         if latched:
+            # Dropping is the default of an advanced publisher, which has no argument for it.
             publisher: Any = ext.declare_advanced_publisher(
                 self._zenoh, key, cache=ext.CacheConfig(1), publisher_detection=True, priority=priority
             )
         else:
-            drop = zenoh.CongestionControl.DROP
-            publisher = self._zenoh.declare_publisher(key, congestion_control=drop, priority=priority)
+            congestion_control = zenoh.CongestionControl.DROP
+            publisher = self._zenoh.declare_publisher(key, congestion_control=congestion_control, priority=priority)
         self._declared.append(publisher)
         return RawPublisher(publisher)
 
-    def queryable(self, key: str) -> RawQueryable:
-        """Declare a receiver of queries at a key. If too many wait, the oldest are dropped."""
+    def declare_queryable(self, key: str) -> RawQueryable:
+        """Declare a receiver of queries at a key. If more than MAX_WAITING_QUERIES wait, the oldest are dropped."""
         queryable = self._zenoh.declare_queryable(key, handlers.RingChannel(MAX_WAITING_QUERIES), complete=True)
         self._declared.append(queryable)
         return RawQueryable(queryable)
 
-    def reader(self, key: str, depth: int = 1) -> RawReader:
+    def declare_reader(self, key: str, depth: int = 1) -> RawReader:
         """Subscribe to a key, and keep its newest samples."""
         reader = RawReader(depth)
         self._declared.append(self._zenoh.declare_subscriber(key, reader.store))
@@ -154,14 +160,14 @@ class ForeignNetwork:
 
 @contextmanager
 def open_foreign_network(endpoint: str, *, max_bytes: int) -> Iterator[ForeignNetwork]:
-    """Connect to a router.
+    """Connect to a router of another system, and close the session when the context ends.
 
     Args:
-        endpoint: of the router.
-        max_bytes: maximum size of a received payload.
+        endpoint: Endpoint of the router.
+        max_bytes: Maximum size of a received payload.
 
     Raises:
-        NotConnectedError: the router does not answer.
+        NotConnectedError: The router does not answer.
     """
     session = open_zenoh(Link(endpoint, max_bytes=max_bytes), CONNECT_TIMEOUT_S)
     with closing(ForeignNetwork(session)) as network:

@@ -23,19 +23,19 @@ LOCAL_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _lock = threading.Lock()
 _claims: list[socket.socket] = []  # open as long as this process lives
 _ports: Iterator[int] = iter(())  # that this process has claimed and not returned yet
-_owner = 0  # process id; a forked child must not go on with the ports of its parent
+_owner_process_id = 0  # process id; a forked child must not go on with the ports of its parent
 
 
 def find_free_port() -> int:
     """Return a port that is free for TCP and UDP on loopback, and that no other call returns, in any process.
 
     Raises:
-        NotConnectedError: all ports are in use.
+        NotConnectedError: All ports are in use.
     """
-    global _ports, _owner
+    global _ports, _owner_process_id
     with _lock:
-        if _owner != os.getpid():
-            _owner = os.getpid()
+        if _owner_process_id != os.getpid():
+            _owner_process_id = os.getpid()
             _ports = iter(())
         while True:
             for port in _ports:

@@ -13,11 +13,11 @@ from typing import Any
 import zenoh
 
 from snakesim_hal.network.endpoint import is_exposed
-from snakesim_hal.network.session_file import endpoints_of_mode
+from snakesim_hal.network.session_file import read_endpoints
 
 # A piece waits up to a second for the one before it. No other thread waits for the thread that sends images.
 WAIT_SETTINGS = {"transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 1_000_000}
-PIECE_SETTINGS = {
+FRAGMENT_SETTINGS = {
     "transport/link/tx/batch_size": 1400,  # bytes of a piece: less than a packet
     # The least that Linux allows: it takes twice the number, for its own records too. With 4096 a state waited twice as
     # long behind images on a link of 6 Mbit/s; on a good link that makes large images faster.
@@ -30,10 +30,10 @@ MARKED_PROTOCOLS = ("tcp/", "tls/")
 
 def configure_for_images(config: zenoh.Config) -> None:
     """Change a client's settings into those of its connection for images. Values of a session file stay."""
-    endpoints = endpoints_of_mode(config, "connect/endpoints", "client")
-    set_unless_given(config, WAIT_SETTINGS)
+    endpoints = read_endpoints(config, "connect/endpoints", "client")
+    set_if_default(config, WAIT_SETTINGS)
     if any(is_exposed(endpoint) for endpoint in endpoints):  # loopback is never slow
-        set_unless_given(config, PIECE_SETTINGS)
+        set_if_default(config, FRAGMENT_SETTINGS)
     marked = [_mark_as_bulk(endpoint) for endpoint in endpoints]
     config.insert_json5("connect/endpoints", json.dumps(marked))
 
@@ -46,7 +46,7 @@ def _mark_as_bulk(endpoint: str) -> str:
     return f"{endpoint}{separator}{BULK_PARAMETER}"
 
 
-def set_unless_given(config: zenoh.Config, settings: Mapping[str, Any]) -> None:
+def set_if_default(config: zenoh.Config, settings: Mapping[str, Any]) -> None:
     """Change the settings that still have Zenoh's default value."""
     untouched = zenoh.Config()
     for key, value in settings.items():

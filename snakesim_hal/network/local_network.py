@@ -17,8 +17,8 @@ import msgspec
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Session, intersects
-from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, reader_depth
+from snakesim_hal.network.session import Session, do_keys_intersect
+from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, get_reader_depth
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
@@ -47,7 +47,7 @@ class LocalNetwork:
 
     def __init__(self) -> None:
         """Start without sessions."""
-        self.answer: Callable[[], None] = lambda: None  # runs the parts that answer queries
+        self.run_responders: Callable[[], None] = lambda: None  # runs the parts that answer queries
         # Callbacks, each with the key or pattern that it is for.
         self.subscribers: list[tuple[str, SampleHandler]] = []
         self.queryables: list[tuple[str, Callable[[Query], None]]] = []
@@ -55,21 +55,21 @@ class LocalNetwork:
         # What sessions have published.
         self.tokens: list[str] = []
         self.latched: dict[str, Arrival] = {}  # by key
-        self._handlers: dict[str, list[SampleHandler]] = {}  # cache of `handlers_for`, by key
+        self._handlers: dict[str, list[SampleHandler]] = {}  # cache of `find_handlers`, by key
 
-    def session(self) -> "LocalSession":
+    def create_session(self) -> "LocalSession":
         """Return a new session."""
         return LocalSession(self)
 
     def close(self) -> None:
         """Drop the reference to the parts that answer queries, because they refer to this network."""
-        self.answer = lambda: None
+        self.run_responders = lambda: None
 
-    def handlers_for(self, key: str) -> list[SampleHandler]:
+    def find_handlers(self, key: str) -> list[SampleHandler]:
         """Return the callbacks of all subscribers of a key."""
         handlers = self._handlers.get(key)
         if handlers is None:
-            handlers = [handler for pattern, handler in self.subscribers if intersects(pattern, key)]
+            handlers = [handler for pattern, handler in self.subscribers if do_keys_intersect(pattern, key)]
             self._handlers[key] = handlers
         return handlers
 
@@ -92,12 +92,12 @@ class LocalNetwork:
         else:
             self.tokens.remove(key)
         for pattern, handler in self.watchers:
-            if intersects(pattern, key):
+            if do_keys_intersect(pattern, key):
                 handler(key, present)
 
 
 @dataclass
-class Declared:
+class Declaration:
     """A subscription, token or queryable of a session. Zenoh's own objects have the same method."""
 
     undeclare: Callable[[], None]
@@ -106,11 +106,11 @@ class Declared:
 class LocalReader(Reader[MessageT]):
     """Reads the newest samples of one key from a queue that its subscription fills."""
 
-    def __init__(self, declared: Declared, arrivals: deque[Arrival], message: type[MessageT], rejected: Any) -> None:
+    def __init__(self, declared: Declaration, arrivals: deque[Arrival], message: type[MessageT], rejected: Any) -> None:
         super().__init__(declared, message, rejected)
         self._arrivals = arrivals
 
-    def _take_samples(self) -> list[Arrival]:
+    def _pop_samples(self) -> list[Arrival]:
         if not self._arrivals:
             return []
         arrived = list(self._arrivals)
@@ -135,7 +135,7 @@ class LocalQuery:
     def drop(self) -> None:
         """Do nothing: there is no query of Zenoh to release."""
 
-    def answered(self) -> Answer | None:
+    def poll(self) -> Answer | None:
         """Return the next answer; None if there is none yet."""
         if self.answers.empty():
             return None
@@ -150,11 +150,11 @@ class LocalSession(Session):
         super().__init__(None)
         self._network = network
 
-    def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
+    def declare_publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
         """Declare a publisher. It is lossless in any case."""
         return self._declare_publisher(key, message, latched=False)
 
-    def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
+    def declare_latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
         return self._declare_publisher(key, message, latched=True)
 
     def _declare_publisher(self, key: str, message: type[MessageT], *, latched: bool) -> Publisher[MessageT]:
@@ -165,20 +165,20 @@ class LocalSession(Session):
             arrival = LocalArrival(key, payload, encoding, time.monotonic_ns())
             if latched:
                 network.latched[key] = arrival
-            for handler in network.handlers_for(key):
+            for handler in network.find_handlers(key):
                 handler(arrival)
 
         def has_subscribers() -> bool:
-            return bool(network.handlers_for(key))
+            return bool(network.find_handlers(key))
 
         return self._register_publisher(key, Publisher(message, send, has_subscribers))
 
-    def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
-        arrivals: deque[Arrival] = deque(maxlen=depth or reader_depth(message))
+    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
+        arrivals: deque[Arrival] = deque(maxlen=depth or get_reader_depth(message))
         declared = self._subscribe(key, arrivals.append)
         return LocalReader(declared, arrivals, message, self.rejected)
 
-    def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
+    def declare_latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
         arrivals: deque[Arrival] = deque(maxlen=READER_DEPTH)
         if key in self._network.latched:
             arrivals.append(self._network.latched[key])
@@ -194,7 +194,7 @@ class LocalSession(Session):
     def on_latched_arrival(self, key: str, handler: SampleHandler) -> None:
         """Call `handler` as `on_arrival` does, and also for the values that were latched before."""
         for latched_key, arrival in list(self._network.latched.items()):
-            if intersects(key, latched_key):
+            if do_keys_intersect(key, latched_key):
                 handler(arrival)
         self._subscribe(key, handler)
 
@@ -208,13 +208,13 @@ class LocalSession(Session):
         self._network.set_token(key, True)
         self._declare(lambda: self._network.set_token(key, False))
 
-    def on_alive(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+    def on_token_change(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
         """Call `handler(key, present)` for every token that exists, appears or vanishes, in the declaring thread."""
         watcher = (key, handler)
         self._network.watchers.append(watcher)
         self._declare(lambda: self._network.watchers.remove(watcher))
         for token in self._network.tokens:
-            if intersects(key, token):
+            if do_keys_intersect(key, token):
                 handler(token, True)
 
     def close(self) -> None:
@@ -223,17 +223,17 @@ class LocalSession(Session):
             declared.undeclare()
         self._declared.clear()
 
-    def _subscribe(self, key: str, handler: SampleHandler) -> Declared:
+    def _subscribe(self, key: str, handler: SampleHandler) -> Declaration:
         return self._declare(self._network.subscribe(key, handler))
 
-    def _declare(self, undeclare: Callable[[], None]) -> Declared:
-        declared = Declared(undeclare)
+    def _declare(self, undeclare: Callable[[], None]) -> Declaration:
+        declared = Declaration(undeclare)
         self._declared.append(declared)
         return declared
 
     def send_query(self, pattern: str, request: Message) -> LocalQuery:
         """Send a query to all matching keys, without waiting: the answering part may have to run a cycle first."""
-        matching = [(key, handler) for key, handler in self._network.queryables if intersects(pattern, key)]
+        matching = [(key, handler) for key, handler in self._network.queryables if do_keys_intersect(pattern, key)]
         query = LocalQuery(len(matching))
         for key, handler in matching:
             handler(Query(key, encode(request), format_encoding(type(request)), query))
@@ -242,7 +242,7 @@ class LocalSession(Session):
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
         decoder = Decoder(Answer)
         query = self.send_query(pattern, request)
-        self._network.answer()
+        self._network.run_responders()
         deadline = time.monotonic() + timeout_s
         for _ in range(query.queryable_count):
             try:

@@ -33,7 +33,7 @@ class LocalRobot:
     session: str = ""  # path of the session file by which it has joined a lab; empty: without one
 
     @staticmethod
-    def describe(
+    def from_connection(
         link: "Link", robot: str, backend: str, stop_port: socket.socket, config: str | None = None
     ) -> "LocalRobot":
         """Return the entry of a robot for which this process is responsible."""
@@ -51,33 +51,36 @@ class LocalRobot:
         )
 
 
-def state_folder() -> Path:
-    """Folder of state that outlives a run: `$XDG_STATE_HOME/snakesim`, by default `~/.local/state/snakesim`."""
+def get_state_folder() -> Path:
+    """Return the folder of state that outlives a run.
+
+    It is `$XDG_STATE_HOME/snakesim`, by default `~/.local/state/snakesim`.
+    """
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "snakesim"
 
 
-def robot_folder(robot: str, backend: str, hardware: str) -> Path:
-    """Folder of one robot's state: its emergency stop. The same in every run, from any folder."""
+def get_robot_state_folder(robot: str, backend: str, hardware: str) -> Path:
+    """Return the folder of one robot's state, such as its emergency stop. It is the same in every run."""
     name = "-".join(filter(None, (robot, backend, hardware)))
-    return state_folder() / "robots" / "".join(c if c.isalnum() or c in "-_+." else "_" for c in name)
+    return get_state_folder() / "robots" / "".join(c if c.isalnum() or c in "-_+." else "_" for c in name)
 
 
 @contextlib.contextmanager
-def registered(robot: LocalRobot) -> Iterator[str | None]:
-    """Register a robot for command-line tools on this computer, for as long as the context lasts.
+def register_robot(robot: LocalRobot) -> Iterator[str | None]:
+    """Register a robot for command-line tools on this computer while the context lasts.
 
-    The robot is described in a file that is named after the process. A lock on the open file shows that the process
+    The robot is described in a file that is named after the process id. A lock on the open file shows that the process
     still runs.
 
     Args:
-        robot: the entry to write.
+        robot: Entry to write.
 
     Yields:
-        None, or if the file cannot be written, the reason why tools will not find the robot.
+        None if the robot is registered. If the file cannot be written, the reason why tools will not find the robot.
     """
-    path = _live() / f"{robot.pid}.json"
+    path = _get_live_folder() / f"{robot.pid}.json"
     consequence = "`snakesim status` and `estop` find this run only with --endpoint"
-    failure = None
+    problem = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
@@ -88,24 +91,24 @@ def registered(robot: LocalRobot) -> Iterator[str | None]:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         os.write(descriptor, json.dumps(asdict(robot)).encode())
     except OSError as error:
-        failure = f"{path}: {error.strerror}; {consequence}"
+        problem = f"{path}: {error.strerror}; {consequence}"
     try:
-        yield failure
+        yield problem
     finally:
         with contextlib.suppress(OSError):
             path.unlink()
         os.close(descriptor)
 
 
-def local_robots() -> list[LocalRobot]:
+def list_local_robots() -> list[LocalRobot]:
     """Return every robot whose process lives, sorted by file name. Removes the files of ended processes."""
     found: list[LocalRobot] = []
-    for path in sorted(_live().glob("*.json")) if _live().is_dir() else []:
+    for path in sorted(_get_live_folder().glob("*.json")) if _get_live_folder().is_dir() else []:
         with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
             handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
                 if _is_locked(handle):
-                    found.append(_decoded(os.read(handle, 65536)))
+                    found.append(_decode_robot(os.read(handle, 65536)))
                 else:
                     path.unlink()
             finally:
@@ -113,27 +116,27 @@ def local_robots() -> list[LocalRobot]:
     return found
 
 
-def _decoded(text: bytes) -> LocalRobot:
-    """Return the robot in a file.
+def _decode_robot(text: bytes) -> LocalRobot:
+    """Return the robot that a file of the registry describes.
 
     Raises:
-        ValueError: it is not JSON.
-        TypeError: a value is missing, or has a wrong type.
+        ValueError: The text is not JSON.
+        TypeError: A value is missing, or has a wrong type.
     """
     values = json.loads(text)
-    known = {field.name: values[field.name] for field in fields(LocalRobot) if field.name in values}
-    robot = LocalRobot(**known)
-    wrong: list[str] = []
+    known_values = {field.name: values[field.name] for field in fields(LocalRobot) if field.name in values}
+    robot = LocalRobot(**known_values)
+    wrong_fields: list[str] = []
     for field in fields(robot):
         if not isinstance(getattr(robot, field.name), cast(type, field.type)):
-            wrong.append(field.name)
-    if wrong:
-        raise TypeError(f"{', '.join(wrong)} cannot be meant")
+            wrong_fields.append(field.name)
+    if wrong_fields:
+        raise TypeError(f"{', '.join(wrong_fields)} cannot be meant")
     return robot
 
 
-def _live() -> Path:
-    return state_folder() / "live"
+def _get_live_folder() -> Path:
+    return get_state_folder() / "live"
 
 
 def _is_locked(handle: int) -> bool:

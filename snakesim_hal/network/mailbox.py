@@ -23,52 +23,56 @@ class Mailbox(Generic[ItemT]):
     """
 
     def __init__(self, limits: Sequence[int | None] = (None,)) -> None:
-        """Create a lane for each limit, which is how many items it keeps; None: any number."""
+        """Create a lane for each limit.
+
+        Args:
+            limits: Maximum number of items in each lane, the most urgent lane first. None means any number.
+        """
         self._lanes: list[deque[ItemT]] = [deque(maxlen=limit) for limit in limits]
-        self._bell = threading.Lock()  # held: no new item since the taking thread looked last
-        self._bell.acquire()
+        self._item_signal = threading.Lock()  # released by `put`, and acquired by the thread that waits for an item
+        self._item_signal.acquire()
 
     def put(self, item: ItemT, lane: int = 0) -> None:
         """Add an item, from any thread; never waits."""
         self._lanes[lane].append(item)
-        if self._bell.locked():
+        if self._item_signal.locked():
             with contextlib.suppress(RuntimeError):  # another thread has just released it
-                self._bell.release()
+                self._item_signal.release()
 
-    def full(self, lane: int = 0) -> bool:
+    def is_full(self, lane: int = 0) -> bool:
         """Return whether one more item would displace the oldest of a lane."""
         return len(self._lanes[lane]) == self._lanes[lane].maxlen
 
     def get(self, timeout: float | None = None) -> ItemT:
-        """Remove and return the oldest item of the first lane that is not empty. Wait for an item if there is none.
+        """Wait for an item if there is none, then remove and return the oldest item of the most urgent lane.
 
         Args:
-            timeout: how long to wait, in seconds; None: without a limit.
+            timeout: Maximum time to wait, in seconds. None waits without a limit.
 
         Raises:
-            queue.Empty: no item came in time, as in the queues of the standard library.
+            queue.Empty: No item arrived in time, as in the queues of the standard library.
         """
-        deadline = None if timeout is None else time.monotonic() + timeout
+        deadline_s = None if timeout is None else time.monotonic() + timeout
         while True:
             for lane in self._lanes:
                 if lane:
                     return lane.popleft()
-            if deadline is None:
-                self._bell.acquire()
+            if deadline_s is None:
+                self._item_signal.acquire()
                 continue
-            remaining_s = deadline - time.monotonic()
+            remaining_s = deadline_s - time.monotonic()
             if remaining_s <= 0.0:
                 raise Empty
-            self._bell.acquire(timeout=remaining_s)
+            self._item_signal.acquire(timeout=remaining_s)
 
     def wait(self, timeout: float) -> None:
         """Wait until there is an item, at most `timeout` seconds, without taking it."""
-        deadline = time.monotonic() + timeout
-        while self.empty() and (left_s := deadline - time.monotonic()) > 0.0:
-            self._bell.acquire(timeout=left_s)
+        deadline_s = time.monotonic() + timeout
+        while self.empty() and (remaining_s := deadline_s - time.monotonic()) > 0.0:
+            self._item_signal.acquire(timeout=remaining_s)
 
     def get_nowait(self) -> ItemT:
-        """Take the oldest item of the lowest lane, without waiting; raises queue.Empty if there is none."""
+        """Remove and return an item as `get` does, without waiting. Raises queue.Empty if there is none."""
         return self.get(timeout=0.0)
 
     def empty(self) -> bool:

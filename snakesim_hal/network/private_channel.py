@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from snakesim_hal.base.workers import start_worker
+from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Status
 
 MAX_BYTES = 1 << 18
@@ -52,11 +52,11 @@ class HostEnd:
             with contextlib.suppress(OSError):
                 self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
 
-    def serve(self, handle: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
-        """Start a thread that receives the requests of the parent process; do nothing without a parent process.
+    def start_serving(self, handle: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
+        """Start a thread that receives the requests of the starter. Does nothing if the host was started on its own.
 
         Args:
-            handle: called as `handle(request, reply)` for each request; `reply` sends the answer.
+            handle: Function that is called as `handle(request, reply)` for each request. `reply` sends the answer.
         """
         channel = self._socket
         if channel is None:
@@ -66,14 +66,14 @@ class HostEnd:
         def receive_requests() -> None:
             while True:
                 try:
-                    request = channel.recv(MAX_BYTES)
+                    encoded_request = channel.recv(MAX_BYTES)
                 except OSError:
                     return
-                if not request:  # the parent process has closed its end
+                if not encoded_request:  # the starter has closed its end
                     return
-                handle(decoder.decode(request), lambda answer: self.send(HostMessage(answer=answer)))
+                handle(decoder.decode(encoded_request), lambda answer: self.send(HostMessage(answer=answer)))
 
-        start_worker("private channel", receive_requests)
+        start_restarting_thread("private channel", receive_requests)
 
 
 class StarterEnd:

@@ -9,11 +9,11 @@ import zenoh
 
 from snakesim_hal.base.terminal import print_stderr
 
-_NAMED = ("connect_private_key", "listen_private_key")  # below transport/link/tls
+PRIVATE_KEY_SETTINGS = ("connect_private_key", "listen_private_key")  # below transport/link/tls
 
 
 def check_permissions(key: Path) -> str:
-    """Return a text if every user may read a private key, with the remedy; else an empty text."""
+    """Return a text with the remedy if every user may read a private key; otherwise an empty text."""
     try:
         mode = stat.S_IMODE(key.stat().st_mode)
     except OSError:
@@ -23,16 +23,17 @@ def check_permissions(key: Path) -> str:
     return f"{key}: every user of this computer may read this private key (mode {mode:o}); chmod 600 {key}"
 
 
-def warn_of_readable_keys(settings: zenoh.Config) -> None:
-    """Warn on stderr of keys that every user may read. It refuses nothing, because a stop must get through."""
-    for name in _NAMED:
-        named = json.loads(settings.get_json(f"transport/link/tls/{name}"))
-        if isinstance(named, str):
-            _warn(Path(named))
+def warn_about_readable_keys(settings: zenoh.Config) -> None:
+    """Warn on stderr about private keys that every user may read. Nothing is refused: a stop must get through."""
+    for name in PRIVATE_KEY_SETTINGS:
+        key_path = json.loads(settings.get_json(f"transport/link/tls/{name}"))
+        if isinstance(key_path, str):
+            _warn(Path(key_path))
 
 
 @cache  # a command may read its file twice
 def _warn(key: Path) -> None:
+    """Warn about a private key that every user may read, once in the life of this process."""
     problem = check_permissions(key)
     if problem:
         print_stderr(f"snakesim: warning: {problem}, and renew it: snakesim lab certs --rotate")

@@ -15,39 +15,39 @@ import zenoh
 from snakesim_hal.base.errors import NotConnectedError
 
 UNUSED_KEY = "unused/key"
-ROUND_TRIPS = 9  # of which the median counts
+ROUND_TRIP_COUNT = 9  # of which the median counts
 
 
-class Probe:
+class NetworkProbe:
     """A session that only measures. Open one with `open_probe`."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
 
-    def round_trip_s(self) -> float:
+    def measure_round_trip_s(self) -> float:
         """Return the median duration of a query to the router and back, in s."""
         durations_s: list[float] = []
-        for _ in range(ROUND_TRIPS):
-            began_s = time.perf_counter()
+        for _ in range(ROUND_TRIP_COUNT):
+            start_s = time.perf_counter()
             list(self._session.liveliness().get(UNUSED_KEY, timeout=1.0))
-            durations_s.append(time.perf_counter() - began_s)
+            durations_s.append(time.perf_counter() - start_s)
         return statistics.median(durations_s)
 
-    def answers(self, key: str, timeout_s: float = 1.0) -> int:
+    def count_answers(self, key: str, timeout_s: float = 1.0) -> int:
         """Return how many processes answer an empty query, which a HAL host refuses without any effect."""
         replies = self._session.get(key, timeout=timeout_s, target=zenoh.QueryTarget.ALL)
         return sum(reply.ok is not None for reply in replies)
 
-    def clock_offsets_s(self, patterns: Sequence[str], listen_s: float) -> dict[str, float]:
-        """Return, for each key, how far the publisher's clock is ahead of this computer's clock, in s.
+    def measure_clock_offsets_s(self, patterns: Sequence[str], listen_s: float) -> dict[str, float]:
+        """Measure, for each key, how far the publisher's clock is ahead of this computer's clock.
 
         Zenoh timestamps samples at the publisher, so each difference is the clock offset minus the network latency.
         The maximum over many samples is the best estimate; it is too small by the minimum latency. The clock of such a
         timestamp is never behind the timestamps of samples that its process has read.
 
         Args:
-            patterns: keys to listen to; they may have wildcards.
-            listen_s: how long to listen.
+            patterns: Keys to subscribe to. They may have wildcards.
+            listen_s: Duration of the measurement, in s.
 
         Returns:
             The offset in s of each key on which a sample with a timestamp arrived.
@@ -56,8 +56,8 @@ class Probe:
 
         def add_offset(sample: zenoh.Sample) -> None:
             if sample.timestamp is not None:
-                sent_at = sample.timestamp.get_time().astimezone(UTC)
-                offset = sent_at - datetime.now(UTC)
+                sent_time = sample.timestamp.get_time().astimezone(UTC)
+                offset = sent_time - datetime.now(UTC)
                 offsets_s[str(sample.key_expr)].append(offset.total_seconds())
 
         subscribers = [self._session.declare_subscriber(pattern, add_offset) for pattern in patterns]
@@ -68,11 +68,14 @@ class Probe:
 
 
 @contextmanager
-def open_probe(settings: str) -> Iterator[Probe]:
-    """Connect to a router; settings: of a session, as JSON5.
+def open_probe(settings: str) -> Iterator[NetworkProbe]:
+    """Connect to a router to measure its network, and close the session when the context ends.
+
+    Args:
+        settings: Settings of a Zenoh session, as JSON5.
 
     Raises:
-        NotConnectedError: no router accepts the session.
+        NotConnectedError: No router accepts the session.
     """
     zenoh.init_log_from_env_or("off")
     try:
@@ -80,4 +83,4 @@ def open_probe(settings: str) -> Iterator[Probe]:
     except zenoh.ZError as error:
         raise NotConnectedError(str(error).split(" at /")[0], code="network/nothing-listens") from None
     with session:
-        yield Probe(session)
+        yield NetworkProbe(session)

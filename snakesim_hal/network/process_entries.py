@@ -14,7 +14,7 @@ from typing import NamedTuple
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.shared_settings import shared_settings
+from snakesim_hal.model.shared_settings import collect_shared_settings
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Arrival, Publisher
 from snakesim_hal.wire import keys
@@ -23,12 +23,17 @@ from snakesim_hal.wire.messages import VERSIONS, Process
 
 HOST = "host"
 MAX_ENTRIES = 256
-MAX_NAMED = 3  # differences in the text of a refusal
+MAX_LISTED_DIFFERENCES = 3  # differences in the text of a refusal
 NOT_SET = "not set"
 
 
-def own_entry(name: str, config: RunConfig | None = None) -> Process:
-    """Return the entry of this process; config: of its run, None if it uses none."""
+def make_own_entry(name: str, config: RunConfig | None = None) -> Process:
+    """Return the entry that describes this process to other processes.
+
+    Args:
+        name: Role of the process, such as the name of its service.
+        config: Configuration of the run. None if the process uses none.
+    """
     return Process(
         name=name,
         machine=socket.gethostname()[:64] or "unnamed",
@@ -36,12 +41,12 @@ def own_entry(name: str, config: RunConfig | None = None) -> Process:
         pid=os.getpid(),
         version=version("snakesim"),
         started_unix_s=round(time.time()),
-        settings={} if config is None else shared_settings(config),
+        settings={} if config is None else collect_shared_settings(config),
         messages={message.__name__: number for message, number in VERSIONS.items()},
     )
 
 
-def show_process(session: Session, entry: Process) -> Publisher[Process]:
+def publish_process_entry(session: Session, entry: Process) -> Publisher[Process]:
     """Publish an entry for as long as the session lives.
 
     The liveliness token is declared first, so that a host waits for the entry.
@@ -51,78 +56,81 @@ def show_process(session: Session, entry: Process) -> Publisher[Process]:
     """
     key = keys.process_key(entry.name, secrets.token_hex(4))
     session.declare_token(key)
-    shown = session.latched_publisher(key, Process)
+    shown = session.declare_latched_publisher(key, Process)
     shown.put(entry)
     return shown
 
 
-def find_differences(one: Process, other: Process) -> list[str]:
+def describe_differences(one: Process, other: Process) -> list[str]:
     """Return the differences between two processes of one robot as texts, with values in the order of the arguments."""
     found = [
-        f"`{key}` is {value} on {describe_place(one)}, {other_value} on {describe_place(other)}"
-        for key, value, other_value in _differing_settings(one, other)
+        f"`{key}` is {value} on {describe_process(one)}, {other_value} on {describe_process(other)}"
+        for key, value, other_value in _find_differing_settings(one, other)
     ]
     found += [
-        f"message {name} has version {one.messages[name]} on {describe_place(one)}, {other.messages[name]} on "
-        f"{describe_place(other)}"
-        for name in _differing_messages(one, other)
+        f"message {name} has version {one.messages[name]} on {describe_process(one)}, {other.messages[name]} on "
+        f"{describe_process(other)}"
+        for name in _find_differing_messages(one, other)
     ]
     return found
 
 
-def _differing_settings(one: Process, other: Process) -> list[tuple[str, str, str]]:
+def _find_differing_settings(one: Process, other: Process) -> list[tuple[str, str, str]]:
     """Return the keys whose values differ, each with both values. A process may use only some sections."""
-    sections = {_section(key) for key in one.settings} & {_section(key) for key in other.settings}
+    sections = {_get_section(key) for key in one.settings} & {_get_section(key) for key in other.settings}
     differing: list[tuple[str, str, str]] = []
     for key in dict.fromkeys((*one.settings, *other.settings)):
         value = one.settings.get(key, NOT_SET)
         other_value = other.settings.get(key, NOT_SET)
-        if _section(key) in sections and value != other_value:
+        if _get_section(key) in sections and value != other_value:
             differing.append((key, value, other_value))
     return differing
 
 
-def _section(key: str) -> str:
+def _get_section(key: str) -> str:
     return key.partition(".")[0]
 
 
-def _differing_messages(one: Process, other: Process) -> list[str]:
+def _find_differing_messages(one: Process, other: Process) -> list[str]:
     """Return the messages that both processes know in different versions."""
     return [name for name in one.messages if name in other.messages and one.messages[name] != other.messages[name]]
 
 
 def _describe_conflict(entry: Process, own: Process) -> str:
-    """Return the keys in which a process differs from this one and what to do; empty if there are none."""
-    settings = _differing_settings(entry, own)
-    named = [f"`{key}` = {value} (here {own_value})" for key, value, own_value in settings]
-    named += [
+    """Return a text about the settings and messages in which a process differs from this one, with the remedy.
+
+    The text is empty if nothing differs.
+    """
+    settings = _find_differing_settings(entry, own)
+    differences = [f"`{key}` = {value} (here {own_value})" for key, value, own_value in settings]
+    differences += [
         f"message {name} version {entry.messages[name]} (here {own.messages[name]})"
-        for name in _differing_messages(entry, own)
+        for name in _find_differing_messages(entry, own)
     ]
-    if not named:
+    if not differences:
         return ""
-    listed = ", ".join(named[:MAX_NAMED])
-    if len(named) > MAX_NAMED:
-        listed += f" and {len(named) - MAX_NAMED} more, which `snakesim status` lists"
-    return f"{describe_place(entry)} differs from this host in {listed}; {_describe_remedy(entry, own)}"
+    listing = ", ".join(differences[:MAX_LISTED_DIFFERENCES])
+    if len(differences) > MAX_LISTED_DIFFERENCES:
+        listing += f" and {len(differences) - MAX_LISTED_DIFFERENCES} more, which `snakesim status` lists"
+    return f"{describe_process(entry)} differs from this host in {listing}; {_describe_remedy(entry, own)}"
 
 
 def _describe_remedy(entry: Process, own: Process) -> str:
     """Return what to do about different settings, or different versions, of two processes."""
-    if _differing_messages(entry, own):
+    if _find_differing_messages(entry, own):
         return "install one version of SnakeSIM on both machines"
-    keys_in_conflict = [key for key, _, _ in _differing_settings(entry, own)]
+    keys_in_conflict = [key for key, _, _ in _find_differing_settings(entry, own)]
     if keys_in_conflict == ["clock_mode"]:
         return f"start {entry.name} again with --clock-mode {own.settings['clock_mode']}"
     return f"start host and {entry.name} with equal files, --set and --clock-mode"
 
 
-def describe_place(entry: Process) -> str:
+def describe_process(entry: Process) -> str:
     """Return the machine, name and id of a process as text."""
     return f"{entry.machine} ({entry.name}, process {entry.pid})"
 
 
-class _Compared(NamedTuple):
+class _Comparison(NamedTuple):
     """Two entries that have been compared."""
 
     entry: Process
@@ -139,41 +147,41 @@ class ProcessEntries:
         self._decoder = Decoder(Process)
         self._entries: dict[str, Process] = {}
         self._alive: set[str] = set()
-        self._compared: dict[str, _Compared] = {}  # only of known services, so there are few
-        session.on_alive(self._on_token, keys.PROCESS_ALL)
+        self._comparisons: dict[str, _Comparison] = {}  # cache by key; only of known services, so there are few
+        session.on_token_change(self._on_token, keys.PROCESS_ALL)
         session.on_latched_arrival(keys.PROCESS_ALL, self._store_entry)
 
     def find_problems(self, own: Process, names: Collection[str]) -> list[str]:
         """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
         problems = [f"{process} has not published its settings yet" for process in self.unpublished(names)]
-        for key, entry in self._published(names).items():
+        for key, entry in self._find_entries(names).items():
             conflict = self._find_conflict(key, entry, own) if entry is not None else ""
             if conflict:
                 problems.append(conflict)
         return problems
 
     def _find_conflict(self, key: str, entry: Process, own: Process) -> str:
-        """Return what `_describe_conflict` returns. Each entry is compared once, although every status asks for it."""
-        compared = self._compared.get(key)
-        if compared is None or compared.entry is not entry or compared.own is not own:
-            compared = _Compared(entry, own, _describe_conflict(entry, own))
-            self._compared[key] = compared
-        return compared.conflict
+        """Return the text of `_describe_conflict`. Each entry is compared only once, although every status needs it."""
+        comparison = self._comparisons.get(key)
+        if comparison is None or comparison.entry is not entry or comparison.own is not own:
+            comparison = _Comparison(entry, own, _describe_conflict(entry, own))
+            self._comparisons[key] = comparison
+        return comparison.conflict
 
     def unpublished(self, names: Collection[str]) -> list[str]:
         """Return the present processes of these names that have not published their entry yet."""
-        return [keys.parse_service(key) for key, entry in self._published(names).items() if entry is None]
+        return [keys.parse_service(key) for key, entry in self._find_entries(names).items() if entry is None]
 
-    def _published(self, names: Collection[str]) -> dict[str, Process | None]:
-        """Return the entry of each present process of these names by its key; None: it is not published yet."""
-        published: dict[str, Process | None] = {}
+    def _find_entries(self, names: Collection[str]) -> dict[str, Process | None]:
+        """Return the entry of each connected process of these names by its key; None for an unpublished entry."""
+        entry_by_key: dict[str, Process | None] = {}
         for key in sorted(self._alive.copy()):
             name = keys.parse_service(key).rpartition("-")[0]
             if name in names:
                 entry = self._entries.get(key)
                 is_own = entry is not None and entry.name == name
-                published[key] = entry if is_own else None
-        return published
+                entry_by_key[key] = entry if is_own else None
+        return entry_by_key
 
     def waits(self) -> dict[str, list[str]]:
         """Return the keys that each present process waits for, by its name."""
@@ -181,13 +189,14 @@ class ProcessEntries:
         return {entry.name: entry.waits_for for entry in entries if entry.waits_for}
 
     def _on_token(self, key: str, present: bool) -> None:
+        """Add or remove a connected process, in Zenoh's thread."""
         if present and len(self._alive) < MAX_ENTRIES:
             self._alive.add(key)
         elif not present:
             self._alive.discard(key)  # the entry stays: if only the link was cut, it is not sent again
 
     def _store_entry(self, arrival: Arrival) -> None:
-        """Store an entry. If there are too many, entries of vanished processes make room; else it is dropped."""
+        """Store an entry, in Zenoh's thread. A full table first drops the entries of processes that have vanished."""
         if len(self._entries) >= MAX_ENTRIES and arrival.key not in self._entries:
             for key in self._entries.keys() - self._alive:
                 self._entries.pop(key, None)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.model.route import is_line
+from snakesim_hal.model.route import is_polyline
 from snakesim_hal.wire.messages import (
     ColorImage,
     Contacts,
@@ -29,10 +29,10 @@ from snakesim_hal.wire.messages import (
 )
 
 MAX_PATH_M = 1e5  # a longer path exceeds the bounds of `control/state`
-JOINT_STATE_LISTS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
-POWER_LISTS = ("voltage_v", "current_a", "motor_c", "board_c", "leak", "valid")
-IMU_LISTS = ("angular_velocity_rad_s", "acceleration_m_s2")
-UNIT_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
+JOINT_STATE_LIST_FIELDS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
+POWER_LIST_FIELDS = ("voltage_v", "current_a", "motor_c", "board_c", "leak", "valid")
+IMU_LIST_FIELDS = ("angular_velocity_rad_s", "acceleration_m_s2")
+MAX_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
 
 Check = Callable[[Any, Description], WireError | None]
 
@@ -41,8 +41,8 @@ def find_mismatch(message: Message, robot: Description) -> WireError | None:
     """Check whether the list lengths, link numbers, rotations and path of a message fit a robot.
 
     Args:
-        message: a decoded message of any class; classes without a check always fit.
-        robot: the description of the robot.
+        message: Decoded message of any class. Classes without a check always fit.
+        robot: Description of the robot.
 
     Returns:
         The error, or None if the message fits. `WireError.reason` is a short code, such as `wrong_length`.
@@ -63,38 +63,38 @@ def _check_joint_state(state: JointState, robot: Description) -> WireError | Non
     joint_count = len(robot.joints)
     if state.has_joint_count(joint_count):
         return None
-    return _check_lengths(state, JOINT_STATE_LISTS, joint_count, "one a joint")
+    return _find_wrong_length(state, JOINT_STATE_LIST_FIELDS, joint_count, "one a joint")
 
 
 def _check_power(power: Power, robot: Description) -> WireError | None:
-    return _check_lengths(power, POWER_LISTS, len(robot.joints), "one a joint")
+    return _find_wrong_length(power, POWER_LIST_FIELDS, len(robot.joints), "one a joint")
 
 
 def _check_imu(imu: Imu, robot: Description) -> WireError | None:
-    error = _check_lengths(imu, IMU_LISTS, len(imu.link), "one for each of Imu.link")
-    return error or _check_link("Imu.link", max(imu.link, default=0), robot)
+    error = _find_wrong_length(imu, IMU_LIST_FIELDS, len(imu.link), "one for each of Imu.link")
+    return error or _find_wrong_link("Imu.link", max(imu.link, default=0), robot)
 
 
 def _check_depth_image(image: DepthImage, robot: Description) -> WireError | None:
-    error = _check_lengths(image, ("depth",), 2 * image.width * image.height, "two bytes a pixel")
+    error = _find_wrong_length(image, ("depth",), 2 * image.width * image.height, "two bytes a pixel")
     return error or _check_mount(image, robot)
 
 
 def _check_color_image(image: ColorImage, robot: Description) -> WireError | None:
-    error = _check_lengths(image, ("rgb",), 3 * image.width * image.height, "three bytes a pixel")
+    error = _find_wrong_length(image, ("rgb",), 3 * image.width * image.height, "three bytes a pixel")
     return error or _check_mount(image, robot)
 
 
 def _check_world(world: World, robot: Description) -> WireError | None:
     error = _check_contacts(world, robot)
-    return error or _check_rotation("World.base_orientation_wxyz", world.base_orientation_wxyz)
+    return error or _find_wrong_rotation("World.base_orientation_wxyz", world.base_orientation_wxyz)
 
 
 def _check_pose(pose: Pose, _robot: Description) -> WireError | None:
-    return _check_rotation("Pose.orientation_wxyz", pose.orientation_wxyz)
+    return _find_wrong_rotation("Pose.orientation_wxyz", pose.orientation_wxyz)
 
 
-def _check_path(trajectory: Trajectory, _robot: Description) -> WireError | None:
+def _check_trajectory(trajectory: Trajectory, _robot: Description) -> WireError | None:
     """Return the error of a trajectory whose points are not a usable path."""
     if _is_path(np.array(trajectory.path_w)):
         return None
@@ -102,48 +102,52 @@ def _check_path(trajectory: Trajectory, _robot: Description) -> WireError | None
     return WireError("no_path", f"Trajectory.path_w of {len(trajectory.path_w)} points is no path: {allowed}")
 
 
-def _check_lengths(message: Message, fields: Sequence[str], expected_length: int, why: str) -> WireError | None:
+def _find_wrong_length(
+    message: Message, fields: Sequence[str], expected_length: int, explanation: str
+) -> WireError | None:
     """Return the error of the first field that has another length than expected."""
     for field in fields:
         length = len(getattr(message, field))
         if length != expected_length:
-            where = f"{type(message).__name__}.{field}"
-            return WireError("wrong_length", f"{where} has length {length}, must have {expected_length}: {why}")
+            label = f"{type(message).__name__}.{field}"
+            return WireError("wrong_length", f"{label} has length {length}, must have {expected_length}: {explanation}")
     return None
 
 
 def _check_contacts(message: Contacts | World, robot: Description) -> WireError | None:
-    furthest = max((contact.link for contact in message.contacts), default=0)
-    return _check_link(f"{type(message).__name__}.contacts: link", furthest, robot)
+    max_link = max((contact.link for contact in message.contacts), default=0)
+    return _find_wrong_link(f"{type(message).__name__}.contacts: link", max_link, robot)
 
 
 def _check_mount(message: MountedSample, robot: Description) -> WireError | None:
     name = type(message).__name__
-    wrong = _check_link(f"{name}.link", message.link, robot)
-    return wrong or _check_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)
+    error = _find_wrong_link(f"{name}.link", message.link, robot)
+    return error or _find_wrong_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)
 
 
-def _check_link(where: str, link: int, robot: Description) -> WireError | None:
+def _find_wrong_link(label: str, link: int, robot: Description) -> WireError | None:
+    """Return the error of a link number that the robot does not have; None for an existing link."""
     last_link = len(robot.links) - 1
     if link <= last_link:
         return None
-    return WireError("wrong_length", f"{where} is {link}, must be 0 (tail) to {last_link} (head)")
+    return WireError("wrong_length", f"{label} is {link}, must be 0 (tail) to {last_link} (head)")
 
 
 def _is_path(points_w: NDArray[np.float64]) -> bool:
     """Return whether points of shape (n, 2) are a usable path."""
     return (
-        is_line(points_w)
+        is_polyline(points_w)
         and float(np.hypot(*np.diff(points_w, axis=0).T).sum()) <= MAX_PATH_M
         and bool((np.abs(points_w) <= MAX_PATH_M).all())
     )
 
 
-def _check_rotation(where: str, wxyz: Sequence[float]) -> WireError | None:
+def _find_wrong_rotation(label: str, wxyz: Sequence[float]) -> WireError | None:
+    """Return the error of a quaternion whose norm is not 1; None for a rotation."""
     norm = math.hypot(*wxyz)
-    if abs(norm - 1.0) <= UNIT_NORM_ERROR:
+    if abs(norm - 1.0) <= MAX_NORM_ERROR:
         return None
-    return WireError("no_rotation", f"{where} is {tuple(wxyz)} of norm {norm:g}, must be a rotation, of norm 1")
+    return WireError("no_rotation", f"{label} is {tuple(wxyz)} of norm {norm:g}, must be a rotation, of norm 1")
 
 
 # The first class that a message belongs to has its check.
@@ -157,5 +161,5 @@ CHECKS: dict[type[Message], Check] = {
     MountedSample: _check_mount,
     World: _check_world,
     Pose: _check_pose,
-    Trajectory: _check_path,
+    Trajectory: _check_trajectory,
 }

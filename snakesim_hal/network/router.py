@@ -9,16 +9,16 @@ from pathlib import Path
 import zenoh
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.network.endpoint import check_guarded
-from snakesim_hal.network.router_log import ZENOH_LEVELS, short_log
-from snakesim_hal.network.session_file import endpoints_of_mode, read_zenoh_file, refused_by_zenoh
+from snakesim_hal.network.endpoint import require_safe_listening_endpoint
+from snakesim_hal.network.router_log import ZENOH_LEVELS, shortened_zenoh_log
+from snakesim_hal.network.session_file import make_zenoh_refusal_error, read_endpoints, read_zenoh_file
 
 
-def router_settings(config: Path) -> zenoh.Config:
+def read_router_settings(config: Path) -> zenoh.Config:
     """Read the settings in a router's JSON5 file, without opening anything.
 
     Raises:
-        ConfigError: the file cannot be read, or is not for a router.
+        ConfigError: The file cannot be read, or is not for a router.
     """
     _, settings = read_zenoh_file(config)
     if json.loads(settings.get_json("mode")) != "router":
@@ -26,7 +26,7 @@ def router_settings(config: Path) -> zenoh.Config:
     return settings
 
 
-def _denies_by_default(settings: zenoh.Config) -> bool:
+def _is_denying_by_default(settings: zenoh.Config) -> bool:
     """Return whether the access control denies everything that its rules do not allow."""
     rules = json.loads(settings.get_json("access_control"))
     return bool(rules["enabled"]) and rules["default_permission"] == "deny"
@@ -34,26 +34,28 @@ def _denies_by_default(settings: zenoh.Config) -> bool:
 
 @contextmanager
 def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
-    """Run a Zenoh router from a JSON5 file for as long as the context lives.
+    """Run a Zenoh router from a JSON5 file while the context lasts.
 
-    Its log is short, unless RUST_LOG sets Zenoh's own levels.
+    The log of Zenoh is shortened, unless RUST_LOG sets its levels.
 
     Args:
-        config: the file.
-        insecure: also run a router that other machines can connect to without access control.
+        config: Path of the file.
+        insecure: Whether to run also a router that other machines can connect to without access control.
 
     Raises:
-        ConfigError: the file is not valid, or the router would let other machines command a robot.
+        ConfigError: The file is not valid, or the router would let other machines command a robot.
     """
-    settings = router_settings(config)
-    for endpoint in endpoints_of_mode(settings, "listen/endpoints", "router"):
-        guarded = _denies_by_default(settings)
-        check_guarded(endpoint, f"{config}: `listen.endpoints`:", access_control=guarded, insecure=insecure)
-    with nullcontext() if "RUST_LOG" in os.environ else short_log():
+    settings = read_router_settings(config)
+    for endpoint in read_endpoints(settings, "listen/endpoints", "router"):
+        has_access_control = _is_denying_by_default(settings)
+        require_safe_listening_endpoint(
+            endpoint, f"{config}: `listen.endpoints`:", access_control=has_access_control, insecure=insecure
+        )
+    with nullcontext() if "RUST_LOG" in os.environ else shortened_zenoh_log():
         zenoh.init_log_from_env_or(ZENOH_LEVELS)
         try:
             session = zenoh.open(settings)
         except zenoh.ZError as error:
-            raise refused_by_zenoh(config, error) from error
+            raise make_zenoh_refusal_error(config, error) from error
         with session:
             yield

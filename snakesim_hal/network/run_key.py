@@ -21,7 +21,7 @@ def new_run_key() -> str:
     return secrets.token_hex(32)
 
 
-def own_run_key() -> str | None:
+def read_own_run_key() -> str | None:
     """Return the key of the run that this process is part of; None if it was started on its own."""
     return os.environ.get(RUN_KEY) or None
 
@@ -30,16 +30,16 @@ def add_proof(description: Description, key: str | None) -> Description:
     """Return a description with the proof that it is of the run with this key."""
     if key is None:
         return description
-    return msgspec.structs.replace(description, proof=_proof(description, key))
+    return msgspec.structs.replace(description, proof=_compute_proof(description, key))
 
 
-def is_proven(description: Description, key: str | None) -> bool:
+def has_valid_proof(description: Description, key: str | None) -> bool:
     """Return whether a description is of the run's own host. Without a key, any description is accepted."""
     if key is None:
         return True
-    return hmac.compare_digest(description.proof, _proof(description, key))
+    return hmac.compare_digest(description.proof, _compute_proof(description, key))
 
 
-def _proof(description: Description, key: str) -> str:
+def _compute_proof(description: Description, key: str) -> str:
     unproven = encode(msgspec.structs.replace(description, proof=""))
     return hmac.new(key.encode(), unproven, "sha256").hexdigest()

@@ -4,7 +4,7 @@ A session connects to explicit endpoints, without scouting, and sees one namespa
 opens Zenoh and has its settings; `local_network` has the same sessions within one process, without Zenoh.
 
 Threads: every method may be called from any thread of the process. Zenoh calls the callbacks that `on_arrival`,
-`on_query` and `on_alive` register in its own threads, so they must return at once: they store what arrived, and
+`on_query` and `on_token_change` register in its own threads, so they must return at once: they store what arrived, and
 the process handles it in a thread of its own.
 """
 
@@ -21,17 +21,17 @@ import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, WireError
-from snakesim_hal.base.process import raise_open_files
+from snakesim_hal.base.process import raise_open_file_limit
 from snakesim_hal.network.connection import (
-    RECEIVERS_CONNECTED,
-    RECEIVERS_LISTENING,
+    CLIENT_RECEIVING_THREADS,
+    ROUTER_RECEIVING_THREADS,
     Link,
     limit_receiving_threads,
     open_zenoh,
 )
-from snakesim_hal.network.endpoint import check_guarded
+from snakesim_hal.network.endpoint import require_safe_listening_endpoint
 from snakesim_hal.network.image_connection import configure_for_images
-from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, reader_depth
+from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, get_reader_depth
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message, Preview
@@ -45,7 +45,7 @@ class Session:
 
     Example:
         with open_session(Link(endpoint, "planar13")) as session:
-            reader = session.reader(keys.JOINTS, JointState)
+            reader = session.declare_reader(keys.JOINTS, JointState)
             for joints in reader.drain():
                 print(joints.angle_rad)
     """
@@ -54,36 +54,36 @@ class Session:
         """Wrap an open Zenoh session.
 
         Args:
-            zenoh_session: it is closed with this session.
-            open_for_images: opens a connection for images alone, when the first publisher of images is declared;
-                None: images share the connection of everything else.
+            zenoh_session: Open session of Zenoh, which is closed with this session.
+            open_for_images: Function that opens a connection for images alone, called when the first publisher of
+                images is declared. None if images share the connection of all other messages.
         """
         # Connections.
         self._zenoh = zenoh_session
-        self._is_part = False  # True: another session closes the connection
+        self._shares_connection = False  # whether another session closes the connection
         self._open_for_images = open_for_images
         self._image_session: Any = None
         # What this session declares.
         self._declared: list[Any] = []
         self._publishers: dict[str, Publisher[Any]] = {}
-        self._reroutes: dict[str, Callable[[bytes], None]] = {}
+        self._reroute_by_key: dict[str, Callable[[bytes], None]] = {}
         self.rejected: Counter[str] = Counter()  # samples that could not be decoded, by reason
 
     # --- publishing ------------------------------------------------------------------------------------------
 
-    def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
+    def declare_publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
         """Declare a publisher for a stream.
 
         Args:
-            key: where it publishes.
-            message: the type of its messages; it decides the priority.
-            lossless: True: `put` waits for slow subscribers (lockstep); False: samples are dropped for them.
+            key: Key to publish on.
+            message: Type of the messages, which decides the priority.
+            lossless: Whether `put` waits for slow subscribers, as in lockstep. Otherwise samples are dropped for them.
 
         Returns:
             The publisher, which is undeclared when this session is closed.
         """
         # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
-        ends_a_tick = key in (keys.JOINT_COMMAND, keys.CLOCK) or key.startswith(keys.done_key(""))
+        is_last_of_tick = key in (keys.JOINT_COMMAND, keys.CLOCK) or key.startswith(keys.done_key(""))
         congestion_control = zenoh.CongestionControl.DROP
         if lossless:
             congestion_control = zenoh.CongestionControl.BLOCK
@@ -95,7 +95,7 @@ class Session:
             encoding=format_encoding(message),
             congestion_control=congestion_control,
             priority=_choose_priority(key, message),
-            express=ends_a_tick,
+            express=is_last_of_tick,
         )
         return self._wrap_publisher(key, publisher, message)
 
@@ -107,7 +107,7 @@ class Session:
             self._image_session = self._open_for_images()
         return self._image_session
 
-    def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
+    def declare_latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
         """Declare a publisher whose last value is sent to later subscribers."""
         publisher = ext.declare_advanced_publisher(
             self._zenoh,
@@ -126,15 +126,15 @@ class Session:
     def _register_publisher(self, key: str, publisher: Publisher[MessageT]) -> Publisher[MessageT]:
         """Apply the key's reroute, now and later, and return the publisher."""
         self._publishers[key] = publisher
-        publisher.reroute(self._reroutes.get(key))
+        publisher.reroute(self._reroute_by_key.get(key))
         return publisher
 
     def reroute(self, key: str, put: Callable[[bytes], None] | None) -> None:
         """Pass payloads of a key's present and future publishers to `put`; None: send them directly again."""
         if put is None:
-            self._reroutes.pop(key, None)
+            self._reroute_by_key.pop(key, None)
         else:
-            self._reroutes[key] = put
+            self._reroute_by_key[key] = put
         if key in self._publishers:
             self._publishers[key].reroute(put)
 
@@ -144,35 +144,35 @@ class Session:
 
     # --- reading ---------------------------------------------------------------------------------------------
 
-    def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
+    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
         """Subscribe to a stream. A slow reader loses old samples, and never blocks the publisher.
 
         Args:
-            key: what to read; it may have wildcards.
-            message: the type of its messages.
-            depth: how many of the newest samples the reader keeps; None: the default for this type.
+            key: Key to subscribe to. It may have wildcards.
+            message: Type of the messages.
+            depth: Number of the newest samples that the reader keeps. None means the default for this type.
         """
-        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or reader_depth(message)))
+        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or get_reader_depth(message)))
         self._declared.append(subscriber)
         return Reader(subscriber, message, self.rejected)
 
-    def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
+    def declare_latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
         """Subscribe as `reader` does, and also get the value that was latched before."""
         subscriber = ext.declare_advanced_subscriber(
             self._zenoh,
             key,
             handlers.RingChannel(READER_DEPTH),
-            history=_last_value_history(),
+            history=_make_last_value_history(),
         )
         self._declared.append(subscriber)
         return Reader(subscriber, message, self.rejected)
 
-    def stop_reading(self, reader: Reader[Any]) -> None:
+    def close_reader(self, reader: Reader[Any]) -> None:
         """Close a reader that is no longer used."""
         self._declared.remove(reader.subscriber)
         reader.subscriber.undeclare()
 
-    def latest(
+    def wait_for_latched(
         self,
         key: str,
         message: type[MessageT],
@@ -182,28 +182,28 @@ class Session:
         """Wait for the value that is latched on a key, and return it.
 
         Args:
-            key: where it is published.
-            message: its type.
-            timeout_s: how long to wait.
-            is_acceptable: returns whether a value is acceptable; others are skipped.
+            key: Key on which the value is published.
+            message: Type of the value.
+            timeout_s: Maximum time to wait, in s.
+            is_acceptable: Function that returns whether a value is acceptable. Other values are skipped.
 
         Returns:
             The value, or None if no acceptable one arrives in time.
         """
-        reader = self.latched_reader(key, message)
-        deadline = time.monotonic() + timeout_s
-        value = reader.newest(is_acceptable)
-        while value is None and time.monotonic() < deadline:
+        reader = self.declare_latched_reader(key, message)
+        deadline_s = time.monotonic() + timeout_s
+        value = reader.pop_newest(is_acceptable)
+        while value is None and time.monotonic() < deadline_s:
             time.sleep(POLL_S)
-            value = reader.newest(is_acceptable)
-        self.stop_reading(reader)
+            value = reader.pop_newest(is_acceptable)
+        self.close_reader(reader)
         return value
 
     # --- callbacks -------------------------------------------------------------------------------------------
 
     def on_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
         """Call `handler` for every sample, in a thread of this subscriber. It must only store the sample."""
-        self._declared.append(self._zenoh.declare_subscriber(key, _arrival_handler(handler)))
+        self._declared.append(self._zenoh.declare_subscriber(key, _make_arrival_handler(handler)))
 
     def on_urgent_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
         """Call `handler` for every sample, in the thread that receives for the whole session.
@@ -211,13 +211,13 @@ class Session:
         The control loop waits for one thread less than with `on_arrival`. While `handler` runs, the session receives
         nothing else, so it must only store the sample.
         """
-        callback = handlers.Callback(_keep_thread_state(_arrival_handler(handler)), indirect=False)
+        callback = handlers.Callback(_make_handler_with_thread_state(_make_arrival_handler(handler)), indirect=False)
         self._declared.append(self._zenoh.declare_subscriber(key, callback))
 
     def on_latched_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
         """Call `handler` as `on_arrival` does, and also for the values that were latched before."""
         subscriber = ext.declare_advanced_subscriber(
-            self._zenoh, key, _arrival_handler(handler), history=_last_value_history()
+            self._zenoh, key, _make_arrival_handler(handler), history=_make_last_value_history()
         )
         self._declared.append(subscriber)
 
@@ -234,29 +234,31 @@ class Session:
 
     # --- queries ---------------------------------------------------------------------------------------------
 
-    def request(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
+    def send_request(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
         """Send a request to the HAL host, and wait for the answer.
 
         Args:
-            key: the request's key, such as `keys.LEASE`.
-            request: what to do.
-            timeout_s: how long to wait.
-            host: id of the addressed host process; answers of other hosts are ignored. None: the first answer counts.
+            key: Key of the request, such as `keys.LEASE`.
+            request: Message with the request.
+            timeout_s: Maximum time to wait, in s.
+            host: Id of the addressed host process. Answers of other hosts are ignored. None accepts the first answer.
 
         Raises:
-            NotConnectedError: no answer came in time, or it cannot be decoded.
+            NotConnectedError: No answer arrives in time, or it cannot be decoded.
         """
-        unreadable: WireError | None = None
+        decoding_error: WireError | None = None
         for _, answer in self._answers(key, request, timeout_s):
             if isinstance(answer, WireError):
-                unreadable = answer
+                decoding_error = answer
             elif host is None or answer.host == host:
                 return answer
-        if unreadable is not None:
-            raise NotConnectedError(f"the answer on {key} cannot be decoded: {unreadable}")
+        if decoding_error is not None:
+            raise NotConnectedError(f"the answer on {key} cannot be decoded: {decoding_error}")
         raise NotConnectedError(f"no answer on {key} within {timeout_s} s; is the robot's HAL host running?")
 
-    def request_all(self, pattern: str, request: Message, timeout_s: float = 2.0) -> Iterator[tuple[str, Answer]]:
+    def send_request_to_all(
+        self, pattern: str, request: Message, timeout_s: float = 2.0
+    ) -> Iterator[tuple[str, Answer]]:
         """Send a request to all matching keys at once.
 
         Yields:
@@ -266,12 +268,12 @@ class Session:
         return ((key, answer) for key, answer in answers if isinstance(answer, Answer))
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
-        """Send a request to all hosts whose keys match a pattern, and yield their answers.
+        """Send a request to all hosts whose keys match a pattern, and yield their answers as they arrive.
 
         Args:
-            pattern: key of the request; it may have wildcards.
-            request: the message to send.
-            timeout_s: how long to wait for answers.
+            pattern: Key of the request. It may have wildcards.
+            request: Message with the request.
+            timeout_s: Time in s in which answers are accepted.
 
         Yields:
             The key and the answer of each host. If the answer cannot be decoded, it is counted in `rejected`, and the
@@ -301,7 +303,7 @@ class Session:
 
     # --- liveliness ------------------------------------------------------------------------------------------
 
-    def present(self, pattern: str, timeout_s: float = 1.0) -> list[str]:
+    def list_tokens(self, pattern: str, timeout_s: float = 1.0) -> list[str]:
         """Return the keys of all liveliness tokens that match now."""
         replies = self._zenoh.liveliness().get(pattern, timeout=timeout_s)
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
@@ -314,7 +316,7 @@ class Session:
         """Declare a liveliness token for as long as the session lives."""
         self._declared.append(self._zenoh.liveliness().declare_token(key))
 
-    def on_alive(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+    def on_token_change(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
         """Call `handler(key, present)` when a token appears or vanishes, in Zenoh's thread."""
 
         def handle(sample: zenoh.Sample) -> None:
@@ -324,11 +326,11 @@ class Session:
 
     # --- the session itself ----------------------------------------------------------------------------------
 
-    def part(self) -> "Session":
-        """Return another session over the same connection. Closing it ends only what it has declared."""
-        part = Session(self._zenoh)
-        part._is_part = True
-        return part
+    def create_subsession(self) -> "Session":
+        """Return another session over the same connection. Closing it undeclares only its own declarations."""
+        subsession = Session(self._zenoh)
+        subsession._shares_connection = True
+        return subsession
 
     def close(self) -> None:
         """Undeclare everything, then close the connections."""
@@ -338,32 +340,32 @@ class Session:
         self._declared.clear()
         if self._image_session is not None:
             self._image_session.close()
-        if not self._is_part:
+        if not self._shares_connection:
             self._zenoh.close()
 
 
 @contextmanager
 def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
-    """Connect to the network of a robot, and close the session when the context ends.
+    """Connect to the network of a robot, or listen for its clients, and close the session when the context ends.
 
     Args:
-        link: where and how to connect.
-        connect_timeout_s: how long a client tries to connect.
+        link: Endpoint, and whether to connect to it or listen on it.
+        connect_timeout_s: Time in s within which a client must be connected.
 
     Raises:
-        NotConnectedError: the endpoint does not answer, or cannot be listened on.
-        RefusedError: the endpoint is on loopback, and that interface is down.
-        ConfigError: listening there would let other machines command the robot.
+        NotConnectedError: The endpoint does not answer, or cannot be listened on.
+        RefusedError: The endpoint is on loopback, and that interface is down.
+        ConfigError: Listening there would let other machines command the robot.
     """
     if link.listen:
-        check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
-        raise_open_files(MAX_OPEN_FILES)
-        receivers = RECEIVERS_LISTENING
+        require_safe_listening_endpoint(link.endpoint, "endpoint", insecure=link.insecure)
+        raise_open_file_limit(MAX_OPEN_FILES)
+        receiving_threads = ROUTER_RECEIVING_THREADS
         open_for_images = None
     else:
-        receivers = RECEIVERS_CONNECTED
+        receiving_threads = CLIENT_RECEIVING_THREADS
         open_for_images = partial(open_zenoh, link, connect_timeout_s, configure_for_images)
-    with limit_receiving_threads(receivers):
+    with limit_receiving_threads(receiving_threads):
         session = Session(open_zenoh(link, connect_timeout_s), open_for_images)
     with closing(session):
         yield session
@@ -373,7 +375,7 @@ def key_expression(text: str) -> str:
     """Return a key that may have wildcards in Zenoh's canonical form.
 
     Raises:
-        ConfigError: the text is not a key.
+        ConfigError: The text is not a key.
     """
     try:
         return str(zenoh.KeyExpr.autocanonize(text))
@@ -384,8 +386,8 @@ def key_expression(text: str) -> str:
         ) from None
 
 
-def intersects(pattern: str, key: str) -> bool:
-    """Return whether two key expressions have a key in common."""
+def do_keys_intersect(pattern: str, key: str) -> bool:
+    """Return whether two key expressions match a common key."""
     return zenoh.KeyExpr(pattern).intersects(zenoh.KeyExpr(key))
 
 
@@ -400,12 +402,12 @@ def _choose_priority(key: str, message: type[Message]) -> zenoh.Priority:
     return zenoh.Priority.DATA_HIGH
 
 
-def _last_value_history() -> ext.HistoryConfig:
+def _make_last_value_history() -> ext.HistoryConfig:
     """Return the history of a latched key: the last value, also of a publisher that appears later."""
     return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
 
 
-def _arrival_handler(handler: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
+def _make_arrival_handler(handler: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
     """Return a handler for Zenoh's thread that passes each sample to `handler` as an `Arrival`."""
 
     def handle(sample: zenoh.Sample) -> None:
@@ -417,7 +419,7 @@ def _arrival_handler(handler: Callable[[Arrival], None]) -> Callable[[zenoh.Samp
     return handle
 
 
-def _keep_thread_state(handle: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+def _make_handler_with_thread_state(handle: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
     """Return a handler that keeps Python's state of Zenoh's thread from one sample to the next.
 
     Otherwise Python creates that state, and a stack, again for each sample, which in the kernel costs twice what a

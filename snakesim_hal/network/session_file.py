@@ -12,9 +12,9 @@ from typing import Any
 import zenoh
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.textfiles import check_brackets, read_text
+from snakesim_hal.model.textfiles import check_nesting_depth, read_text
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
-from snakesim_hal.network.private_keys import warn_of_readable_keys
+from snakesim_hal.network.private_keys import warn_about_readable_keys
 
 # Values that a file may leave out, except the mode, which is `peer` when left out.
 REQUIRED: dict[str, Any] = {
@@ -33,11 +33,17 @@ class SessionFile:
     endpoints: tuple[str, ...]  # of routers: the first that answers is used
     namespace: str | None  # of the only robot that this session can see; None: the file names none
 
-    def namespace_for(self, requested: str | None) -> str | None:
-        """Return the namespace of a session; requested: by the user, None: any.
+    def resolve_namespace(self, requested: str | None) -> str | None:
+        """Return the namespace of a session: the requested one, or that of the file.
+
+        Args:
+            requested: Namespace that the user requests. None if the user requests none.
+
+        Returns:
+            The namespace, or None if neither the user nor the file names one.
 
         Raises:
-            ConfigError: the file names another one.
+            ConfigError: The file names another namespace than the user.
         """
         if self.namespace is not None and requested not in (None, self.namespace):
             raise ConfigError(
@@ -53,17 +59,17 @@ def read_session(path: Path) -> SessionFile:
     """Read and check a Zenoh session file, without connecting.
 
     Args:
-        path: a JSON5 file for a Zenoh client. It may contain one namespace, and must not contain `listen.endpoints`.
+        path: JSON5 file for a Zenoh client. It may contain one namespace, and must not contain `listen.endpoints`.
 
     Returns:
-        The path, text, router endpoints and namespace of the file.
+        The checked content of the file, with the endpoints of its routers.
 
     Raises:
-        ConfigError: the file cannot be read, or is not a session file for SnakeSIM.
+        ConfigError: The file cannot be read, or is not a session file for SnakeSIM.
     """
     text, settings = read_zenoh_file(path)
-    for key, required in REQUIRED.items():
-        _check_required_value(path, key, json.loads(settings.get_json(key)), required)
+    for key, required_value in REQUIRED.items():
+        _check_required_value(path, key, json.loads(settings.get_json(key)), required_value)
     endpoints = _read_router_endpoints(path, settings)
     namespace = json.loads(settings.get_json("namespace"))
     if namespace is not None:
@@ -85,11 +91,11 @@ def _check_required_value(path: Path, key: str, value: Any, required: Any) -> No
 
 def _read_router_endpoints(path: Path, settings: zenoh.Config) -> list[str]:
     """Return the valid endpoints of the routers that a file names. Raises ConfigError if there are none."""
-    if endpoints_of_mode(settings, "listen/endpoints", "client"):
+    if read_endpoints(settings, "listen/endpoints", "client"):
         raise ConfigError(
             f"{path}: `listen.endpoints`: a session only connects; leave it out", code="network/session-file"
         )
-    endpoints = endpoints_of_mode(settings, "connect/endpoints", "client")
+    endpoints = read_endpoints(settings, "connect/endpoints", "client")
     if not endpoints:
         raise ConfigError(
             f"{path}: `connect.endpoints` is empty: name the router's, such as tls/robot-lab:7447",
@@ -107,25 +113,31 @@ def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
         The text, and the settings that Zenoh reads in it.
 
     Raises:
-        ConfigError: it cannot be read, or Zenoh refuses it.
+        ConfigError: The file cannot be read, or Zenoh refuses it.
     """
     text = read_text(path)
-    check_brackets(text, str(path))
+    check_nesting_depth(text, str(path))
     try:
         settings = zenoh.Config.from_json5(text)
     except zenoh.ZError as error:
-        raise refused_by_zenoh(path, error) from error
-    warn_of_readable_keys(settings)
+        raise make_zenoh_refusal_error(path, error) from error
+    warn_about_readable_keys(settings)
     return text, settings
 
 
-def refused_by_zenoh(path: Path, error: zenoh.ZError) -> ConfigError:
+def make_zenoh_refusal_error(path: Path, error: zenoh.ZError) -> ConfigError:
     """Return an error with Zenoh's own message about a file, shortened because it quotes the file."""
     message = " ".join(str(error).split())
     return ConfigError(f"{path}: Zenoh refuses it: {shorten(message, 500)}", code="network/session-file")
 
 
-def endpoints_of_mode(settings: zenoh.Config, key: str, mode: str) -> list[str]:
-    """Return a list of endpoints for a mode. The file has one list for all modes, or one for each."""
+def read_endpoints(settings: zenoh.Config, key: str, mode: str) -> list[str]:
+    """Return the endpoints that a setting lists for a mode of Zenoh.
+
+    Args:
+        settings: Settings of a Zenoh file, which has one list for all modes, or one for each mode.
+        key: Key of the setting, "connect/endpoints" or "listen/endpoints".
+        mode: Mode of the session, "client" or "router".
+    """
     value = json.loads(settings.get_json(key))
     return value if isinstance(value, list) else value.get(mode, [])

@@ -25,27 +25,35 @@ from contextlib import closing
 from dataclasses import dataclass
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.base.workers import start_worker
+from snakesim_hal.base.workers import start_restarting_thread
 
-REQUEST = b"SNAKSTOP"
-ANSWER = b"SNAKDONE"
+REQUEST_HEADER = b"SNAKSTOP"
+ANSWER_HEADER = b"SNAKDONE"
 TEST = b"SNAKTEST"  # does nothing, and is never answered
 NONCE_BYTES = 16
 MAX_REQUESTER_BYTES = 64
 MAX_ANSWER_BYTES = 1024
-UDP_HEADER = 8  # bytes
+UDP_HEADER_BYTES = 8  # bytes
 SO_ATTACH_FILTER = 26  # of Linux; Python has no name for it
-PAUSE_S = 0.001  # between two requests: a flood of them must not block the interpreter
-MAX_REFUSED = 10  # answers of the kernel that the port is closed
-REPEAT_S = 0.02  # after which a sender repeats an unanswered request
+PAUSE_AFTER_REQUEST_S = 0.001  # between two requests: a flood of them must not block the interpreter
+MAX_REFUSAL_COUNT = 10  # answers of the kernel that the port is closed
+REPEAT_PERIOD_S = 0.02  # after which a sender repeats an unanswered request
 TEST_WAIT_S = 0.01  # for the kernel's answer that a port is closed; on loopback it comes at once
 
 Address = tuple[str, int]  # host and port
 Reply = Callable[[str], None]
 
 
-def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
-    """Return the address of a robot's stop port: that of the endpoint on which its host listens, else on loopback."""
+def find_stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
+    """Return the host and port of a robot's stop port.
+
+    It has the address of the endpoint on which the HAL host listens. If the host listens nowhere, or the protocol is
+    not based on TCP, it is any free port of the loopback interface, which is returned as port 0.
+
+    Args:
+        endpoint: Endpoint of the robot's network.
+        listens: Whether the HAL host listens on the endpoint.
+    """
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     if listens and protocol in ("tcp", "tls", "ws") and port.isdigit():
@@ -58,19 +66,19 @@ def open_stop_port(host: str, port: int) -> socket.socket:
 
     Args:
         host: IP address to listen on.
-        port: number of the port; 0: any free one.
+        port: Number of the port. 0 for any free port.
 
     Returns:
-        The bound socket, with a kernel filter that drops other datagrams than requests.
+        The bound socket, with a kernel filter that drops all datagrams but requests.
 
     Raises:
-        NotConnectedError: the port is in use.
+        NotConnectedError: The port is in use.
     """
     address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
     stop_socket = socket.socket(address_family, socket.SOCK_DGRAM)
     try:
         stop_socket.bind((host, port))
-        _accept_requests_only(stop_socket)
+        _attach_request_filter(stop_socket)
     except OSError as error:
         stop_socket.close()
         raise NotConnectedError(
@@ -81,33 +89,33 @@ def open_stop_port(host: str, port: int) -> socket.socket:
     return stop_socket
 
 
-def serve_stops(opened: socket.socket, robot: str, handle: Callable[[str, Reply], None]) -> None:
+def start_stop_server(opened: socket.socket, robot: str, handle: Callable[[str, Reply], None]) -> None:
     """Start the thread `stop port`, which calls `handle(requester, reply)` for every stop request.
 
-    A request consists of the constant REQUEST, a nonce that the answer repeats, and the name of the requester.
+    A request consists of a constant header, a nonce that the answer repeats, and the name of the requester.
 
     Args:
-        opened: the bound socket; closing it ends the thread.
-        robot: namespace of the robot; the answers contain it.
-        handle: gets the name of the requester and a function that sends the answer.
+        opened: Bound UDP socket. Closing it ends the thread.
+        robot: Namespace of the robot, which the answers contain.
+        handle: Function that gets the name of the requester and a function that sends the answer.
     """
-    header_bytes = len(REQUEST) + NONCE_BYTES
+    header_bytes = len(REQUEST_HEADER) + NONCE_BYTES
 
     def serve() -> None:
         while True:
             try:
-                datagram, sender = opened.recvfrom(UDP_HEADER + header_bytes + MAX_REQUESTER_BYTES)
+                datagram, sender = opened.recvfrom(UDP_HEADER_BYTES + header_bytes + MAX_REQUESTER_BYTES)
             except OSError:  # the socket is closed
                 return
-            if not datagram.startswith(REQUEST) or len(datagram) < header_bytes:
+            if not datagram.startswith(REQUEST_HEADER) or len(datagram) < header_bytes:
                 continue
-            nonce = datagram[len(REQUEST) : header_bytes]
+            nonce = datagram[len(REQUEST_HEADER) : header_bytes]
             requester = datagram[header_bytes:].decode(errors="replace")
             reply = _make_reply(opened, nonce + robot.encode() + b"\n", sender)
             handle(requester or "an unnamed client", reply)
-            time.sleep(PAUSE_S)
+            time.sleep(PAUSE_AFTER_REQUEST_S)
 
-    start_worker("stop port", serve)
+    start_restarting_thread("stop port", serve)
 
 
 @dataclass(frozen=True)
@@ -127,48 +135,52 @@ class StopRequester:
     def __init__(self) -> None:
         self._sockets: dict[Address, socket.socket] = {}
 
-    def prepare(self, addresses: Collection[Address]) -> None:
+    def open_sockets(self, addresses: Collection[Address]) -> None:
         """Open a socket for each of these stop ports, and close the sockets of others.
 
         Raises:
-            OSError: no socket can be opened.
+            OSError: No socket can be opened.
         """
         for address in addresses:
             if address not in self._sockets:
-                self._sockets[address] = _open_for(address)
+                self._sockets[address] = _open_udp_socket(address)
         unused = [address for address in self._sockets if address not in addresses]
         for address in unused:
             self._sockets.pop(address).close()
 
     def request_stop(self, address: Address, requester: str, timeout_s: float) -> StopAnswer | None:
-        """Repeat a stop request until it is answered.
+        """Send a stop request to a stop port, and repeat it until it is answered.
 
         Args:
-            address: of the stop port.
-            requester: name of the person or program, for the record.
-            timeout_s: how long to repeat it.
+            address: Host and port of the stop port.
+            requester: Name of the person or program that requests the stop.
+            timeout_s: Time in s after which the request is no longer repeated.
 
         Returns:
             The answer, or None if none came in time.
 
         Raises:
-            NotConnectedError: the port is closed.
+            NotConnectedError: The port is closed.
             OSError: `address` is not prepared, and no socket can be opened.
         """
         opened = self._sockets.get(address)
         if opened is None:
-            opened = _open_for(address)
+            opened = _open_udp_socket(address)
             self._sockets[address] = opened
-        return _request_stop(opened, address, requester, timeout_s)
+        return _repeat_stop_request(opened, address, requester, timeout_s)
 
-    def test(self, address: Address, wait_s: float = TEST_WAIT_S) -> None:
-        """Send a datagram that does nothing to a stop port.
+    def require_open_port(self, address: Address, wait_s: float = TEST_WAIT_S) -> None:
+        """Check that a stop port is open, by sending a datagram that does nothing.
 
-        The robot's kernel drops it unread, so that a flood of tests takes no room from a stop. For a port that no
-        process has open, the kernel answers with an error.
+        The robot's kernel drops the datagram unread, so that a flood of tests takes no room from a stop. If no process
+        has opened the port, the kernel answers with an error.
+
+        Args:
+            address: Host and port of the stop port.
+            wait_s: Time in s to wait for the error.
 
         Raises:
-            NotConnectedError: the port is closed or cannot be reached, or `address` is not prepared.
+            NotConnectedError: The port is closed or cannot be reached, or `address` is not prepared.
         """
         opened = self._sockets.get(address)
         if opened is None:
@@ -200,38 +212,40 @@ def request_stop(host: str, port: int, requester: str, timeout_s: float) -> Stop
     """Send a stop request to one stop port, as `StopRequester.request_stop` does.
 
     Raises:
-        NotConnectedError: the port is closed.
+        NotConnectedError: The port is closed.
     """
     with closing(StopRequester()) as stop_requester:
         return stop_requester.request_stop((host, port), requester, timeout_s)
 
 
-def _open_for(address: Address) -> socket.socket:
+def _open_udp_socket(address: Address) -> socket.socket:
     address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
     return socket.socket(address_family, socket.SOCK_DGRAM)
 
 
-def _request_stop(opened: socket.socket, address: Address, requester: str, timeout_s: float) -> StopAnswer | None:
-    """Repeat a stop request until it is answered.
+def _repeat_stop_request(
+    opened: socket.socket, address: Address, requester: str, timeout_s: float
+) -> StopAnswer | None:
+    """Send a stop request, and repeat it every REPEAT_S until it is answered.
 
     Args:
-        opened: a UDP socket of the requester.
-        address: host and port of the stop port.
-        requester: name of the person or program that requests the stop.
-        timeout_s: how long to repeat the request.
+        opened: UDP socket of the requester.
+        address: Host and port of the stop port.
+        requester: Name of the person or program that requests the stop.
+        timeout_s: Time in s after which the request is no longer repeated.
 
     Returns:
         The answer, or None if none came in time.
 
     Raises:
-        NotConnectedError: the port is closed: it refused more than MAX_REFUSED requests.
+        NotConnectedError: The port is closed: it refused more than MAX_REFUSAL_COUNT requests.
     """
     nonce = os.urandom(NONCE_BYTES)
-    request = REQUEST + nonce + requester.encode()[:MAX_REQUESTER_BYTES]
-    deadline = time.monotonic() + timeout_s
+    request = REQUEST_HEADER + nonce + requester.encode()[:MAX_REQUESTER_BYTES]
+    deadline_s = time.monotonic() + timeout_s
     refused_count = 0
-    opened.settimeout(REPEAT_S)
-    while time.monotonic() < deadline:
+    opened.settimeout(REPEAT_PERIOD_S)
+    while time.monotonic() < deadline_s:
         try:
             opened.connect(address)  # so that the kernel accepts answers only from there
             opened.send(request)
@@ -242,25 +256,28 @@ def _request_stop(opened: socket.socket, address: Address, requester: str, timeo
             continue
         except ConnectionRefusedError:
             refused_count += 1
-            if refused_count > MAX_REFUSED:
+            if refused_count > MAX_REFUSAL_COUNT:
                 raise NotConnectedError(f"no host takes emergency stops on udp/{address[0]}:{address[1]}") from None
-            time.sleep(REPEAT_S)
+            time.sleep(REPEAT_PERIOD_S)
         except OSError:  # the network is unreachable at present
-            time.sleep(REPEAT_S)
+            time.sleep(REPEAT_PERIOD_S)
     return None
 
 
 def _receive_answer(opened: socket.socket, nonce: bytes) -> StopAnswer | None:
-    """Wait for the answer to the request with this nonce, for REPEAT_S; other datagrams are ignored.
+    """Wait for the answer to the request with this nonce for REPEAT_S. Other datagrams are ignored.
+
+    Returns:
+        The answer, or None if only other datagrams have arrived.
 
     Raises:
-        TimeoutError: nothing arrived.
+        TimeoutError: No datagram has arrived.
     """
-    until = time.monotonic() + REPEAT_S
-    while time.monotonic() < until:
+    deadline_s = time.monotonic() + REPEAT_PERIOD_S
+    while time.monotonic() < deadline_s:
         datagram = opened.recv(MAX_ANSWER_BYTES)
-        if datagram.startswith(ANSWER + nonce):
-            content = datagram[len(ANSWER) + NONCE_BYTES :].decode(errors="replace")
+        if datagram.startswith(ANSWER_HEADER + nonce):
+            content = datagram[len(ANSWER_HEADER) + NONCE_BYTES :].decode(errors="replace")
             robot, _, text = content.partition("\n")
             return StopAnswer(robot, text)
     return None
@@ -271,32 +288,36 @@ def _make_reply(opened: socket.socket, head: bytes, sender: object) -> Reply:
 
     def reply(text: str) -> None:
         try:
-            opened.sendto(ANSWER + head + text.encode()[: MAX_ANSWER_BYTES - 64], sender)  # pyright: ignore
+            opened.sendto(ANSWER_HEADER + head + text.encode()[: MAX_ANSWER_BYTES - 64], sender)  # pyright: ignore
         except OSError:  # the requester has ended; the robot is stopped all the same
             return
 
     return reply
 
 
-def _accept_requests_only(opened: socket.socket) -> None:
-    """Have the kernel drop datagrams that do not begin like a request, and truncate long ones.
+def _attach_request_filter(opened: socket.socket) -> None:
+    """Let the kernel drop datagrams that do not start like a request, and truncate long ones.
 
-    Classic BPF; offsets count from the UDP header. If the kernel refuses the filter, `serve_stops` still checks each.
+    The filter is a program in classic BPF, whose offsets count from the start of the UDP header. If the kernel refuses
+    the filter, nothing is lost: the thread that serves the requests checks each datagram, too.
+
+    Args:
+        opened: Bound UDP socket.
     """
-    first, second = struct.unpack(">II", REQUEST)
-    max_bytes = UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_REQUESTER_BYTES
-    program = [  # (code, jump if true, jump if false, constant)
-        (0x20, 0, 0, UDP_HEADER),  # load the word there
-        (0x15, 0, 3, first),  # continue if it is equal
-        (0x20, 0, 0, UDP_HEADER + 4),
-        (0x15, 0, 1, second),
+    first_word, second_word = struct.unpack(">II", REQUEST_HEADER)  # the 8 bytes of the header, as BPF compares them
+    max_bytes = UDP_HEADER_BYTES + len(REQUEST_HEADER) + NONCE_BYTES + MAX_REQUESTER_BYTES
+    instructions = [  # (code, jump if true, jump if false, constant)
+        (0x20, 0, 0, UDP_HEADER_BYTES),  # load the first word of the payload
+        (0x15, 0, 3, first_word),  # if it differs, jump to the last instruction
+        (0x20, 0, 0, UDP_HEADER_BYTES + 4),  # load the second word
+        (0x15, 0, 1, second_word),  # if it differs, jump to the last instruction
         (0x06, 0, 0, max_bytes),  # accept this many bytes
-        (0x06, 0, 0, 0),  # accept none
+        (0x06, 0, 0, 0),  # drop the datagram
     ]
-    code = b"".join(struct.pack("HBBI", *instruction) for instruction in program)
-    buffer = ctypes.create_string_buffer(code)  # must live until the kernel has copied it
-    program_header = struct.pack("HL", len(program), ctypes.addressof(buffer))
+    program = b"".join(struct.pack("HBBI", *instruction) for instruction in instructions)
+    buffer = ctypes.create_string_buffer(program)  # must live until the kernel has copied it
+    program_description = struct.pack("HL", len(instructions), ctypes.addressof(buffer))  # `struct sock_fprog`
     try:
-        opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program_header)
+        opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program_description)
     except OSError:
         return

@@ -37,9 +37,9 @@ class Publisher(Generic[MessageT]):
         """Wrap the two functions of a network's publisher.
 
         Args:
-            message: the type of its messages.
-            send: sends bytes as they are, bypassing any reroute.
-            has_subscriber: returns whether the key has a subscriber now.
+            message: The type of its messages.
+            send: Sends bytes as they are, bypassing any reroute.
+            has_subscriber: Returns whether the key has a subscriber now.
         """
         self.message = message
         self.send = send
@@ -50,8 +50,8 @@ class Publisher(Generic[MessageT]):
         """Send a message. Only a publisher that was declared lossless waits for slow subscribers.
 
         Args:
-            message: what to send.
-            encoded: its bytes, if the caller has encoded it already.
+            message: Message to send.
+            encoded: Bytes of the message. None if the publisher has to encode it.
         """
         if encoded is None:
             encoded = encode(message)
@@ -74,24 +74,24 @@ class Reader(Generic[MessageT]):
     def drain(self) -> list[MessageT]:
         """Return all samples since the last call, oldest first. Samples that cannot be decoded are dropped."""
         messages: list[MessageT] = []
-        for sample in self._take_samples():
+        for sample in self._pop_samples():
             message = self._decode(sample)
             if message is not None:
                 messages.append(message)
         return messages
 
-    def newest(self, is_acceptable: Callable[[MessageT], bool]) -> MessageT | None:
+    def pop_newest(self, is_acceptable: Callable[[MessageT], bool]) -> MessageT | None:
         """Return the newest sample since the last call for which `is_acceptable` is true.
 
         Earlier samples are dropped without decoding, so that a flood costs little.
         """
-        for sample in reversed(self._take_samples()):
+        for sample in reversed(self._pop_samples()):
             message = self._decode(sample)
             if message is not None and is_acceptable(message):
                 return message
         return None
 
-    def _take_samples(self) -> list[Any]:
+    def _pop_samples(self) -> list[Any]:
         samples: list[Any] = []
         while (sample := self.subscriber.try_recv()) is not None:
             samples.append(sample)
@@ -124,6 +124,6 @@ class Query:
         self._query.drop()
 
 
-def reader_depth(message: type[Message]) -> int:
+def get_reader_depth(message: type[Message]) -> int:
     """Return how many samples of a stream a reader keeps."""
     return IMAGES_DEPTH if message in IMAGES else READER_DEPTH

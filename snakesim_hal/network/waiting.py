@@ -6,18 +6,18 @@ from contextlib import ExitStack, contextmanager
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import Link, Session, open_session
 
-ATTEMPT_S = 2.0  # for one attempt to connect: `keeps_waiting` is called so often
+CONNECT_ATTEMPT_S = 2.0  # for one attempt to connect: `keeps_waiting` is called so often
 
 
 @contextmanager
 def open_session_when_ready(link: Link, keeps_waiting: Callable[[], bool]) -> Iterator[Session]:
-    """Connect as soon as there is a network, and close the session when the context ends.
+    """Connect as soon as the robot's network accepts connections, and close the session when the context ends.
 
-    Between two attempts the caller decides whether to go on, so that a process that waits can be ended in order.
+    After each failed attempt the caller decides whether to try again, so that a waiting process can be ended in order.
 
     Args:
-        link: where and how to connect.
-        keeps_waiting: is called after each attempt that failed; returns whether to try again.
+        link: Endpoint to connect to, and how.
+        keeps_waiting: Is called after each attempt that failed; returns whether to try again.
 
     Yields:
         The session.
@@ -28,7 +28,7 @@ def open_session_when_ready(link: Link, keeps_waiting: Callable[[], bool]) -> It
     with ExitStack() as stack:
         while True:
             try:
-                session = stack.enter_context(open_session(link, connect_timeout_s=ATTEMPT_S))
+                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_ATTEMPT_S))
                 break
             except NotConnectedError:
                 if not keeps_waiting():

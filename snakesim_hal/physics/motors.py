@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.physics.motor import roll_off
+from snakesim_hal.physics.motor import compute_torque_roll_off
 from snakesim_hal.wire.messages import Mode
 
 
@@ -29,103 +29,109 @@ class Motors:
         """Start with every motor passive and without torque.
 
         Args:
-            robot: gives limits, lags and inertias of the joints.
-            step_s: duration of a step of the physics model.
+            robot: Robot file with the limits, lags and inertias of the joints.
+            step_s: Duration of a step of the physics model.
         """
         joints = robot.joint_table
         count = len(joints)
 
         # Parameters, (n_joints,).
-        self.full_nm: Floats = np.array([joint.limits.torque_nm for joint in joints])
-        self._decay = np.array([_lag_decay(joint.motor.response_time_s, step_s) for joint in joints])
-        self._fading = self._fading_nm_s(robot, step_s)
+        self.full_torque_nm: Floats = np.array([joint.limits.torque_nm for joint in joints])
+        self._lag_decay = np.array([_compute_lag_decay(joint.motor.response_time_s, step_s) for joint in joints])
+        self._roll_off_slope = self._compute_roll_off_slopes(robot, step_s)  # N·m·s/rad
 
         # State.
         self.torque_nm: Floats = np.zeros(count)
-        self.heat: Floats = np.zeros(
-            count
-        )  # N²·m²; sum of torque squared over the steps since `pop_mean_square_torque`
-        self._steps = 0  # since `pop_mean_square_torque`
+        # Sum of torque squared over the steps since the last `pop_mean_square_torque`, N²·m², and their number.
+        self.torque_squared_sum: Floats = np.zeros(count)
+        self._step_count = 0
 
-        # Demand, by the latest setpoints: kp (position - angle) + kd (velocity - speed) + feedforward.
+        # Demanded torque, by the latest setpoints: kp (position - angle) + kd (velocity - speed) + feedforward.
         self._kp = np.zeros(count)  # N·m/rad
         self._kd = np.zeros(count)  # N·m·s/rad
         self._position = np.zeros(count)  # rad
         self._velocity = np.zeros(count)  # rad/s
         self._feedforward = np.zeros(count)  # N·m
 
-        # Limits of the demand: top - slope * speed, and its mirror image.
+        # Speed-dependent limit of the demand: stall torque - slope * speed, and its mirror image.
         self._slope = np.zeros(count)  # N·m·s/rad
-        self._top = np.full(count, np.inf)  # N·m
+        self._stall_torque = np.full(count, np.inf)  # N·m, extrapolated to speed 0: above full torque
 
         # Limits of the torque, N·m: of the setpoint, of derating, and the smaller of both.
-        self._setpoint_limit = self.full_nm.copy()
-        self._derated_limit = self.full_nm.copy()
+        self._setpoint_limit = self.full_torque_nm.copy()
+        self._derated_limit = self.full_torque_nm.copy()
         self._limit = self._setpoint_limit.copy()
 
-        # Buffers, so that a step allocates nothing. `derated` reads the demand of the last step.
+        # Buffers, so that a step allocates nothing. `find_derated` reads the demand of the last step.
         self._demand = np.zeros(count)
-        self._cap = np.zeros(count)
-        self._spare = np.zeros(count)
+        self._max_torque_buffer = np.zeros(count)
+        self._scratch_buffer = np.zeros(count)
 
-    def _fading_nm_s(self, robot: RobotFile, step_s: float) -> Floats:
+    def _compute_roll_off_slopes(self, robot: RobotFile, step_s: float) -> Floats:
         """Return how much torque each motor loses per rad/s near its speed limit, (n_joints,), N·m·s/rad."""
         joints = robot.joint_table
         speed_limits_rad_s = np.array([joint.limits.speed_rad_s for joint in joints])
-        steepness = np.array([roll_off(joint, robot.module, step_s) for joint in joints])
-        return steepness * self.full_nm / speed_limits_rad_s
+        steepness = np.array([compute_torque_roll_off(joint, robot.module, step_s) for joint in joints])
+        return steepness * self.full_torque_nm / speed_limits_rad_s
 
     def set_demand(
-        self, i: int, mode: Mode, target: float, limit_nm: float, gain: float, damping: float, speed: float
+        self,
+        joint_index: int,
+        mode: Mode,
+        target: float,
+        torque_limit_nm: float,
+        stiffness: float,
+        damping: float,
+        speed_limit_rad_s: float,
     ) -> None:
-        """Set the demand of one motor.
+        """Set mode, target, gains, torque limit and speed limit of one motor.
 
         Args:
-            i: index of the joint from the tail.
-            mode: of the drive.
-            target: rad, rad/s or N·m, depending on the mode; ignored in passive mode.
-            limit_nm: torque limit of the setpoint.
-            gain: kp of position mode, N·m/rad.
-            damping: kd of position and velocity mode, N·m·s/rad.
-            speed: speed limit, rad/s.
+            joint_index: Index of the joint, from 0 at the tail.
+            mode: Control mode of the drive.
+            target: Target in rad, rad/s or N·m, depending on the mode. Ignored in passive mode.
+            torque_limit_nm: Torque limit of the setpoint. Full torque limits it further.
+            stiffness: Proportional gain kp of position mode, N·m/rad.
+            damping: Derivative gain kd of position mode, and gain of velocity mode, N·m·s/rad.
+            speed_limit_rad_s: Speed limit. Near it, the torque that accelerates the motor falls to 0.
         """
-        self._kp[i] = 0.0
-        self._kd[i] = 0.0
-        self._position[i] = 0.0
-        self._velocity[i] = 0.0
-        self._feedforward[i] = 0.0
+        self._kp[joint_index] = 0.0
+        self._kd[joint_index] = 0.0
+        self._position[joint_index] = 0.0
+        self._velocity[joint_index] = 0.0
+        self._feedforward[joint_index] = 0.0
         match mode:
             case Mode.POSITION:
-                self._kp[i] = gain
-                self._kd[i] = damping
-                self._position[i] = target
+                self._kp[joint_index] = stiffness
+                self._kd[joint_index] = damping
+                self._position[joint_index] = target
             case Mode.VELOCITY:
-                self._kd[i] = damping
-                self._velocity[i] = target
+                self._kd[joint_index] = damping
+                self._velocity[joint_index] = target
             case Mode.TORQUE:
-                self._feedforward[i] = target
+                self._feedforward[joint_index] = target
             case Mode.PASSIVE:
                 pass
-        if mode == Mode.PASSIVE:
-            self._slope[i] = 0.0
-            self._top[i] = math.inf
+        if mode == Mode.PASSIVE:  # without a limit: the demand of a passive motor is 0
+            self._slope[joint_index] = 0.0
+            self._stall_torque[joint_index] = math.inf
         else:
-            self._slope[i] = self._fading[i]
-            self._top[i] = self._fading[i] * speed
-        self._setpoint_limit[i] = min(limit_nm, self.full_nm[i])
-        self._limit[i] = min(self._setpoint_limit[i], self._derated_limit[i])
+            self._slope[joint_index] = self._roll_off_slope[joint_index]
+            self._stall_torque[joint_index] = self._roll_off_slope[joint_index] * speed_limit_rad_s
+        self._setpoint_limit[joint_index] = min(torque_limit_nm, self.full_torque_nm[joint_index])
+        self._limit[joint_index] = min(self._setpoint_limit[joint_index], self._derated_limit[joint_index])
 
-    def derate(self, remaining_fraction: Floats) -> None:
+    def apply_derating(self, remaining_fraction: Floats) -> None:
         """Limit every torque to a fraction of full torque, (n_joints,), from 0 to 1; lower demands are not reduced."""
-        np.multiply(self.full_nm, remaining_fraction, out=self._derated_limit)
+        np.multiply(self.full_torque_nm, remaining_fraction, out=self._derated_limit)
         np.minimum(self._setpoint_limit, self._derated_limit, out=self._limit)
 
-    def derated(self) -> NDArray[np.bool_]:
+    def find_derated(self) -> NDArray[np.bool_]:
         """Return whether derating limits each torque below its demand, (n_joints,)."""
-        wanted_nm = np.minimum(np.abs(self._demand), self._setpoint_limit)
-        return wanted_nm > self._limit
+        requested_nm = np.minimum(np.abs(self._demand), self._setpoint_limit)
+        return requested_nm > self._limit
 
-    def step(self, angle_rad: Floats, speed_rad_s: Floats) -> Floats:
+    def compute_torques(self, angle_rad: Floats, speed_rad_s: Floats) -> Floats:
         """Return the torques for the next step of the physics model, (n_joints,), N·m.
 
         The result is always the same array, and no step allocates one.
@@ -135,53 +141,53 @@ class Motors:
             speed_rad_s: joint velocities, (n_joints,).
         """
         demand = self._demand
-        cap = self._cap
-        spare = self._spare
+        max_torque = self._max_torque_buffer
+        scratch = self._scratch_buffer
         torque = self.torque_nm
 
         # demand = kp (position - angle) + kd (velocity - speed) + feedforward
         np.subtract(self._position, angle_rad, out=demand)
         demand *= self._kp
-        np.subtract(self._velocity, speed_rad_s, out=spare)
-        spare *= self._kd
-        demand += spare
+        np.subtract(self._velocity, speed_rad_s, out=scratch)
+        scratch *= self._kd
+        demand += scratch
         demand += self._feedforward
 
-        # -(top + slope * speed) <= demand <= top - slope * speed
-        np.multiply(self._slope, speed_rad_s, out=spare)
-        np.subtract(self._top, spare, out=cap)
-        np.minimum(demand, cap, out=demand)
-        spare += self._top
-        np.negative(spare, out=spare)
-        np.maximum(demand, spare, out=demand)
+        # -(stall torque + slope * speed) <= demand <= stall torque - slope * speed
+        np.multiply(self._slope, speed_rad_s, out=scratch)
+        np.subtract(self._stall_torque, scratch, out=max_torque)
+        np.minimum(demand, max_torque, out=demand)
+        scratch += self._stall_torque
+        np.negative(scratch, out=scratch)
+        np.maximum(demand, scratch, out=demand)
 
         # A lowered limit takes effect no faster than the motor can follow.
-        np.abs(torque, out=cap)
-        cap *= self._decay
-        np.maximum(cap, self._limit, out=cap)
+        np.abs(torque, out=max_torque)
+        max_torque *= self._lag_decay
+        np.maximum(max_torque, self._limit, out=max_torque)
 
         # torque = demand + decay * (torque - demand), within the limit
         torque -= demand
-        torque *= self._decay
+        torque *= self._lag_decay
         torque += demand
-        np.minimum(torque, cap, out=torque)
-        np.negative(cap, out=cap)
-        np.maximum(torque, cap, out=torque)
+        np.minimum(torque, max_torque, out=torque)
+        np.negative(max_torque, out=max_torque)
+        np.maximum(torque, max_torque, out=torque)
 
-        np.multiply(torque, torque, out=spare)
-        self.heat += spare
-        self._steps += 1
+        np.multiply(torque, torque, out=scratch)
+        self.torque_squared_sum += scratch
+        self._step_count += 1
         return torque
 
     def pop_mean_square_torque(self) -> Floats:
         """Return the mean square of each torque since the last call, N²·m², (n_joints,), and start a new mean."""
-        mean = self.heat / max(self._steps, 1)
-        self.heat[:] = 0.0
-        self._steps = 0
+        mean = self.torque_squared_sum / max(self._step_count, 1)
+        self.torque_squared_sum[:] = 0.0
+        self._step_count = 0
         return mean
 
 
-def _lag_decay(lag_s: float, step_s: float) -> float:
+def _compute_lag_decay(lag_s: float, step_s: float) -> float:
     """Return the fraction of a deviation from the demand that is left after a step; 0 without a lag."""
     if lag_s > 0:
         return math.exp(-step_s / lag_s)

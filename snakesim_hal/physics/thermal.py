@@ -31,13 +31,13 @@ class HeatLimits:
     derate_from_c: float
     stop_at_c: float
 
-    def remaining_fraction(self, winding_c: float) -> float:
-        """Return the fraction of the rated torque that a motor may use at a winding temperature.
+    def compute_remaining_fraction(self, winding_temperature_c: float) -> float:
+        """Return the fraction of the full torque that a motor may use at a winding temperature.
 
-        It is 1 up to `derate_from_c`, `MIN_SHARE` from `stop_at_c` on, and falls linearly between the two.
+        It is 1 up to `derate_from_c`, `MIN_TORQUE_FRACTION` from `stop_at_c` on, and falls linearly in between.
         """
-        over = (winding_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
-        return 1.0 - (1.0 - MIN_TORQUE_FRACTION) * min(max(over, 0.0), 1.0)
+        derating_progress = (winding_temperature_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
+        return 1.0 - (1.0 - MIN_TORQUE_FRACTION) * min(max(derating_progress, 0.0), 1.0)
 
 
 class Thermal:
@@ -45,84 +45,89 @@ class Thermal:
 
     def __init__(self, joints: Sequence[Joint]) -> None:
         """Start with every winding at the ambient temperature."""
-        # Limits, (n_joints,).
+        # Limits of each winding, (n_joints,).
         self.limits = [HeatLimits(joint.limits.derate_from_c, joint.limits.stop_at_c) for joint in joints]
         self.stop_at_c: Floats = np.array([limits.stop_at_c for limits in self.limits])
         self._derate_from_c = np.array([limits.derate_from_c for limits in self.limits])
 
         # Parameters, (n_joints,).
         self._ambient_c = np.array([joint.heat.ambient_c for joint in joints])
-        self._rated_nm = np.array([joint.rated_nm for joint in joints])
-        self._rise = np.array([joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints])  # K/(N·m)²
-        self._minus_time_s = np.array([-joint.heat.time_constant_s for joint in joints])
-        self._loss_w = np.array([joint.heat.loss_at_rated_w for joint in joints])
+        self._rated_torque_nm = np.array([joint.rated_nm for joint in joints])
+        self._rise_per_torque_squared = np.array(
+            [joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints]
+        )  # K/(N·m)²
+        self._negative_time_constant_s = np.array([-joint.heat.time_constant_s for joint in joints])
+        self._loss_at_rated_w = np.array([joint.heat.loss_at_rated_w for joint in joints])
         self._board_fraction = np.array([joint.heat.board_fraction for joint in joints])
 
-        # The fraction of the way to its settled temperature that a winding covers in a period; the same every time.
-        self._settling_s = 0.0
-        self._settling_fraction: Floats = np.zeros(len(joints))
+        # Fraction of its distance to the final temperature by which a winding changes in a time step. It is cached,
+        # because all time steps are equal.
+        self._cached_duration_s = 0.0
+        self._cached_settling_fraction: Floats = np.zeros(len(joints))
 
         # State.
-        self.winding_c: Floats = self._ambient_c.copy()
-        self._held = np.zeros(len(joints), dtype=np.bool_)  # an injected fault keeps the temperature
-        self._holds_any = False
-        self._derates = False  # whether any motor was derated when `remaining_fraction` was last called
+        self.winding_temperature_c: Floats = self._ambient_c.copy()
+        self._is_kept_hot = np.zeros(len(joints), dtype=np.bool_)  # by an injected fault
+        self._is_any_kept_hot = False
+        self._is_any_derated = False  # when `compute_remaining_fractions` was last called
 
-    def pass_time(self, seconds: float, torque_squared: Floats) -> None:
-        """Heat and cool the windings for a time. Exact for a constant torque.
+    def advance_temperatures(self, duration_s: float, torque_squared: Floats) -> None:
+        """Update the winding temperatures after a time under load. The result is exact for a constant torque.
 
-        The temperature changes by (settled - temperature) * (1 - exp(-seconds / time constant)).
+        A temperature changes by (final temperature - temperature) * (1 - exp(-duration / time constant)).
 
         Args:
-            seconds: how long.
-            torque_squared: mean square of each torque in this time, N²·m², (n_joints,).
+            duration_s: Time that has elapsed since the last call.
+            torque_squared: Mean square of each torque in this time, N²·m², (n_joints,).
         """
-        if seconds != self._settling_s:
-            self._settling_s = seconds
-            self._settling_fraction = -np.expm1(seconds / self._minus_time_s)
-        settled_c = self._ambient_c + self._rise * torque_squared
-        self.winding_c += (settled_c - self.winding_c) * self._settling_fraction
-        if self._holds_any:
-            np.copyto(self.winding_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._held)
+        if duration_s != self._cached_duration_s:
+            self._cached_duration_s = duration_s
+            self._cached_settling_fraction = -np.expm1(duration_s / self._negative_time_constant_s)
+        final_temperature_c = self._ambient_c + self._rise_per_torque_squared * torque_squared
+        self.winding_temperature_c += (
+            final_temperature_c - self.winding_temperature_c
+        ) * self._cached_settling_fraction
+        if self._is_any_kept_hot:
+            np.copyto(self.winding_temperature_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._is_kept_hot)
 
-    def inject(self, motor: int, *, heat: bool, hold: bool) -> None:
-        """Change the temperature of one winding as an injected fault.
+    def inject_heat(self, motor: int, *, heat: bool, hold: bool) -> None:
+        """Inject an overheating fault into one winding, or remove it.
 
         Args:
-            motor: index of the joint from the tail.
-            heat: whether to heat the winding above its `stop_at_c` now.
-            hold: whether to keep that temperature, until a call with False.
+            motor: Index of the joint, from 0 at the tail.
+            heat: If True, the winding is heated above its `stop_at_c` now.
+            hold: If True, it keeps that temperature until a call with False. If False, it cools down.
         """
         if heat:
-            self.winding_c[motor] = self.stop_at_c[motor] + INJECTED_ABOVE_STOP_K
-        self._held[motor] = hold
-        self._holds_any = bool(self._held.any())
+            self.winding_temperature_c[motor] = self.stop_at_c[motor] + INJECTED_ABOVE_STOP_K
+        self._is_kept_hot[motor] = hold
+        self._is_any_kept_hot = bool(self._is_kept_hot.any())
 
-    def remaining_fraction(self) -> Floats | None:
+    def compute_remaining_fractions(self) -> Floats | None:
         """Return the fraction of its torque that each motor may use, (n_joints,), if it may have changed.
 
         Returns:
             None while all windings are cool. When the last one has cooled down, one more array, which is all 1.
         """
-        was_derated = self._derates
-        self._derates = bool((self.winding_c > self._derate_from_c).any())
-        if not (self._derates or was_derated):
+        was_derated = self._is_any_derated
+        self._is_any_derated = bool((self.winding_temperature_c > self._derate_from_c).any())
+        if not (self._is_any_derated or was_derated):
             return None
         fractions = [
-            limits.remaining_fraction(winding_c)
-            for limits, winding_c in zip(self.limits, self.winding_c.tolist(), strict=True)
+            limits.compute_remaining_fraction(winding_c)
+            for limits, winding_c in zip(self.limits, self.winding_temperature_c.tolist(), strict=True)
         ]
         return np.array(fractions)
 
-    def board_c(self) -> Floats:
+    def compute_board_temperatures_c(self) -> Floats:
         """Return the temperatures of the electronics beside the windings, (n_joints,)."""
-        return self._ambient_c + self._board_fraction * (self.winding_c - self._ambient_c)
+        return self._ambient_c + self._board_fraction * (self.winding_temperature_c - self._ambient_c)
 
-    def power_w(self, torque_nm: Floats, speed_rad_s: Floats) -> Floats:
+    def compute_power_w(self, torque_nm: Floats, speed_rad_s: Floats) -> Floats:
         """Return the power that each motor draws, (n_joints,): mechanical power and copper losses.
 
         The current that a module draws at rest, `Supply.idle_a`, is not included.
         """
         mechanical_w = torque_nm * speed_rad_s
-        copper_loss_w = self._loss_w * (torque_nm / self._rated_nm) ** 2
+        copper_loss_w = self._loss_at_rated_w * (torque_nm / self._rated_torque_nm) ** 2
         return mechanical_w + copper_loss_w

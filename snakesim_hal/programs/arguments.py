@@ -13,40 +13,44 @@ from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_endpoint, check_namespace
 
 if TYPE_CHECKING:
-    from snakesim_hal.model.scenario import Loaded, RunConfig
+    from snakesim_hal.model.scenario import LoadedScenario, RunConfig
     from snakesim_hal.network.session import Link
     from snakesim_hal.network.session_file import SessionFile
 
-SESSION = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
+SESSION_VARIABLE = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
 
 
-def number_type(least: float, most: float, unit: str = "") -> Callable[[str], float]:
-    """Return a type for argparse: a number within bounds.
+def make_number_parser(min_value: float, max_value: float, unit: str = "") -> Callable[[str], float]:
+    """Make a function for the `type` of an argparse option, which parses a number within bounds.
 
     Args:
-        least: minimum of the number; if it is an int, the number has to be a whole one.
-        most: maximum of the number.
-        unit: unit of the number, for the error message.
-    """
-    must_be_whole = isinstance(least, int)
+        min_value: Minimum of the number. If it is an int, the number must be a whole number.
+        max_value: Maximum of the number.
+        unit: Unit of the number, for the error message.
 
-    def parse(text: str) -> float:
+    Returns:
+        A function that converts a text to a number. It raises `argparse.ArgumentTypeError` if the text is not a number
+        within the bounds.
+    """
+    must_be_whole = isinstance(min_value, int)
+
+    def parse_number(text: str) -> float:
         try:
             value = int(text) if must_be_whole else float(text)
         except ValueError:
             value = float("nan")  # every comparison with NaN is false, so that it is rejected below
-        if not least <= value <= most:
+        if not min_value <= value <= max_value:
             kind = "a whole number" if must_be_whole else "a number"
             suffix = f" {unit}" if unit else ""
-            bounds = f"from {least:.12g} to {most:.12g}{suffix}"
+            bounds = f"from {min_value:.12g} to {max_value:.12g}{suffix}"
             raise argparse.ArgumentTypeError(f"{shorten(text, 40)!r}: give {kind} {bounds}")
         return value
 
-    return parse
+    return parse_number
 
 
-def add_scenario(parser: argparse.ArgumentParser) -> None:
-    """Add the scenario, and flags that change it."""
+def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the argument SCENARIO, and the options that change values of the scenario."""
     add_scenario_name(parser)
     parser.add_argument("--backend", metavar="NAME", help="backend, such as sim, can or odrive")
     parser.add_argument("--controller", metavar="NAME", help="installed controller, or ./file.py:Class")
@@ -66,7 +70,7 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def add_scenario_name(parser: argparse.ArgumentParser) -> None:
-    """Add the scenario alone."""
+    """Add the argument SCENARIO, without options that change the scenario."""
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
@@ -75,19 +79,19 @@ def add_scenario_name(parser: argparse.ArgumentParser) -> None:
 
 
 def add_set(parser: argparse.ArgumentParser, about: str = "change any value of the configuration") -> None:
-    """Add `--set`. about: for the help."""
+    """Add the option --set, with a text for the help."""
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about} (may be repeated)")
 
 
 def add_seed(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
-    """Add `--seed`, which fixes every random number. about: more text for the help."""
+    """Add the option --seed, which fixes every random number, with more text for the help."""
     parser.add_argument(
         "--seed", type=int, default=default, metavar="SEED", help=f"seed of all random numbers ({about})"
     )
 
 
 def add_out(parser: argparse.ArgumentParser, about: str, *, required: bool = False) -> None:
-    """Add `--out`, the file or folder that a command writes. about: for the help."""
+    """Add the option --out, the file or folder that a command writes, with a text for the help."""
     parser.add_argument("--out", type=Path, required=required, metavar="PATH", help=about)
 
 
@@ -97,18 +101,22 @@ def add_duration(
     """Add `--duration`, in seconds.
 
     Args:
-        parser: of a command.
-        about: for the help.
-        parse: reads and checks the number.
-        default: in seconds.
+        parser: Parser of a command.
+        about: Text for the help.
+        parse: Function that converts the text to a number, and checks the number.
+        default: Default in seconds. None leaves the choice to the command.
     """
     parser.add_argument("--duration", type=parse, default=default, metavar="S", help=about)
 
 
 def add_fields(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
-    """Add `--fields`, the number of random fields. about: what each number is for, for the help."""
+    """Add the option --fields, the number of random fields, with more text for the help."""
     parser.add_argument(
-        "--fields", type=number_type(1, 100_000), default=default, metavar="N", help=f"number of random fields {about}"
+        "--fields",
+        type=make_number_parser(1, 100_000),
+        default=default,
+        metavar="N",
+        help=f"number of random fields {about}",
     )
 
 
@@ -118,54 +126,59 @@ def add_resume(parser: argparse.ArgumentParser) -> None:
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
-    """Add where runs are computed."""
+    """Add the options --cluster and --workers, which select the processors for runs."""
     parser.add_argument(
         "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
     )
     parser.add_argument(
-        "--workers", type=number_type(1, 100_000), metavar="N", help="processes on this computer (default: one a core)"
+        "--workers",
+        type=make_number_parser(1, 100_000),
+        metavar="N",
+        help="processes on this computer (default: one a core)",
     )
 
 
 def add_task(parser: argparse.ArgumentParser, about: str) -> None:
-    """Add `--task`, which describes a demonstration. about: for the help."""
+    """Add the option --task, which describes a demonstration, with a text for the help."""
     parser.add_argument("--task", metavar="TEXT", help=about)
 
 
-def load_scenario(arguments: argparse.Namespace) -> "Loaded":
-    """Load a scenario with the overrides of the command line: --set, --unset, and the flags with a name of their own.
+def load_scenario_from_arguments(arguments: argparse.Namespace) -> "LoadedScenario":
+    """Load a scenario with the overrides of the command line: --set, --unset, and options such as --backend.
 
     Args:
-        arguments: parsed arguments of a parser to which `add_scenario` has added the scenario.
+        arguments: Parsed command line with the arguments of `add_scenario_arguments`. The options --until-goal and
+            --fault count too if the command has them.
 
     Raises:
-        ConfigError: a file or an override is not valid.
+        ConfigError: A file or an override is not valid.
     """
-    from snakesim_hal.model.scenario import Override, load, parse_set
+    from snakesim_hal.model.scenario import Override, load_scenario, parse_set_option
 
-    flags = {
+    # Options that set one key of the scenario.
+    value_by_key = {
         "backend": arguments.backend,
         "controller": arguments.controller,
         "clock_mode": arguments.clock_mode,
         "duration_s": arguments.duration,
         "seed": arguments.seed,
     }
-    overrides = [parse_set(text) for text in arguments.set]
+    overrides = [parse_set_option(text) for text in arguments.set]
     overrides += [Override(key, None, f"--unset {shorten(key)}") for key in arguments.unset]
     if getattr(arguments, "until_goal", False):
         overrides.append(Override("mission.until_goal", True, "--until-goal"))
-    for key, value in flags.items():
+    for key, value in value_by_key.items():
         if value is not None:
             flag = f"--{key.removesuffix('_s').replace('_', '-')} {shorten(str(value))}"
             overrides.append(Override(key, value, flag))
     faults = getattr(arguments, "fault", None)
     if faults:
         overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
-    return load(arguments.scenario, overrides)
+    return load_scenario(arguments.scenario, overrides)
 
 
-def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION})") -> None:
-    """Add the options that select the network. session: text about the default of `--session`, for the help."""
+def add_network_arguments(parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION_VARIABLE})") -> None:
+    """Add the options that select the network, with a text about the default of --session for the help."""
     parser.add_argument(
         "--endpoint", metavar="ENDPOINT", help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})"
     )
@@ -212,15 +225,17 @@ def add_unchecked(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_host(parser: argparse.ArgumentParser) -> None:
+def add_host_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a HAL host.
 
-    Three options are hidden, because only a run uses them for its host. --memory: path of an in-memory file for the
-    host's statistics; --parent-socket: inherited socket to the parent process; --stop-port: inherited UDP socket for
-    emergency stops.
+    Three options are hidden, because only `snakesim run` passes them to its host:
+
+    --memory         path of an in-memory file for the host's statistics
+    --parent-socket  file descriptor of an inherited socket to the parent process
+    --stop-port      file descriptor of an inherited UDP socket for emergency stops
     """
-    add_scenario(parser)
-    add_network(parser, "")
+    add_scenario_arguments(parser)
+    add_network_arguments(parser, "")
     add_insecure(parser)
     add_out(parser, "folder for the record: black box, description, statistics")
     parser.add_argument(
@@ -232,11 +247,11 @@ def add_host(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
 
 
-def add_service(parser: argparse.ArgumentParser) -> None:
+def add_service_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a service."""
     parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
-    add_scenario(parser)
-    add_network(parser, "")
+    add_scenario_arguments(parser)
+    add_network_arguments(parser, "")
     add_parent(parser)
 
 
@@ -258,19 +273,20 @@ def read_session_option(arguments: argparse.Namespace, *, or_environment: bool =
     """Read the Zenoh session file that the command line or the environment names.
 
     Args:
-        arguments: parsed network options, such as --session, --endpoint and --router.
-        or_environment: whether SNAKESIM_SESSION counts too, if the arguments name no endpoint. This is for an
-            operator's tools: a process that moves or emulates a robot connects only as its command line specifies.
+        arguments: Parsed network options, such as --session, --endpoint and --router.
+        or_environment: Whether the environment variable SNAKESIM_SESSION is used if the arguments name no endpoint.
+            This is for an operator's tools: a process that moves or emulates a robot connects only as its command line
+            specifies.
 
     Returns:
         The checked session file, or None if none is named.
 
     Raises:
-        ConfigError: the file cannot be read, or is not valid.
+        ConfigError: The file cannot be read, or is not valid.
     """
     path: Path | None = arguments.session
     if path is None and or_environment and arguments.endpoint is None and arguments.router is None:
-        from_environment = os.environ.get(SESSION)
+        from_environment = os.environ.get(SESSION_VARIABLE)
         if from_environment:
             path = Path(from_environment)
     if not path:
@@ -280,30 +296,31 @@ def read_session_option(arguments: argparse.Namespace, *, or_environment: bool =
     return read_session(path.expanduser())
 
 
-def create_link(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool = False) -> "Link":
-    """Return endpoint, namespace and options with which a process of a robot joins its network.
+def create_link(arguments: argparse.Namespace, config: "RunConfig", *, is_host: bool = False) -> "Link":
+    """Create the description of how a process of a robot connects to its network.
 
     Args:
-        arguments: parsed network options, such as --endpoint, --router and --namespace.
-        config: configuration of the run.
-        hosts: whether the process is the HAL host. Without a router it listens, and the others connect to it.
+        arguments: Parsed network options, such as --endpoint, --router and --namespace.
+        config: Configuration of the run, whose robot gives the default namespace and the largest image.
+        is_host: Whether the process is the HAL host. Without a router, the host listens, and all other processes
+            connect to it.
 
     Raises:
-        ConfigError: the options contradict one another, or the session file is not valid.
+        ConfigError: The options contradict one another, or the session file is not valid.
     """
     from snakesim_hal.network.session import Link
     from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 
     check_network(arguments)
-    session = read_session_option(arguments)
+    session_file = read_session_option(arguments)
     max_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.max_image_bytes)
-    if session is not None:
-        namespace = session.namespace_for(arguments.namespace) or config.robot.name
-        return Link(session.endpoints[0], namespace, max_bytes=max_bytes, session=session)
+    if session_file is not None:
+        namespace = session_file.resolve_namespace(arguments.namespace) or config.robot.name
+        return Link(session_file.endpoints[0], namespace, max_bytes=max_bytes, session=session_file)
     return Link(
         endpoint=arguments.router or arguments.endpoint or DEFAULT_ENDPOINT,
         namespace=arguments.namespace or config.robot.name,
-        listen=hosts and arguments.router is None,
+        listen=is_host and arguments.router is None,
         insecure=getattr(arguments, "insecure", False),
         max_bytes=max_bytes,
     )

@@ -16,8 +16,8 @@ from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import BackendError, RefusedError, SnakesimError
 from snakesim_hal.base.process import (
     HOST_PRIORITY,
+    call_on_stop_signals,
     enter_realtime,
-    on_stop_signal,
     restart_process,
     tune_garbage_collector,
 )
@@ -27,71 +27,86 @@ from snakesim_hal.host.cable_file import open_cable_file
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.host.latch import EstopLatch
-from snakesim_hal.model.checked import CHECK, why_unchecked
-from snakesim_hal.model.fault_plan import check_without_run
+from snakesim_hal.model.checked import START_CHECK_CONTROLLER, find_unchecked_reason
+from snakesim_hal.model.fault_plan import validate_faults_without_supervisor
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
-from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
+from snakesim_hal.network.local_registry import LocalRobot, get_robot_state_folder, register_robot
 from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
-from snakesim_hal.programs.arguments import add_host
-from snakesim_hal.programs.preflight import backend_settings, check_backend, find_backend
-from snakesim_hal.programs.service_program import ProcessOptions, connect_process, process_options
+from snakesim_hal.network.stop_port import find_stop_address, open_stop_port, start_stop_server
+from snakesim_hal.programs.arguments import add_host_arguments
+from snakesim_hal.programs.preflight import decode_backend_settings, load_backend_class, validate_backend_config
+from snakesim_hal.programs.service_program import ProcessOptions, connect_process, read_process_options
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.wire import keys
 
-GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
+TOKEN_EXPIRY_TIMEOUT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise."""
+    """Run the program. Return the exit code: 0 after all ticks without a fault, 2 for wrong input, else 1."""
     parser = argparse.ArgumentParser(
         prog="snakesim start host", description="Run the HAL host of a robot, with its backend."
     )
-    add_host(parser)
+    add_host_arguments(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim start host", lambda: host(process_options(arguments, hosts=True)))
+    return run_tool("snakesim start host", lambda: run_host_program(read_process_options(arguments, hosts=True)))
 
 
-def host(options: ProcessOptions, on_network: Callable[[], None] = lambda: None) -> int:
-    """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError.
+def run_host_program(options: ProcessOptions, on_network: Callable[[], None] = lambda: None) -> int:
+    """Run a host until it ends, and return the exit code of the process.
 
-    A simulator that is reset becomes another host, in the same process.
+    When the simulator is reset, the process restarts as another host.
 
     Args:
-        options: of the process.
-        on_network: is called once the host can be reached.
+        options: What the process was started with.
+        on_network: Function that is called once the host can be reached.
+
+    Returns:
+        0 if all ticks were done without a fault, 1 otherwise.
+
+    Raises:
+        SnakesimError: The host cannot start or continue.
     """
     if options.arguments.parent_socket is None:
-        check_without_run(options.config, options.loaded.table)
-    host = _run(options, check_backend(options.config, options.loaded.table), on_network)
-    if host.ended == "reset":
+        validate_faults_without_supervisor(options.config, options.loaded.table)
+    host = _run_until_end(options, validate_backend_config(options.config, options.loaded.table), on_network)
+    if host.ending_status == "reset":
         restart_process()
-    stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.stored)
-    return 1 if stopped or host.ended != "complete" else 0
+    has_stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.faults)
+    return 1 if has_stopped or host.ending_status != "complete" else 0
 
 
-def _run(options: ProcessOptions, config: RunConfig, on_network: Callable[[], None]) -> Host:
-    """Open stop port, backend and network, run the host to its end, and close everything."""
+def _run_until_end(options: ProcessOptions, config: RunConfig, on_network: Callable[[], None]) -> Host:
+    """Open stop port, backend and network, run the host until it ends, and close everything.
+
+    Args:
+        options: What the process was started with.
+        config: Checked configuration of the run.
+        on_network: Function that is called once the host can be reached.
+
+    Returns:
+        The host that has ended.
+    """
     arguments = options.arguments
     with contextlib.ExitStack() as opened:
         stop_port = _open_stop_port(options, config, opened)
-        backend = open_backend(find_backend(config.backend), config)
+        backend = open_backend(load_backend_class(config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
-        network = open_session(options.link) if options.link.listen else connect_process(options.link, "host")
-        session = opened.enter_context(network)
+        connection = open_session(options.link) if options.link.listen else connect_process(options.link, "host")
+        session = opened.enter_context(connection)
         refuse_second_host(session, options.link)
         on_network()
         host = _create_host(arguments, config, backend, session, realtime_warnings)
-        serve_stops(stop_port, options.link.namespace or host.description.robot, host.request_estop)
-        on_stop_signal(host.stop)
+        start_stop_server(stop_port, options.link.namespace or host.description.robot, host.request_estop)
+        call_on_stop_signals(host.request_stop)
         tune_garbage_collector()
-        memory = arguments.memory and os.open(arguments.memory, os.O_WRONLY)
+        memory_fd = arguments.memory and os.open(arguments.memory, os.O_WRONLY)
         with HostRecordWriter(
-            host.black_box, host.description, partial(create_host_record, host), arguments.out, memory
+            host.black_box, host.description, partial(create_host_record, host), arguments.out, memory_fd
         ):
             if config.in_host_services:  # imported only for runs with such services
                 from snakesim_hal.programs.in_host_service import InHostServices
@@ -102,14 +117,14 @@ def _run(options: ProcessOptions, config: RunConfig, on_network: Callable[[], No
 
 
 def _open_stop_port(options: ProcessOptions, config: RunConfig, opened: contextlib.ExitStack) -> socket.socket:
-    """Use the stop port that the run has handed to this host, or open one and register the robot on this computer."""
+    """Use the stop port that the parent process has passed on, or open one and register the robot on this computer."""
     inherited = options.arguments.stop_port
     if inherited is not None:
         stop_port = socket.socket(fileno=os.dup(inherited))  # the original stays open for another host
     else:
-        stop_port = open_stop_port(*stop_address(options.link.endpoint, listens=options.link.listen))
-        robot = LocalRobot.describe(options.link, config.robot.name, config.backend, stop_port)
-        opened.enter_context(registered(robot))
+        stop_port = open_stop_port(*find_stop_address(options.link.endpoint, listens=options.link.listen))
+        robot = LocalRobot.from_connection(options.link, config.robot.name, config.backend, stop_port)
+        opened.enter_context(register_robot(robot))
     opened.callback(stop_port.close)
     return stop_port
 
@@ -124,52 +139,52 @@ def _create_host(
     """Create the HAL host for a backend, with the emergency-stop latch and the cable file of this robot.
 
     Args:
-        arguments: parsed arguments of the host program.
-        config: configuration of the run.
-        backend: the open backend.
-        session: connection to the network.
-        realtime_warnings: real-time measures that the system refused, as short reasons.
+        arguments: Parsed arguments of the host program.
+        config: Configuration of the run.
+        backend: Open backend.
+        session: Connection to the network.
+        realtime_warnings: Short texts about real-time measures that the operating system refused.
     """
-    described = backend.describe()
-    print_stderr(f"host: {describe_what_moves(described)}")  # for a lab's journal too
-    unchecked = ""
-    if config.controller != CHECK:
-        unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
-    folder = robot_folder(described.robot, described.backend, described.hardware)
+    description = backend.describe()
+    print_stderr(f"host: {describe_what_moves(description)}")  # for a lab's journal too
+    unchecked_reason = ""
+    if config.controller != START_CHECK_CONTROLLER:
+        unchecked_reason = find_unchecked_reason(config.robot.checked, config.robot.joint_table, description)
+    folder = get_robot_state_folder(description.robot, description.backend, description.hardware)
     backend_with_faults, faults = create_host_faults(config, backend, session)
     options = HostOptions(
         # The end of the run.
         max_ticks=round(config.duration_s * config.rate_hz) if arguments.end_after_duration else None,
         end_after_fault_s=arguments.end_after_fault,
-        stay=arguments.end_after_fault is None,
+        stays_after_run=arguments.end_after_fault is None,
         # What connects the host with its surroundings.
         latch=EstopLatch(folder),
-        starter=HostEnd.from_descriptor(arguments.parent_socket),
+        starter_channel=HostEnd.from_descriptor(arguments.parent_socket),
         realtime_warnings=realtime_warnings,
         # The robot.
         faults=faults,
-        unchecked=unchecked,
-        cables=open_cable_file(folder, config.robot.joint_table, described),
+        unchecked_reason=unchecked_reason,
+        cable_file=open_cable_file(folder, config.robot.joint_table, description),
     )
     return Host(config, backend_with_faults, session, options)
 
 
 def refuse_second_host(session: Session, link: Link) -> None:
-    """Raise RefusedError when another HAL host has the robot's name; a dead one may stay visible for a while."""
-    deadline = time.monotonic() + GONE_LIMIT_S
-    while others := session.present(keys.HOST_ALL):
+    """Raise RefusedError if another HAL host has the robot's name. A dead host stays visible for a while."""
+    deadline = time.monotonic() + TOKEN_EXPIRY_TIMEOUT_S
+    while other_hosts := session.list_tokens(keys.HOST_ALL):
         if time.monotonic() > deadline:
             raise RefusedError(
                 f"another HAL host is on {link.endpoint} as {link.namespace}: "
-                f"{keys.parse_service(others[0])}. End it, or "
+                f"{keys.parse_service(other_hosts[0])}. End it, or "
                 f"give this robot another --namespace",
                 code="robot/already-running",
             )
 
 
 def open_backend(backend_type: type[Backend], config: RunConfig) -> GuardedBackend:
-    """Open the run's backend. Raises BackendError for any error in it."""
-    settings = backend_settings(config, backend_type)
+    """Open the run's backend. Raises BackendError for any error that is not a SnakesimError itself."""
+    settings = decode_backend_settings(config, backend_type)
     try:
         return GuardedBackend(backend_type(config, settings))
     except SnakesimError:
@@ -179,15 +194,20 @@ def open_backend(backend_type: type[Backend], config: RunConfig) -> GuardedBacke
 
 
 def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:
-    """Return the host's present statistics.
+    """Return the current statistics of a host.
 
     This may be called in another thread than the host's loop, which updates each value atomically.
+
+    Args:
+        host: Host, which may be running.
+        lost_ticks: Number of ticks that are missing in the black box file.
+        failure: Which file cannot be written, and why. Empty if all can be written.
     """
     statistics = host.statistics
     authority = host.authority
     return HostRecord(
-        ticks=host.black_box.ticks,
-        wall_s=host.wall_s,
+        ticks=host.black_box.row_count,
+        wall_s=host.armed_wall_time_s,
         overruns=statistics.overruns,
         answered_ticks=statistics.answered_ticks,
         armed_ticks=statistics.ticks,
@@ -196,16 +216,16 @@ def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") ->
         tick_times=statistics.times.timings(),
         rejected_commands=dict(authority.rejected_counts),
         limited_commands=dict(authority.limited_counts),
-        faults=list(authority.faults_since_start.stored),
-        faults_left_out=authority.faults_since_start.left_out,
+        faults=list(authority.faults_since_start.faults),
+        faults_left_out=authority.faults_since_start.dropped_count,
         lifecycle=authority.state,
         reason=authority.reason,
-        ended=host.ended,
-        ended_why=host.ended_why,
+        ended=host.ending_status,
+        ended_why=host.ending_reason,
         lost_ticks=lost_ticks,
         failure=failure,
         injected=list(host.faults.notes),
-        requests=list(host.requests),
+        requests=list(host.request_log),
         isolated=authority.isolated_joints,
     )
 

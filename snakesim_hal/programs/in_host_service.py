@@ -21,11 +21,11 @@ from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.base.terminal import report_error
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
-from snakesim_hal.programs.preflight import find_service
+from snakesim_hal.programs.preflight import load_service_class
 from snakesim_hal.service import ServiceLoop
 
-RESTART_S = 1.0  # until a service that ended is started again
-END_S = 0.5  # for all threads to end; one that hangs ends with the process
+RESTART_PAUSE_S = 1.0  # until a service that ended is started again
+CLOSE_TIMEOUT_S = 0.5  # for all threads to end; one that hangs ends with the process
 
 
 class InHostServices:
@@ -36,7 +36,7 @@ class InHostServices:
         self._session = session
         self._closing = threading.Event()
         self._threads = [
-            threading.Thread(target=self._serve, args=(name,), name=name, daemon=True)
+            threading.Thread(target=self._run_service, args=(name,), name=name, daemon=True)
             for name in config.in_host_services
         ]
 
@@ -49,26 +49,26 @@ class InHostServices:
 
     def __exit__(self, *_error: object) -> None:
         self._closing.set()
-        deadline = time.monotonic() + END_S
+        deadline = time.monotonic() + CLOSE_TIMEOUT_S
         for thread in self._threads:
             thread.join(max(deadline - time.monotonic(), 0.0))
 
-    def _serve(self, name: str) -> None:
-        """Run a service, and restart it where that is allowed, until the host ends."""
+    def _run_service(self, name: str) -> None:
+        """Run a service, and restart it after it has ended if the configuration allows it, until the host ends."""
         if self._config.clock_mode == "realtime":
             set_realtime_priority(SERVICE_PRIORITY)
         while not self._closing.is_set():
-            self._serve_once(name)
-            if not self._config.services[name].restart or self._closing.wait(RESTART_S):
+            self._run_service_once(name)
+            if not self._config.services[name].restart or self._closing.wait(RESTART_PAUSE_S):
                 return
 
-    def _serve_once(self, name: str) -> None:
+    def _run_service_once(self, name: str) -> None:
         """Run a service until it fails, or the host ends. The host sees the end, because its liveliness token ends."""
         try:
-            with closing(self._session.part()) as part:
-                service_type = find_service(self._config, name)
-                with closing(ServiceLoop(service_type, self._config, part, self._host_runs)) as loop:
-                    loop.join()
+            with closing(self._session.create_subsession()) as part:
+                service_type = load_service_class(self._config, name)
+                with closing(ServiceLoop(service_type, self._config, part, self._is_host_running)) as loop:
+                    loop.connect()
                     loop.run(self._closing.is_set)
         except SnakesimError as error:
             if not self._closing.is_set():
@@ -77,5 +77,5 @@ class InHostServices:
             if not self._closing.is_set():
                 traceback.print_exc()
 
-    def _host_runs(self) -> bool:
+    def _is_host_running(self) -> bool:
         return not self._closing.is_set()

@@ -17,17 +17,17 @@ from threadpoolctl import threadpool_limits
 from snakesim_hal.base.process import (
     SERVICE_PRIORITY,
     accept_interrupts,
-    die_with_parent,
     drop_priority_after,
     enter_realtime,
+    set_parent_death_signal,
     tune_garbage_collector,
 )
 from snakesim_hal.base.terminal import print_stderr, run_tool
-from snakesim_hal.model.scenario import Loaded, RunConfig
+from snakesim_hal.model.scenario import LoadedScenario, RunConfig
 from snakesim_hal.network.session import Link, Session
 from snakesim_hal.network.waiting import open_session_when_ready
-from snakesim_hal.programs.arguments import add_service, create_link, load_scenario
-from snakesim_hal.programs.preflight import find_service
+from snakesim_hal.programs.arguments import add_service_arguments, create_link, load_scenario_from_arguments
+from snakesim_hal.programs.preflight import load_service_class
 from snakesim_hal.service import SERVICE_START_LIMIT_S, Service, ServiceLoop
 
 REPORT_PERIOD_S = 20.0  # between two lines that report the wait
@@ -37,7 +37,7 @@ REPORT_PERIOD_S = 20.0  # between two lines that report the wait
 class ProcessOptions:
     """What one process of a robot was started with."""
 
-    loaded: Loaded
+    loaded: LoadedScenario
     link: Link
     arguments: argparse.Namespace
 
@@ -47,18 +47,26 @@ class ProcessOptions:
         return self.loaded.config
 
 
-def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> ProcessOptions:
-    """Read the files that the arguments name, and tie this process to its parent if it has one. Raises ConfigError."""
+def read_process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> ProcessOptions:
+    """Load the scenario that the arguments name, and let this process die with its parent if it has one.
+
+    Args:
+        arguments: Parsed command line.
+        hosts: Whether this process is the HAL host.
+
+    Raises:
+        ConfigError: A file or an argument is not valid.
+    """
     if arguments.parent is not None:
-        die_with_parent(arguments.parent)
-    loaded = load_scenario(arguments)
-    return ProcessOptions(loaded, create_link(arguments, loaded.config, hosts=hosts), arguments)
+        set_parent_death_signal(arguments.parent)
+    loaded = load_scenario_from_arguments(arguments)
+    return ProcessOptions(loaded, create_link(arguments, loaded.config, is_host=hosts), arguments)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a service. Returns the exit code: 0 stopped by a signal, 1 it could not continue, 2 wrong input."""
     parser = argparse.ArgumentParser(prog="snakesim start service", description="Run one service of a robot.")
-    add_service(parser)
+    add_service_arguments(parser)
     return run(parser.parse_args(argv))
 
 
@@ -67,15 +75,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     def act() -> int:
         with suppress(KeyboardInterrupt):
-            options = process_options(arguments)
-            serve(find_service(options.config, arguments.name), options)
+            options = read_process_options(arguments)
+            run_service(load_service_class(options.config, arguments.name), options)
         return 0
 
     return run_tool(f"snakesim {arguments.name}", act)
 
 
-def serve(service_type: type[Service], options: ProcessOptions) -> None:
-    """Run a service, as long as this process lives. Raises SnakesimError when it cannot continue."""
+def run_service(service_type: type[Service], options: ProcessOptions) -> None:
+    """Connect to the network, and run a service until this process ends. Raises SnakesimError if it cannot continue."""
     config = options.config
     name = service_type.name
     accept_interrupts()
@@ -86,7 +94,7 @@ def serve(service_type: type[Service], options: ProcessOptions) -> None:
     with connect_process(options.link, name) as session:
         waiting = StartupWait(name, f"a HAL host of {options.link.namespace} on {options.link.endpoint}")
         with closing(ServiceLoop(service_type, config, session, waiting.keeps_waiting)) as loop:
-            loop.join()
+            loop.connect()
             tune_garbage_collector()
             loop.run()
 
@@ -95,30 +103,35 @@ class StartupWait:
     """Limits the wait for something that others start, and reports it on the terminal."""
 
     def __init__(self, name: str, what: str) -> None:
-        """Begin to wait. name: the process that waits; what: the thing that it waits for."""
+        """Start the time limit of a wait.
+
+        Args:
+            name: Name of the process that waits.
+            what: What it waits for, for the report.
+        """
         self._name = name
         self._what = what
-        self._began_s = time.monotonic()
-        self._reported_s = self._began_s - REPORT_PERIOD_S
+        self._start_time_s = time.monotonic()
+        self._last_report_time_s = self._start_time_s - REPORT_PERIOD_S
 
     def keeps_waiting(self) -> bool:
         """Return whether to try again; call it after each attempt that failed."""
         now_s = time.monotonic()
-        if now_s - self._reported_s >= REPORT_PERIOD_S:
-            self._reported_s = now_s
+        if now_s - self._last_report_time_s >= REPORT_PERIOD_S:
+            self._last_report_time_s = now_s
             print_stderr(f"{self._name}: waiting for {self._what}")
-        return now_s - self._began_s < SERVICE_START_LIMIT_S
+        return now_s - self._start_time_s < SERVICE_START_LIMIT_S
 
 
 def connect_process(link: Link, name: str) -> AbstractContextManager[Session]:
     """Connect a process as soon as there is a network, and report the wait on the terminal.
 
     Args:
-        link: where and how to connect.
-        name: of the process.
+        link: Endpoint, namespace and options of the network.
+        name: Name of the process, for the report.
 
     Raises:
-        NotConnectedError: there was no network within SERVICE_START_LIMIT_S.
+        NotConnectedError: There was no network within SERVICE_START_LIMIT_S.
     """
     return open_session_when_ready(link, StartupWait(name, f"the network: {link.endpoint}").keeps_waiting)
 

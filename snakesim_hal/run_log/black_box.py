@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.safety.authority import TickDecision
+from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, Pose
 
 MEMORY_BYTES = 16 * 2**20  # about four minutes of 13 joints at 100 Hz
-COPIED_BYTES = 2**18  # at once, at most: the host waits for the interpreter while they are copied, 20 us
-HEADER_LIMIT_BYTES = 2**20
+MAX_COPIED_BYTES = 2**18  # in one copy: meanwhile the host waits for the interpreter, about 20 µs
+MAX_HEADER_BYTES = 2**20
 HEADER_ALIGNMENT_BYTES = 64
 ROW_ALIGNMENT_BYTES = 8
 
@@ -43,14 +43,14 @@ class Column(msgspec.Struct, frozen=True):
 
     @property
     def format(self) -> Any:
-        """Return what NumPy makes a dtype of."""
+        """Return the format of the column in a NumPy dtype."""
         if self.width is None:
             return self.type
         return self.type, (self.width,)
 
     @property
     def bytes(self) -> int:
-        """Return its size in each row."""
+        """Return the size of the column in each row."""
         return np.dtype(self.format).itemsize
 
 
@@ -64,11 +64,14 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
     columns: list[Column]  # in order; the rest of the row is padding
 
     @staticmethod
-    def for_robot(robot: Description) -> "Layout":
-        """Return the layout of a row for a robot.
+    def make_for_robot(robot: Description) -> "Layout":
+        """Return the layout of a row of the black box for a robot.
 
-        Names of columns contain the units. Position and orientation are those of the tail end in the world. A row is
-        padded to a multiple of ROW_ALIGNMENT_BYTES.
+        Names of columns contain the units. Position and orientation are those of the tail end in the world frame. A row
+        is padded to a multiple of ROW_ALIGNMENT_BYTES. `BlackBox` packs rows in this order of columns.
+
+        Args:
+            robot: Description of the robot, from which the number and the names of the joints are taken.
         """
         joint_count = len(robot.joints)
         joint_columns = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
@@ -87,13 +90,13 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
         joint_names = [joint.name for joint in robot.joints]
         return Layout(robot=robot.robot, joints=joint_names, row_bytes=used_bytes + padding_bytes, columns=columns)
 
-    def header(self) -> bytes:
+    def encode_header(self) -> bytes:
         """Return the first line of the file, padded so that the rows are aligned."""
         line = msgspec.json.encode(self)
         padding_bytes = -(len(line) + 1) % HEADER_ALIGNMENT_BYTES
         return line + b" " * padding_bytes + b"\n"
 
-    def arrays(self, rows: bytes) -> dict[str, NDArray[Any]]:
+    def decode_rows(self, rows: bytes) -> dict[str, NDArray[Any]]:
         """Return whole rows as columns by name, each of shape (n,) or (n, width)."""
         offsets = np.cumsum([0, *(column.bytes for column in self.columns)])
         dtype = np.dtype(
@@ -113,41 +116,46 @@ class BlackBox:
 
     def __init__(self, description: Description, memory_bytes: int = MEMORY_BYTES) -> None:
         """Allocate the memory for a robot's rows."""
-        self.layout = Layout.for_robot(description)
-        joints = len(description.joints)
-        self._pack_into = struct.Struct(f"<qd{5 * joints + 9}d{joints}b").pack_into
+        self.layout = Layout.make_for_robot(description)
+        joint_count = len(description.joints)
+        # One row, in the order of the columns of `Layout.for_robot`: tick, time, five values of each joint, 7 of the
+        # pose, 2 of the contacts, and the mode of each joint.
+        self._pack_row_into = struct.Struct(f"<qd{5 * joint_count + 9}d{joint_count}b").pack_into
         self._capacity = max(memory_bytes // self.layout.row_bytes, 2)
         # Multiplying writes every byte now, so that recording causes no page faults.
-        self._memory = bytearray(b"\0") * (self._capacity * self.layout.row_bytes)
-        self._rows = 0  # recorded so far
+        self._buffer = bytearray(b"\0") * (self._capacity * self.layout.row_bytes)
+        self._rows_written = 0
         self._digest = hashlib.sha256()
-        self._pack_setpoints = struct.Struct(f"<q{joints}b{2 * joints}d").pack
-        self._pose = [np.nan] * 7
-        self._contact_peak_n = 0.0
-        self._contact_count = 0
+        # The setpoints of one tick, in the order that `compute_digest` reads: tick, modes, targets, torque limits.
+        self._pack_setpoints = struct.Struct(f"<q{joint_count}b{2 * joint_count}d").pack
+        # The newest samples, which are repeated in rows without a new sample.
+        self._last_pose = [np.nan] * 7
+        self._last_contact_peak_n = 0.0
+        self._last_contact_count = 0
 
-    def record(self, tick: int, timestamp_ns: int, samples: Samples, decision: TickDecision) -> None:
-        """Append the row of one tick to the ring of rows, and update the digest of the setpoints.
+    def record_tick(self, tick: int, timestamp_ns: int, samples: Samples, decision: TickOutput) -> None:
+        """Append the row of one tick to the ring buffer, and update the digest of the setpoints.
 
         Args:
-            tick: number of the tick.
-            timestamp_ns: robot time of the tick.
-            samples: the joint states of this tick, and other samples by key. Pose and contacts without a new sample
-                are repeated from the row before.
-            decision: the setpoints that are applied in this tick.
+            tick: Number of the tick.
+            timestamp_ns: Robot time of the tick.
+            samples: Joint states of this tick, and new samples of other sensors by key. Without a new sample of pose or
+                contacts, the values of the last row are repeated.
+            decision: Setpoints that are applied in this tick.
         """
-        pose = samples.others.get(keys.POSE)
+        pose = samples.by_key.get(keys.POSE)
         if isinstance(pose, Pose):
-            self._pose = [*pose.position_w, *pose.orientation_wxyz]
-        contacts = samples.others.get(keys.CONTACTS)
+            self._last_pose = [*pose.position_w, *pose.orientation_wxyz]
+        contacts = samples.by_key.get(keys.CONTACTS)
         if isinstance(contacts, Contacts):
-            self._contact_peak_n, self._contact_count = summarize_contacts(contacts)
+            self._last_contact_peak_n, self._last_contact_count = summarize_contacts(contacts)
         joints = samples.joints
         setpoints = decision.setpoints
-        offset = self._rows % self._capacity * self.layout.row_bytes
-        self._pack_into(
-            self._memory,
-            offset,
+        buffer_offset = self._rows_written % self._capacity * self.layout.row_bytes
+        # The order of the arguments is that of the columns in `Layout.for_robot`.
+        self._pack_row_into(
+            self._buffer,
+            buffer_offset,
             tick,
             timestamp_ns * 1e-9,
             *joints.angle_rad,
@@ -155,74 +163,83 @@ class BlackBox:
             *joints.torque_nm,
             *setpoints.target,
             *setpoints.torque_limit_nm,
-            *self._pose,
-            self._contact_peak_n,
-            self._contact_count,
+            *self._last_pose,
+            self._last_contact_peak_n,
+            self._last_contact_count,
             *setpoints.mode,
         )
+        # The order of the arguments is that of `compute_digest`.
         packed = self._pack_setpoints(tick, *setpoints.mode, *setpoints.target, *setpoints.torque_limit_nm)
         self._digest.update(packed)
-        self._rows += 1  # last: another thread reads the counted rows
+        # Last, because the writer's thread, which calls `read_rows`, reads all rows that are counted.
+        self._rows_written += 1
 
     @property
-    def ticks(self) -> int:
+    def row_count(self) -> int:
         """Return how many rows were recorded so far, read or not."""
-        return self._rows
+        return self._rows_written
 
     @property
     def command_digest(self) -> str:
         """Return the hash of every setpoint applied so far."""
         return self._digest.hexdigest()
 
-    def read_rows(self, row: int) -> tuple[int, bytes]:
-        """Return some rows from number `row` on, or from the oldest row that is still there.
+    def read_rows(self, start_row: int) -> tuple[int, bytes]:
+        """Return some recorded rows from a row on, or from the oldest row that was not overwritten yet.
 
         May be called from another thread: the rows are consistent, also while the host records.
 
+        Args:
+            start_row: Number of the first row to read, counted from 0 since the start of the recording.
+
         Returns:
-            The number of the first returned row, and the bytes of the rows.
+            Number of the first row that is returned, and the bytes of the rows. The bytes are empty if there is no new
+            row. They end at the end of the ring buffer, or after MAX_COPIED_BYTES, so more rows may be left.
         """
-        size = self.layout.row_bytes
+        row_bytes = self.layout.row_bytes
         while True:
-            end = self._rows
-            first = max(row, end - self._capacity + 1)  # the oldest row may be overwritten right now
-            begin = first % self._capacity  # position in the ring
-            count = min(end - first, self._capacity - begin, max(COPIED_BYTES // size, 1))
-            rows = bytes(memoryview(self._memory)[begin * size : (begin + count) * size])
-            if self._rows - first < self._capacity:  # otherwise the host has overwritten them meanwhile
-                return first, rows
+            end = self._rows_written
+            first_row = max(start_row, end - self._capacity + 1)  # the oldest row may be overwritten right now
+            position = first_row % self._capacity  # in the ring buffer
+            count = min(end - first_row, self._capacity - position, max(MAX_COPIED_BYTES // row_bytes, 1))
+            rows = bytes(memoryview(self._buffer)[position * row_bytes : (position + count) * row_bytes])
+            if self._rows_written - first_row < self._capacity:  # otherwise the host has overwritten them meanwhile
+                return first_row, rows
 
 
 def summarize_contacts(contacts: Contacts) -> tuple[float, int]:
     """Return the force of the strongest contact in N, and the number of touched obstacles.
 
-    The force is the mean over 50 ms that the sensor measures, see `measured_force`; without one, it is the largest
-    contact force of this tick.
+    The force is the mean over 50 ms that the sensor measures, see `measured_force`. If the sample has no such mean, the
+    force is the largest contact force of this tick.
     """
-    touched = len({contact.obstacle for contact in contacts.contacts})
+    touched_count = len({contact.obstacle for contact in contacts.contacts})
     if contacts.measured_force_n is not None:
-        return contacts.measured_force_n, touched
-    squares: list[float] = []
+        return contacts.measured_force_n, touched_count
+    squared_forces: list[float] = []
     for contact in contacts.contacts:
         x, y, z = contact.force_l
-        squares.append(x * x + y * y + z * z)
-    return max(squares, default=0.0) ** 0.5, touched
+        squared_forces.append(x * x + y * y + z * z)
+    return max(squared_forces, default=0.0) ** 0.5, touched_count
 
 
 def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
     """Read every complete row of a black box file.
 
+    Args:
+        path: Path of the file.
+
     Returns:
-        The layout of the file, and its columns by name.
+        The layout of the file, and the columns by name, each of shape (rows,) or (rows, width).
 
     Raises:
-        ConfigError: it is not the black box of a run, or cannot be read.
+        ConfigError: The file is not the black box of a run, or cannot be read.
     """
     try:
         with path.open("rb") as file:
-            header = file.readline(HEADER_LIMIT_BYTES)
+            header = file.readline(MAX_HEADER_BYTES)
             layout = msgspec.json.decode(header, type=Layout)
-            return layout, layout.arrays(file.read())
+            return layout, layout.decode_rows(file.read())
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise ConfigError(
             f"{path} cannot be read as the black box of a run: {str(error)[:200]}", code="recording/not-readable"
@@ -230,10 +247,15 @@ def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
 
 
 def compute_digest(columns: dict[str, NDArray[Any]]) -> str:
-    """Compute `command_digest` from recorded rows, for a host that was killed."""
-    names = {"tick": "<i8", "mode": "|i1", "target": "<f8", "torque_limit_nm": "<f8"}
-    dtype = [(name, type_, columns[name].shape[1:]) for name, type_ in names.items()]
+    """Compute the `command_digest` of a run from its recorded rows, for a host that was killed.
+
+    Args:
+        columns: Columns of the black box by name, as `read_black_box` returns them.
+    """
+    # The same order as in `BlackBox.record`.
+    column_types = {"tick": "<i8", "mode": "|i1", "target": "<f8", "torque_limit_nm": "<f8"}
+    dtype = [(name, type_, columns[name].shape[1:]) for name, type_ in column_types.items()]
     packed = np.empty(len(columns["tick"]), dtype=dtype)
-    for name in names:
+    for name in column_types:
         packed[name] = columns[name]
     return hashlib.sha256(packed.tobytes()).hexdigest()

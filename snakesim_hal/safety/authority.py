@@ -13,16 +13,16 @@ import numpy as np
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety import lifecycle, limiter
-from snakesim_hal.safety.cables import Cables
-from snakesim_hal.safety.derating import Derating
+from snakesim_hal.safety.cables import CableTracker
+from snakesim_hal.safety.derating import HealthMonitor
 from snakesim_hal.safety.fault_log import FaultLog
 from snakesim_hal.safety.isolation import Isolation
-from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask
+from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, JointMask
 from snakesim_hal.safety.lease import Lease, decide_lease_request, free_lease, renew_lease
 from snakesim_hal.safety.lifecycle import UnmetCondition
-from snakesim_hal.safety.limit_names import name_active_limits
-from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityCheck, replace_unreadable
-from snakesim_hal.safety.stop_ramp import StopReaction, uniform_setpoints
+from snakesim_hal.safety.limit_names import find_active_limits
+from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityChecker, replace_non_finite_values
+from snakesim_hal.safety.stop_ramp import StopReaction, make_uniform_setpoints
 from snakesim_hal.wire.messages import (
     Answer,
     Description,
@@ -37,17 +37,17 @@ from snakesim_hal.wire.messages import (
     Power,
 )
 
-COMMANDS_KEPT = 1024  # in lockstep a tick may name an older command than the newest
+RECENT_COMMAND_COUNT = 1024  # accepted commands that are stored: in lockstep a tick may need an older one
 MAX_REASON_LENGTH = 500  # characters, as `quantities.Reason` allows
 
 
 @dataclass(frozen=True)
-class TickDecision:
-    """The setpoints of one tick."""
+class TickOutput:
+    """The setpoints of one tick, with the command that they come from."""
 
     setpoints: SafeSetpoints
-    sequence: int | None  # of the command; None: the host's own stop mode
-    limited: dict[int, str]  # joint index -> which limit changed its target
+    command_sequence: int | None  # sequence number of the applied command; None if no command is applied
+    limit_by_joint: dict[int, str]  # joint index -> name of the limit that changed its target
 
 
 class Authority:
@@ -59,23 +59,24 @@ class Authority:
         *,
         first_epoch: int = 0,
         awaits_reports: bool = False,
-        unchecked: str = "",
-        cables: Cables | None = None,
+        unchecked_reason: str = "",
+        cables: CableTracker | None = None,
     ) -> None:
         """Start disarmed, without a holder of the lease.
 
         Args:
-            description: the robot as its backend describes it: joints, their limits, and the lease term.
-            first_epoch: epoch of the lease before its first holder. It must differ from that of any earlier host, so
+            description: Robot as its backend describes it: joints, their limits, and the duration of a lease.
+            first_epoch: Epoch of the lease before its first holder. It must differ from that of any earlier host, so
                 that commands for another host are rejected.
-            awaits_reports: whether arming waits until every joint module has reported its supply.
-            unchecked: why the joints count as not checked, so that only a request with `unchecked` arms the
-                robot; empty if they were checked.
-            cables: cables of joints without end stops. The caller updates them.
+            awaits_reports: Whether arming waits until every joint module has reported its supply.
+            unchecked_reason: Reason why the joints count as not checked, so that only a request with `unchecked` arms
+                the robot. Empty if they were checked.
+            cables: Tracker of the cables of joints without end stops, which the caller updates. None if there are no
+                such joints.
         """
-        self._cables = cables or Cables((), {}, {})
+        self._cables = cables or CableTracker((), {}, {})
         self.description = description
-        self.unchecked = unchecked
+        self.unchecked_reason = unchecked_reason
         self.limits = JointLimits.from_description(description)
         count = len(description.joints)
 
@@ -84,9 +85,9 @@ class Authority:
         self.reason = "not armed yet"
         self.arm_session = 0
         self.lease = Lease(epoch=first_epoch)
-        self._state_tick = 0  # of the newest joint state
-        self._armed_tick = -1  # of the state that was the newest at the last arming
-        self._stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
+        self._newest_state_tick = 0
+        self._last_arming_tick = -1  # tick of the joint state that was the newest at the last arming
+        self._is_stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
 
         # Faults and counters.
         self.faults_since_reset = FaultLog()
@@ -97,84 +98,93 @@ class Authority:
         self.limited_counts: Counter[str] = Counter()
 
         # Checks of what is measured.
-        self._plausibility = PlausibilityCheck(self.limits)
-        self._measured = self._plausibility.measured
-        self._implausible: ImplausibleState | None = self._unknown_state("no joint state yet")
-        self._backend_obstacles: list[str] = []  # why the backend cannot be armed now
+        self._plausibility_checker = PlausibilityChecker(self.limits)
+        self._measured_state = self._plausibility_checker.measured
+        self._implausible_state: ImplausibleState | None = self._make_unknown_state("no joint state yet")
+        self._backend_obstacles: list[str] = []  # reasons of the backend against arming now
         self._isolation = Isolation(description)
-        self._derating = Derating(description, awaits_reports=awaits_reports)
+        self._health_monitor = HealthMonitor(description, awaits_reports=awaits_reports)
 
         # Commands.
-        self._command: JointCommand | None = None
-        self._command_ns = 0  # when it was received
-        self._decided_command: JointCommand | None = None  # of the last decision since arming
-        self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # accepted ones since arming, oldest first
+        self._newest_command: JointCommand | None = None
+        self._newest_command_ns = 0  # safety time at which it was received
+        self._last_used_command: JointCommand | None = None  # since arming
+        # Commands accepted since arming, oldest first.
+        self._recent_commands: deque[JointCommand] = deque(maxlen=RECENT_COMMAND_COUNT)
         self._last_sequence = -1
 
         # Setpoints.
-        self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
-        self._angle_at_arming_rad = np.zeros(count)
+        self._last_setpoints = AppliedSetpoints(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
+        self._angles_at_arming_rad = np.zeros(count)
         self._stop_reaction = StopReaction(self.limits, description.stop_mode)
 
     # --- inputs: measured values -----------------------------------------------------------------------------
 
-    def observe(self, joints: JointState, now_ns: int | None = None) -> None:
-        """Process the newest joint state. Implausible values are rejected: the last good ones stay.
+    def observe_joints(self, joints: JointState, now_ns: int | None = None) -> None:
+        """Check the newest joint state, and store its plausible values.
+
+        An implausible value is rejected: the last good value of that joint stays.
 
         Args:
-            joints: the joint state.
-            now_ns: safety time; None means the timestamp of the state.
+            joints: Newest joint state.
+            now_ns: Safety time in ns. None means the timestamp of the state.
         """
         if now_ns is None:
             now_ns = joints.timestamp_ns
         applied = None
         if self.state == "armed":
-            applied = self._applied
-        self._state_tick = joints.tick
-        self._implausible = self._plausibility.check(
+            applied = self._last_setpoints
+        self._newest_state_tick = joints.tick
+        self._implausible_state = self._plausibility_checker.check(
             joints, now_ns=now_ns, applied=applied, isolated=self._isolation.joints
         )
-        self._measured = self._plausibility.measured
+        self._measured_state = self._plausibility_checker.measured
 
     def observe_power(self, power: Power, now_ns: int) -> None:
-        """Process the newest power sample: supply, heat and leaks. `check_deadlines` acts on it."""
-        self._derating.update(power, now_ns)
+        """Store the newest power sample: supply, heat and leaks.
 
-    def observe_obstacles(self, obstacles: list[str]) -> None:
+        `latch_faults_and_expire_lease` latches the faults that follow from the sample.
+        """
+        self._health_monitor.update(power, now_ns)
+
+    def set_backend_obstacles(self, obstacles: list[str]) -> None:
         """Process why the backend cannot be armed now; empty if nothing is against it."""
         self._backend_obstacles = obstacles
 
-    def replace_unreadable(self, joints: JointState) -> JointState:
-        """Return a joint state for publishing: without NaN or infinity."""
-        return replace_unreadable(joints, self._measured)
+    def replace_non_finite_values(self, joints: JointState) -> JointState:
+        """Return a joint state without NaN or infinity, so that it can be published."""
+        return replace_non_finite_values(joints, self._measured_state)
 
     @property
     def derated_joints(self) -> dict[str, float]:
-        """The names of derated joints, with the fraction of their torque that is left."""
-        return self._derating.derated_joints()
+        """Fraction of the torque limit that derating leaves, by the name of each derated joint."""
+        return self._health_monitor.derated_joints()
 
     @property
     def faults(self) -> list[Fault]:
-        """Faults since the last reset, as far as they are stored."""
-        return self.faults_since_reset.stored
+        """Faults since the last reset. A long list leaves out faults in its middle."""
+        return self.faults_since_reset.faults
 
     @property
     def isolated_joints(self) -> list[str]:
-        """The names of joints that failed, and are passive until a reset."""
-        return self._isolation.names
+        """Names of the joints that failed, and are passive until a reset."""
+        return self._isolation.joint_names
 
     # --- inputs: commands and requests -----------------------------------------------------------------------
 
-    def offer_command(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
-        """Accept a command, or return why it is rejected.
+    def process_command(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
+        """Accept a command and renew the lease, or reject the command and count why.
 
         Args:
-            command: the command as it was received.
-            now_ns: safety time.
-            tick: the newest tick that the host has published.
-            age_ns: age of the state that the command answers.
+            command: Command as it was received.
+            now_ns: Safety time in ns.
+            tick: Newest tick that the host has published.
+            age_ns: Age in ns of the joint state that the command answers.
+
+        Returns:
+            The reason of the rejection as a word, or None if the command is accepted.
         """
-        refusal = limiter.find_refusal(
+        rejection_reason = limiter.find_rejection_reason(
             command,
             lease=self.lease,
             now_ns=now_ns,
@@ -183,264 +193,295 @@ class Authority:
             age_ns=age_ns,
             limits=self.limits,
         )
-        if refusal is not None:
-            self.rejected_counts[refusal] += 1
-            return refusal
-        if not self.answers_arm_session(command):
-            # It does not renew the lease either: that takes commands of the present arm session.
-            self._count_command_before_arming(command)
+        if rejection_reason is not None:
+            self.rejected_counts[rejection_reason] += 1
+            return rejection_reason
+        if not self.matches_arm_session(command):
+            # The lease is not renewed either: only commands of the current arm session renew it.
+            self._count_command_of_other_session(command)
             return "before_arming"
-        # Only now: a rejected command must not make the next good one a replay.
+        # The sequence number is stored only now: a rejected command must not make the next good one a replay.
         self._last_sequence = command.sequence
         self.lease = renew_lease(self.lease, now_ns, self.description.lease_ns)
-        self._command = command
-        self._command_ns = now_ns
+        self._newest_command = command
+        self._newest_command_ns = now_ns
         if self.state == "armed":
             self.accepted_count += 1
-            self._recent.append(command)
+            self._recent_commands.append(command)
         else:
             self.standby_count += 1
         return None
 
-    def answers_arm_session(self, command: JointCommand) -> bool:
-        """Return whether a command names the present arm session, or the robot is not armed."""
+    def matches_arm_session(self, command: JointCommand) -> bool:
+        """Return whether a command names the current arm session. True for any command while the robot is not armed."""
         return self.state != "armed" or command.arm_session == self.arm_session
 
     def count_rejection(self, reason: str) -> None:
         """Count a sample that could not be decoded."""
         self.rejected_counts[reason] += 1
 
-    def on_lease(self, request: LeaseRequest, now_ns: int) -> Answer:
-        """Decide a lease request. If the lease changes hands, an armed robot is disarmed."""
+    def handle_lease_request(self, request: LeaseRequest, now_ns: int) -> Answer:
+        """Grant or refuse a lease request. If the lease gets another holder or none, an armed robot is disarmed."""
         decision = decide_lease_request(self.lease, request, now_ns, self.description.lease_ns)
         if self.state == "armed" and request.action == "renew":
             # While armed only a command renews the lease.
-            return self._answer(decision.refusal, decision.refusal_word)
+            return self._make_answer(decision.refusal, decision.refusal_code)
         self.lease = decision.lease
-        if decision.changed_hands:
+        if decision.has_holder_changed:
             self._forget_commands()
             if self.state == "armed":
                 self._transition("disarm", f"lease passed to {decision.lease.holder or 'no client'}")
-        return self._answer(decision.refusal, decision.refusal_word)
+        return self._make_answer(decision.refusal, decision.refusal_code)
 
-    def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
-        """Arm, disarm, reset or finish. A refused arming lists every condition that is not met."""
+    def handle_lifecycle_request(self, request: LifecycleRequest, now_ns: int) -> Answer:
+        """Arm, disarm or reset the robot, or disarm it at the end of the run.
+
+        The answer to a refused arming lists every condition that is not met.
+        """
         match request.action:
             case "arm":
-                return self._arm(request, now_ns)
+                return self._handle_arm_request(request, now_ns)
             case "disarm":
-                return self._disarm(request)
+                return self._handle_disarm_request(request)
             case "reset":
-                return self._reset(request)
+                return self._handle_reset_request(request)
             case "finish":
                 if self.state == "armed":
                     self._transition("disarm", f"finished by {request.requester}")
-                return self._answer(None)
+                return self._make_answer(None)
 
-    def on_estop(self, request: EstopRequest, tick: int) -> Answer:
-        """Stop now, for any requester."""
-        latch_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.requester}")
-        self._record(latch_fault, stops=self.state != "estop")
+    def handle_estop_request(self, request: EstopRequest, tick: int) -> Answer:
+        """Enter the state `estop` at once. Every requester may do so."""
+        estop_fault = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.requester}")
+        self._add_to_fault_logs(estop_fault, stops_robot=self.state != "estop")
         self._transition("estop", f"emergency stop by {request.requester}; reset it to continue")
-        return self._answer(None)
+        return self._make_answer(None)
 
     # --- inputs: faults --------------------------------------------------------------------------------------
 
-    def fault(self, fault: Fault, joints: Mask | None = None) -> None:
-        """Latch a fault: the joints take the stop mode until a reset.
+    def latch_fault(self, fault: Fault, joints: JointMask | None = None) -> None:
+        """Latch a fault: the robot is in the state `fault`, and its joints in the stop mode, until a reset.
 
-        A fault with the reach "none" is only recorded. A fault of only some joints isolates them instead of stopping
-        the robot, if the robot file allows that.
+        A fault with the reach "none" is only logged. A fault with the reach "joint" isolates its joints instead of
+        stopping the robot, if the robot file allows that.
 
         Args:
-            fault: what happened.
-            joints: (n_joints,), the joints concerned; None means the joint that the fault names.
+            fault: Fault to latch.
+            joints: (n_joints,) mask of the joints that failed. None means the joint that the fault names.
         """
         if fault.reach == "none":
-            self._record(fault, stops=False)
+            self._add_to_fault_logs(fault, stops_robot=False)
             return
         if joints is None:
-            joints = self._isolation.find_joint(fault.joint)
-        if fault.reach == "joint" and self._isolate(fault, joints):
+            joints = self._isolation.make_joint_mask(fault.joint)
+        if fault.reach == "joint" and self._try_isolate(fault, joints):
             return
         fault = msgspec.structs.replace(fault, reach="robot")
-        stops = self.state not in ("fault", "estop")  # later faults are usually consequences of the first
-        self._record(fault, stops=stops)
-        if stops:
+        # Only the first fault counts as the reason of the stop: later ones are usually its consequences.
+        stops_robot = self.state not in ("fault", "estop")
+        self._add_to_fault_logs(fault, stops_robot=stops_robot)
+        if stops_robot:
             self._transition("fault", fault.cause[:MAX_REASON_LENGTH] or fault.what)
-        self._drop_lease()
+        self._free_lease()
 
-    def record_fault(self, fault: Fault, *, precedes_stop: bool = False) -> None:
-        """Record a fault for people that stops nothing by itself.
+    def log_fault(self, fault: Fault, *, precedes_stop: bool = False) -> None:
+        """Log a fault without changing the state of the robot.
 
         Args:
-            fault: what happened.
-            precedes_stop: whether its consequence stops the robot, as when the process that holds the lease ends.
+            fault: Fault to log.
+            precedes_stop: Whether a consequence of the fault will stop the robot. True when the process that holds the
+                lease ends.
         """
         reach = "robot" if precedes_stop else "none"
-        self._record(msgspec.structs.replace(fault, reach=reach), stops=False)
+        self._add_to_fault_logs(msgspec.structs.replace(fault, reach=reach), stops_robot=False)
 
-    def on_holder_gone(self, cause: str) -> None:
-        """React to the end of the lease holder's process: unless the robot is armed, free the lease at once."""
+    def handle_lease_holder_exit(self, cause: str) -> None:
+        """Free the lease after its holder's process has ended. An armed robot keeps the lease until it expires.
+
+        Args:
+            cause: Text for the operator, which becomes the reason of the state `disarmed`.
+        """
         if self.state != "armed":
-            self._drop_lease()
+            self._free_lease()
         if self.state == "disarmed":
             self.reason = cause
 
     # --- outputs ---------------------------------------------------------------------------------------------
 
     def list_unmet_conditions(self, now_ns: int) -> list[str]:
-        """Return every condition for arming that is not met; empty if the robot is ready."""
+        """Return a text for each condition for arming that is not met. An empty list means that the robot is ready."""
         return [condition.reason for condition in self._find_unmet_conditions(now_ns)]
 
-    def check_deadlines(self, now_ns: int, tick: int) -> None:
-        """Latch the faults that follow from the measured values and from the time.
+    def latch_faults_and_expire_lease(self, now_ns: int, tick: int) -> None:
+        """Latch the faults that follow from the measured values and from the time, and free an expired lease.
 
-        These are: an armed robot without plausible joint states; a robot, armed or not, whose modules are too hot,
-        leak or lack voltage; and an expired lease of an armed robot. If the robot is not armed, an expired lease
-        only becomes free.
-        """
-        if self.state == "armed" and self._implausible is not None:
-            self.fault(msgspec.structs.replace(self._implausible.fault, tick=tick), self._implausible.joints)
-        new_faults, silent = self._derating.evaluate(now_ns, tick)
-        for fault in new_faults:
-            self.fault(fault)
-        if silent is not None and not self._isolation.is_isolated(silent.joint):
-            self.record_fault(silent)
-        if self.lease.is_live(now_ns):
-            return
-        if self.state == "armed":
-            term_ms = self.description.lease_ns / 1e6
-            cause = f"lease of {self.lease.holder} expired: no accepted command for {term_ms:.0f} ms"
-            self.fault(Fault(tick=tick, what="lease_expired", cause=cause))
-        else:
-            self._drop_lease()
-
-    def decide(self, up_to: int | None = None) -> TickDecision:
-        """Return the setpoints for the next period. Call `check_deadlines` first.
+        Three conditions are faults: an armed robot has no plausible joint state; a joint module is too hot, leaks, or
+        has a low supply voltage, whether or not the robot is armed; and the lease of an armed robot has expired. If the
+        robot is not armed, an expired lease is only released.
 
         Args:
-            up_to: in lockstep, the newest tick whose command is used; None means the newest command.
+            now_ns: Safety time in ns.
+            tick: Current tick, which new faults name.
         """
-        command = self._find_command(up_to)
+        implausible_state = self._implausible_state
+        if self.state == "armed" and implausible_state is not None:
+            self.latch_fault(msgspec.structs.replace(implausible_state.fault, tick=tick), implausible_state.joints)
+        new_faults, silence_fault = self._health_monitor.evaluate(now_ns, tick)
+        for fault in new_faults:
+            self.latch_fault(fault)
+        if silence_fault is not None and not self._isolation.is_isolated(silence_fault.joint):
+            self.log_fault(silence_fault)  # missing reports stop nothing
+        if self.lease.is_held(now_ns):
+            return
+        if self.state == "armed":
+            lease_duration_ms = self.description.lease_ns / 1e6
+            cause = f"lease of {self.lease.holder} expired: no accepted command for {lease_duration_ms:.0f} ms"
+            self.latch_fault(Fault(tick=tick, what="lease_expired", cause=cause))
+        else:
+            self._free_lease()
+
+    def compute_setpoints(self, max_tick: int | None = None) -> TickOutput:
+        """Return the limited setpoints for the next control period. Call `latch_faults_and_expire_lease` first.
+
+        An armed robot gets the setpoints of a command, or holds its pose until the first command. In every other state
+        it gets those of its stop mode.
+
+        Args:
+            max_tick: In lockstep, the newest tick whose command may be used. None means the newest command.
+        """
+        command = self._select_command(max_tick)
         sequence: int | None = None
         limited: dict[int, str] = {}
         if self.state != "armed":
-            applied = self._stop_reaction.make_setpoints(self.state, self._derated_torque_nm())
-            self._stop_sent = True
+            applied = self._stop_reaction.make_setpoints(self.state, self._compute_derated_torque_nm())
+            self._is_stop_sent = True
         elif command is None:
             # Just armed: hold the pose until the first command.
-            pose_rad = self.limits.clip_angles(self._angle_at_arming_rad)
-            applied = uniform_setpoints(Mode.POSITION, pose_rad, self._derated_torque_nm())
+            pose_rad = self.limits.clip_angles(self._angles_at_arming_rad)
+            applied = make_uniform_setpoints(Mode.POSITION, pose_rad, self._compute_derated_torque_nm())
         else:
             applied = limiter.limit_command(
                 command,
-                measured=self._measured,
-                last=self._applied,
+                measured=self._measured_state,
+                last=self._last_setpoints,
                 limits=self.limits,
-                torque_fraction=self._derating.torque_fraction,
+                torque_fraction=self._health_monitor.torque_fraction,
             )
             sequence = command.sequence
-            limited = self._name_limits(command, applied)
-            self._decided_command = command
+            limited = self._find_and_count_active_limits(command, applied)
+            self._last_used_command = command
         applied = self._isolation.make_passive(applied)
-        self._applied = applied
-        return TickDecision(limiter.make_safe_setpoints(applied, self._isolation.indices), sequence, limited)
+        self._last_setpoints = applied
+        return TickOutput(limiter.make_safe_setpoints(applied, self._isolation.indices), sequence, limited)
 
     # --- commands and setpoints ------------------------------------------------------------------------------
 
-    def _count_command_before_arming(self, command: JointCommand) -> None:
-        """Count a command of another arm session: it is an error only if it was sent after the last arming."""
-        if command.tick <= self._armed_tick:
+    def _count_command_of_other_session(self, command: JointCommand) -> None:
+        """Count a command of another arm session: as rejected only if it was sent after the last arming."""
+        if command.tick <= self._last_arming_tick:
             self.standby_count += 1
         else:
             self.rejected_counts["before_arming"] += 1
 
-    def _find_command(self, up_to: int | None) -> JointCommand | None:
-        """Return the newest command, or in lockstep the newest one that does not answer a later tick than `up_to`."""
-        if up_to is None:
-            return self._command
-        for command in reversed(self._recent):
-            if command.tick <= up_to:
+    def _select_command(self, max_tick: int | None) -> JointCommand | None:
+        """Return the command to apply in this tick; None if there is none.
+
+        Args:
+            max_tick: In lockstep, the newest tick that the command may answer. None means the newest command.
+        """
+        if max_tick is None:
+            return self._newest_command
+        for command in reversed(self._recent_commands):
+            if command.tick <= max_tick:
                 return command
-        return self._decided_command
+        return self._last_used_command
 
-    def _name_limits(self, command: JointCommand, applied: Applied) -> dict[int, str]:
-        """Return the index of each joint whose command was changed, with the name of the limit, and count them."""
-        limited: dict[int, str] = {}
-        torque_fraction = self._derating.torque_fraction
+    def _find_and_count_active_limits(self, command: JointCommand, applied: AppliedSetpoints) -> dict[int, str]:
+        """Return the name of the limit that changed the command of each limited joint, by joint index, and count it."""
+        limit_by_joint: dict[int, str] = {}
+        torque_fraction = self._health_monitor.torque_fraction
+        # Most commands pass unchanged, so that the limits are named only when a target or a torque limit differs.
         if applied.target.tolist() != command.target or min(torque_fraction.tolist()) < 1.0:
-            limited = name_active_limits(
-                command, applied, measured=self._measured, limits=self.limits, torque_fraction=torque_fraction
+            limit_by_joint = find_active_limits(
+                command, applied, measured=self._measured_state, limits=self.limits, torque_fraction=torque_fraction
             )
-        limited |= self._isolation.name_overruled(command)
-        self.limited_counts.update(limited.values())
-        return limited
+        limit_by_joint |= self._isolation.find_overruled_joints(command)
+        self.limited_counts.update(limit_by_joint.values())
+        return limit_by_joint
 
-    def _derated_torque_nm(self) -> Floats:
+    def _compute_derated_torque_nm(self) -> Floats:
         """Return the torque limits that derating leaves, (n_joints,)."""
-        return self.limits.torque_nm * self._derating.torque_fraction
+        return self.limits.torque_nm * self._health_monitor.torque_fraction
 
     # --- lifecycle -------------------------------------------------------------------------------------------
 
-    def _arm(self, request: LifecycleRequest, now_ns: int) -> Answer:
-        """Arm the robot and begin an arm session; or refuse the request with all conditions that are not met."""
+    def _handle_arm_request(self, request: LifecycleRequest, now_ns: int) -> Answer:
+        """Arm the robot and start an arm session, or refuse the request with all conditions that are not met."""
         unmet = self._find_unmet_conditions(now_ns)
         unmet += lifecycle.find_address_mismatches(request, self.description)
-        if self.unchecked and not request.unchecked:
-            reason = f"{self.unchecked}; to arm it as it is, add --unchecked"
+        if self.unchecked_reason and not request.unchecked:
+            reason = f"{self.unchecked_reason}; to arm it as it is, add --unchecked"
             unmet.append(UnmetCondition("not_checked", reason))
         if unmet:
             reasons = "; ".join(condition.reason for condition in unmet)
-            refusals = {condition.refusal for condition in unmet}
-            return self._answer(reasons, min(refusals, key=lifecycle.REFUSAL_ORDER.index))
-        as_it_is = ", unchecked" if self.unchecked else ""
-        self._transition("arm", f"armed by {request.requester}{as_it_is}, commanded by {self.lease.holder}")
+            refusal_codes = {condition.refusal for condition in unmet}
+            most_important = min(refusal_codes, key=lifecycle.REFUSAL_ORDER.index)
+            return self._make_answer(reasons, most_important)
+        unchecked_suffix = ", unchecked" if self.unchecked_reason else ""
+        self._transition("arm", f"armed by {request.requester}{unchecked_suffix}, commanded by {self.lease.holder}")
         self.arm_session += 1
-        self._armed_tick = self._state_tick
-        self._command = None
-        self._decided_command = None
-        self._recent.clear()
+        self._last_arming_tick = self._newest_state_tick
+        self._newest_command = None
+        self._last_used_command = None
+        self._recent_commands.clear()
         self.lease = renew_lease(self.lease, now_ns, self.description.lease_ns)
-        return self._answer(None)
+        return self._make_answer(None)
 
-    def _disarm(self, request: LifecycleRequest) -> Answer:
+    def _handle_disarm_request(self, request: LifecycleRequest) -> Answer:
         if not self._transition("disarm", f"disarmed by {request.requester}"):
-            return self._answer(f"cannot disarm in state {self.state}; reset it first", "wrong_state")
-        return self._answer(None)
+            return self._make_answer(f"cannot disarm in state {self.state}; reset it first", "wrong_state")
+        return self._make_answer(None)
 
-    def _reset(self, request: LifecycleRequest) -> Answer:
+    def _handle_reset_request(self, request: LifecycleRequest) -> Answer:
         if not self._transition("reset", f"reset by {request.requester}; arm to move again"):
             hint = ""
             if self.isolated_joints:
                 hint = f"; disarm first, then a reset ends the isolation of {', '.join(self.isolated_joints)}"
-            return self._answer(f"nothing to reset in state {self.state}{hint}", "wrong_state")
+            return self._make_answer(f"nothing to reset in state {self.state}{hint}", "wrong_state")
         self._end_isolation()
         self.faults_since_reset = FaultLog()
-        return self._answer(None)
+        return self._make_answer(None)
 
-    def _transition(self, event: lifecycle.Event, why: str) -> bool:
-        """Change the lifecycle state. Returns False if the event is not allowed in this state."""
-        following = lifecycle.next_state(self.state, event)
-        if following is None:
+    def _transition(self, event: lifecycle.LifecycleEvent, reason: str) -> bool:
+        """Change the lifecycle state, and start or cancel the stop ramp that belongs to it.
+
+        Args:
+            event: Event that causes the change.
+            reason: Text for the operator.
+
+        Returns:
+            False if the event is not allowed in this state; then nothing is changed.
+        """
+        next_state = lifecycle.next_state(self.state, event)
+        if next_state is None:
             return False
         was_armed = self.state == "armed"
-        if following != self.state:
-            self._angle_at_arming_rad = self._measured.angle_rad
+        if next_state != self.state:
+            self._angles_at_arming_rad = self._measured_state.angle_rad
             if was_armed:
-                self._stop_reaction.begin(self._measured, self._applied)
+                self._stop_reaction.start_ramp(self._measured_state, self._last_setpoints)
             else:
-                self._stop_reaction.end()
-            if following == "disarmed":
-                self._stop_sent = False
+                self._stop_reaction.cancel_ramp()
+            if next_state == "disarmed":
+                self._is_stop_sent = False
         if was_armed:
-            self._command = None
-        self.state = following
-        self.reason = why
+            self._newest_command = None
+        self.state = next_state
+        self.reason = reason
         return True
 
     def _find_unmet_conditions(self, now_ns: int) -> list[UnmetCondition]:
-        """Return every condition for arming that is not met, apart from those of the request."""
+        """Return every condition of the robot, its lease and its commands for arming that is not met."""
         unmet: list[UnmetCondition] = []
         if self.state != "disarmed":
             reset_first = "; first `snakesim robot reset`" if self.state in ("fault", "estop") else ""
@@ -451,75 +492,94 @@ class Authority:
         return unmet
 
     def _find_unready_robot(self, now_ns: int) -> list[str]:
-        """Return what is wrong with the joint state, heat, supply, and the last stop."""
+        """Return a text for each problem of the joint state, heat, supply, backend and last stop."""
         reasons: list[str] = []
-        if self._implausible is not None:
-            reasons.append(self._implausible.fault.cause)
-        for fault in self._derating.present_faults:
+        if self._implausible_state is not None:
+            reasons.append(self._implausible_state.fault.cause)
+        for fault in self._health_monitor.current_faults:
             # The supply has a separate reason, which explains what to do.
-            if fault.what != "undervoltage" and not self._is_of_isolated_joint(fault):
+            if fault.what != "undervoltage" and not self._concerns_isolated_joint(fault):
                 reasons.append(fault.cause)
-        reasons += self._derating.find_supply_problems(now_ns)
+        reasons += self._health_monitor.find_supply_problems(now_ns)
         reasons += self._backend_obstacles
-        if self.arm_session and not self._stop_sent:
+        if self.arm_session and not self._is_stop_sent:
             reasons.append("the motors have not received the stop yet; ask again in a period")
         return reasons
 
     def _find_unready_commands(self, now_ns: int) -> list[str]:
-        """Return what is wrong with the lease and with the stream of commands."""
-        if not self.lease.is_live(now_ns):
+        """Return a text for each problem of the lease and of the stream of commands."""
+        if not self.lease.is_held(now_ns):
             return ["nothing commands the robot: the lease is free"]
-        if self._command is None:
+        if self._newest_command is None:
             return [f"no commands from {self.lease.holder} yet"]
-        if now_ns - self._command_ns > self.description.lease_ns:  # the lease may also be renewed by requests
+        # Requests may renew the lease, too, so that a held lease does not prove that commands still arrive.
+        if now_ns - self._newest_command_ns > self.description.lease_ns:
             return [f"no commands from {self.lease.holder} any more"]
         return lifecycle.find_far_targets(
-            self._command, self._measured.angle_rad, self.description, self._isolation.joints
+            self._newest_command, self._measured_state.angle_rad, self.description, self._isolation.joints
         )
 
     # --- faults and isolation --------------------------------------------------------------------------------
 
-    def _record(self, fault: Fault, *, stops: bool) -> None:
-        """Log a fault. `stops` means that the robot is in `fault` or `estop` now because of it."""
-        fault = msgspec.structs.replace(fault, cause=fault.cause[:MAX_REASON_LENGTH])
-        self.faults_since_reset.add(fault, stops=stops)
-        self.faults_since_start.add(fault, stops=stops)
+    def _add_to_fault_logs(self, fault: Fault, *, stops_robot: bool) -> None:
+        """Add a fault to both logs.
 
-    def _isolate(self, fault: Fault, joints: Mask) -> bool:
-        """Isolate failed joints, and return whether that is allowed. Later faults of isolated joints are ignored."""
-        if self._isolation.covers(joints):
+        Args:
+            fault: Fault to add.
+            stops_robot: Whether the robot enters `fault` or `estop` because of this fault.
+        """
+        fault = msgspec.structs.replace(fault, cause=fault.cause[:MAX_REASON_LENGTH])
+        self.faults_since_reset.add(fault, stops_robot=stops_robot)
+        self.faults_since_start.add(fault, stops_robot=stops_robot)
+
+    def _try_isolate(self, fault: Fault, joints: JointMask) -> bool:
+        """Isolate failed joints if the robot may continue without them.
+
+        Args:
+            fault: Fault of the joints, which is logged.
+            joints: (n_joints,) mask of the joints.
+
+        Returns:
+            Whether the joints are isolated now. True without another log entry if they were isolated already.
+        """
+        if self._isolation.are_isolated(joints):
             return True
-        if self.state != "armed" or not self._isolation.isolate(joints):
+        if self.state != "armed" or not self._isolation.try_isolate(joints):
             return False
-        self._record(fault, stops=False)
+        self._add_to_fault_logs(fault, stops_robot=False)
         self.reason = f"armed, without {', '.join(self.isolated_joints)}: {fault.cause}"[:MAX_REASON_LENGTH]
         return True
 
     def _end_isolation(self) -> None:
-        """End the isolation of joints. Before the next arming, a new joint state must arrive."""
+        """End all isolations. The robot cannot be armed before a new joint state has arrived."""
         if self.isolated_joints:
             self._isolation.reset()
-            self._implausible = self._unknown_state("no joint state since the reset")
+            self._implausible_state = self._make_unknown_state("no joint state since the reset")
 
-    def _is_of_isolated_joint(self, fault: Fault) -> bool:
+    def _concerns_isolated_joint(self, fault: Fault) -> bool:
         return fault.reach == "joint" and self._isolation.is_isolated(fault.joint)
 
-    def _unknown_state(self, cause: str) -> ImplausibleState:
+    def _make_unknown_state(self, cause: str) -> ImplausibleState:
         fault = Fault(tick=0, what="state_invalid", cause=cause)
         return ImplausibleState(fault, np.ones(len(self.description.joints), dtype=np.bool_))
 
     # --- lease and answers -----------------------------------------------------------------------------------
 
-    def _drop_lease(self) -> None:
+    def _free_lease(self) -> None:
         self.lease = free_lease(self.lease)
         self._forget_commands()
 
     def _forget_commands(self) -> None:
-        self._command = None
+        self._newest_command = None
         self._last_sequence = -1
 
-    def _answer(self, reason: str | None, refusal: str | None = None) -> Answer:
-        """Answer a request. `reason` is None if it was granted; `refusal` is the reason as one word."""
+    def _make_answer(self, reason: str | None, refusal: str | None = None) -> Answer:
+        """Return the answer to a request.
+
+        Args:
+            reason: Text why the request is refused. None if it is granted.
+            refusal: Reason of the refusal as one word.
+        """
         return Answer(
             ok=reason is None,
             reason=(reason or self.reason)[:MAX_REASON_LENGTH],

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 from snakesim_hal.wire.messages import JointState
 
-TURN_RAD = 2 * math.pi
+REVOLUTION_RAD = 2 * math.pi
 # Motion after which the angles are saved again. What is saved differs from the truth by at most this angle, and by
 # what the joint turns while the disk is busy.
-KEEP_AFTER_RAD = math.pi / 4
+SAVE_THRESHOLD_RAD = math.pi / 4
 
 
 @dataclass(frozen=True)
@@ -28,75 +28,84 @@ class CableJoint:
     cable_turns: float  # maximum winding of the cable to either side of zero, in turns
 
 
-class Cables:
+class CableTracker:
     """The joints that have such a cable."""
 
-    def __init__(self, joints: Sequence[CableJoint], seen_rad: Mapping[str, float], unknown: Mapping[str, str]) -> None:
-        """Start to follow the joints.
+    def __init__(
+        self, joints: Sequence[CableJoint], last_angles_rad: Mapping[str, float], unknown_reasons: Mapping[str, str]
+    ) -> None:
+        """Start to track the angles of the joints.
 
         Args:
-            joints: the joints that have such a cable.
-            seen_rad: the counted angle at which each joint was last measured, by name.
-            unknown: why the angle of each other joint is not known, by name.
+            joints: Joints whose cable is wound when they turn.
+            last_angles_rad: Angle at which each joint was last measured, counted over all revolutions, by joint name.
+            unknown_reasons: Reason why the angle of a joint is not known, by joint name.
         """
         self._joints = joints
-        self._unknown = dict(unknown)
-        self._angles_rad = dict(seen_rad)  # counted over restarts
-        self._drives_rad: dict[str, float] = {}  # as the drive measures it
-        self._kept_rad: dict[str, float] = {}
+        self._unknown_reasons = dict(unknown_reasons)
+        self._angles_rad = dict(last_angles_rad)  # counted over restarts
+        self._drive_angles_rad: dict[str, float] = {}  # as the drive measures it
+        self._saved_angles_rad: dict[str, float] = {}
         self.save_problem = ""  # why the counted angles would be lost with this host; empty if they are saved
 
-    def follow(self, joints: JointState) -> None:
-        """Follow a sample."""
+    def update_angles(self, joints: JointState) -> None:
+        """Update the counted angles from a joint state. A joint turns at most half a revolution between two samples."""
         for joint in self._joints:
             if joint.name not in self._angles_rad:
                 continue
             drive_rad = joints.angle_rad[joint.index]
             if joints.valid[joint.index] and math.isfinite(drive_rad):
-                turns = round((self._angles_rad[joint.name] - drive_rad) / TURN_RAD)
-                self._angles_rad[joint.name] = drive_rad + turns * TURN_RAD
-                self._drives_rad[joint.name] = drive_rad
+                turns = round((self._angles_rad[joint.name] - drive_rad) / REVOLUTION_RAD)
+                self._angles_rad[joint.name] = drive_rad + turns * REVOLUTION_RAD
+                self._drive_angles_rad[joint.name] = drive_rad
 
-    def take_angles_to_save(self, *, all_of_it: bool = False) -> dict[str, float] | None:
-        """Return the counted angles if they should be saved now; from then on they count as saved.
+    def pop_angles_to_save(self, *, should_force: bool = False) -> dict[str, float] | None:
+        """Return the counted angles if they should be saved now, and mark them as saved.
 
         Args:
-            all_of_it: whether to save them even if no joint has turned far enough since the last time.
+            should_force: Whether to save the angles even if no joint has turned far enough since the last time.
+
+        Returns:
+            The angle in rad of each measured joint by name, or None if nothing should be saved.
         """
-        angles_rad = {name: angle for name, angle in self._angles_rad.items() if name in self._drives_rad}
+        angles_rad = {name: angle for name, angle in self._angles_rad.items() if name in self._drive_angles_rad}
         if not angles_rad:
             return None
-        if not all_of_it and not self._have_changed(angles_rad):
+        if not should_force and not self._have_angles_changed(angles_rad):
             return None
-        self._kept_rad = angles_rad
+        self._saved_angles_rad = angles_rad
         return dict(angles_rad)
 
     def list_arming_obstacles(self) -> list[str]:
-        """Return why the robot must not be armed: a turn is not known, or a cable could be wound too far."""
-        reasons = [f"{name}: {why}" for name, why in self._unknown.items()]
+        """Return a text for each reason why the robot must not be armed.
+
+        The number of revolutions of a joint is not known, a cable could be wound too far, or the angles cannot be
+        saved.
+        """
+        reasons = [f"{name}: {reason}" for name, reason in self._unknown_reasons.items()]
         for joint in self._joints:
-            drive_rad = self._drives_rad.get(joint.name)
+            drive_rad = self._drive_angles_rad.get(joint.name)
             if drive_rad is None:
                 continue
-            reason = _explain_winding(joint, drive_rad, self._angles_rad[joint.name])
+            reason = _find_winding_problem(joint, drive_rad, self._angles_rad[joint.name])
             if reason is not None:
                 reasons.append(reason)
         if self.save_problem:
             reasons.append(self.save_problem)
         return reasons
 
-    def _have_changed(self, angles_rad: Mapping[str, float]) -> bool:
-        """Return whether a joint has turned far enough since its angle was saved, or it never was."""
+    def _have_angles_changed(self, angles_rad: Mapping[str, float]) -> bool:
+        """Return whether a joint has turned far enough since its angle was saved, or its angle was never saved."""
         for name, angle_rad in angles_rad.items():
-            if abs(angle_rad - self._kept_rad.get(name, math.inf)) > KEEP_AFTER_RAD:
+            if abs(angle_rad - self._saved_angles_rad.get(name, math.inf)) > SAVE_THRESHOLD_RAD:
                 return True
         return False
 
 
-def _explain_winding(joint: CableJoint, drive_rad: float, angle_rad: float) -> str | None:
-    """Return what to do if the limits of a joint would let it wind its cable too far, or None."""
-    turns = round((angle_rad - drive_rad) / TURN_RAD)
-    max_turns = max(abs(joint.lower_rad / TURN_RAD + turns), abs(joint.upper_rad / TURN_RAD + turns))
+def _find_winding_problem(joint: CableJoint, drive_rad: float, angle_rad: float) -> str | None:
+    """Return the problem and the remedy if a joint could wind its cable too far within its limits; otherwise None."""
+    turns = round((angle_rad - drive_rad) / REVOLUTION_RAD)
+    max_turns = max(abs(joint.lower_rad / REVOLUTION_RAD + turns), abs(joint.upper_rad / REVOLUTION_RAD + turns))
     if max_turns <= joint.cable_turns:
         return None
     plural = "s" if abs(turns) > 1 else ""

@@ -3,23 +3,30 @@
 from snakesim_hal.wire.messages import Fault
 
 MAX_FAULTS = 32
-FIRST_FAULTS = MAX_FAULTS // 2  # the first faults usually show the cause, so the report lists as many
+FIRST_FAULT_COUNT = MAX_FAULTS // 2  # the first faults usually show the cause, so the report lists as many
 
 
 class FaultLog:
     """The faults since some event. A full log drops faults between the first and the newest ones."""
 
     def __init__(self) -> None:
-        self.stored: list[Fault] = []  # oldest first
-        self.left_out = 0
-        self._stop: Fault | None = None  # the newest that stopped the robot
+        self.faults: list[Fault] = []  # oldest first
+        self.dropped_count = 0
+        self._last_stopping_fault: Fault | None = None
 
-    def add(self, fault: Fault, *, stops: bool) -> None:
-        """Add a fault. `stops` means that the robot is in `fault` or `estop` now because of it."""
-        if stops:
-            self._stop = fault
-        self.stored.append(fault)
-        if len(self.stored) > MAX_FAULTS:
-            # The fault that stopped the robot stays: then the one behind it is dropped.
-            del self.stored[FIRST_FAULTS + (self.stored[FIRST_FAULTS] is self._stop)]
-            self.left_out += 1
+    def add(self, fault: Fault, *, stops_robot: bool) -> None:
+        """Add a fault, and drop one from the middle of a full log.
+
+        Args:
+            fault: Fault to add.
+            stops_robot: Whether the robot has entered `fault` or `estop` because of this fault.
+        """
+        if stops_robot:
+            self._last_stopping_fault = fault
+        self.faults.append(fault)
+        if len(self.faults) > MAX_FAULTS:
+            dropped_index = FIRST_FAULT_COUNT
+            if self.faults[dropped_index] is self._last_stopping_fault:
+                dropped_index += 1  # the fault that stopped the robot stays
+            del self.faults[dropped_index]
+            self.dropped_count += 1

@@ -13,7 +13,7 @@ from snakesim_hal.wire.freshness import max_state_age_ns
 from snakesim_hal.wire.messages import Description, JointDescription, Mode
 
 Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]  # (n_joints,): which joints
+JointMask = NDArray[np.bool_]  # (n_joints,): which joints
 
 
 @dataclass(frozen=True)
@@ -30,36 +30,36 @@ class JointLimits:
     max_step_rad: float  # maximum distance of an angle target from the measured angle
     period_s: float
     lease_ns: int
-    oldest_state_ns: int  # an older joint state is rejected
+    max_state_age_ns: int  # an older joint state is rejected
     layout: str
     # The same limits joint by joint, for loops over plain floats.
     joints: tuple[JointDescription, ...]
     # Modes that the joints support.
-    has_velocity_mode: Mask
-    all_modes: bool  # whether every joint supports every mode
+    has_velocity_mode: JointMask
+    has_all_modes: bool  # whether every joint supports every mode
 
     @staticmethod
     def from_description(description: Description) -> "JointLimits":
-        """Collect the limits that a description states."""
+        """Collect the limits of all joints from the description of a robot, as vectors and joint by joint."""
         joints = description.joints
 
-        def column(field: str) -> Floats:
+        def collect_field(field: str) -> Floats:
             return np.array([getattr(joint, field) for joint in joints], dtype=np.float64)
 
         return JointLimits(
-            angle_min_rad=column("angle_min_rad"),
-            angle_max_rad=column("angle_max_rad"),
-            speed_rad_s=column("speed_limit_rad_s"),
-            acceleration_rad_s2=column("acceleration_limit_rad_s2"),
-            torque_nm=column("torque_limit_nm"),
+            angle_min_rad=collect_field("angle_min_rad"),
+            angle_max_rad=collect_field("angle_max_rad"),
+            speed_rad_s=collect_field("speed_limit_rad_s"),
+            acceleration_rad_s2=collect_field("acceleration_limit_rad_s2"),
+            torque_nm=collect_field("torque_limit_nm"),
             max_step_rad=description.max_step_rad,
             period_s=description.period_ns * 1e-9,
             lease_ns=description.lease_ns,
-            oldest_state_ns=max_state_age_ns(description),
+            max_state_age_ns=max_state_age_ns(description),
             layout=description.layout,
             joints=tuple(joints),
             has_velocity_mode=np.array([joint.supports_mode(Mode.VELOCITY) for joint in joints]),
-            all_modes=all(joint.supports_mode(mode) for joint in joints for mode in Mode),
+            has_all_modes=all(joint.supports_mode(mode) for joint in joints for mode in Mode),
         )
 
     def clip_angles(self, angle_rad: Floats) -> Floats:
@@ -68,7 +68,7 @@ class JointLimits:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredState:
     """The measured state of the joints, (n_joints,) each."""
 
     angle_rad: Floats
@@ -77,7 +77,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Applied:
+class AppliedSetpoints:
     """Limited setpoints of the joints, (n_joints,) each."""
 
     mode: Ints  # values of `Mode`

@@ -14,65 +14,68 @@ class Lease:
     priority: int = 0
     expires_ns: int = 0
 
-    def is_live(self, now_ns: int) -> bool:
+    def is_held(self, now_ns: int) -> bool:
         """Return whether the lease is held at this time."""
         return self.holder is not None and now_ns <= self.expires_ns
 
 
 @dataclass(frozen=True)
 class LeaseDecision:
-    """The decision about a request."""
+    """The decision about a lease request."""
 
     lease: Lease  # after the request
-    refusal: str | None = None  # why it was refused; None: it was granted
-    changed_hands: bool = False
-    refusal_word: str | None = None  # the refusal as one word
+    refusal: str | None = None  # text why the request is refused; None if it is granted
+    has_holder_changed: bool = False
+    refusal_code: str | None = None  # the reason of the refusal as one word
 
 
-def decide_lease_request(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> LeaseDecision:
-    """Decide a request. While a lease is live, it is granted only to its holder, or to a higher priority.
+def decide_lease_request(lease: Lease, request: LeaseRequest, now_ns: int, lease_duration_ns: int) -> LeaseDecision:
+    """Grant or refuse a request to acquire, renew or release a lease.
+
+    While the lease is held, only its holder may renew or release it, and only a client with a higher priority may
+    acquire it.
 
     Args:
-        lease: the lease before the request.
-        request: acquire, renew or release.
-        now_ns: safety time.
-        term_ns: how long a lease lasts without a renewal.
+        lease: Lease before the request.
+        request: Request of a client.
+        now_ns: Safety time in ns.
+        lease_duration_ns: Duration of a lease without a renewal, in ns.
     """
-    is_holder = lease.is_live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
+    is_holder = lease.is_held(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
     match request.action:
         case "acquire":
-            if lease.is_live(now_ns) and request.priority <= lease.priority:
-                left_ms = (lease.expires_ns - now_ns) / 1e6
+            if lease.is_held(now_ns) and request.priority <= lease.priority:
+                remaining_ms = (lease.expires_ns - now_ns) / 1e6
                 return LeaseDecision(
                     lease,
                     f"held by {lease.holder} (epoch {lease.epoch}, priority {lease.priority}) for another "
-                    f"{left_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
-                    refusal_word="lease_held",
+                    f"{remaining_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
+                    refusal_code="lease_held",
                 )
-            acquired = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + term_ns)
-            return LeaseDecision(acquired, changed_hands=True)
+            acquired = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + lease_duration_ns)
+            return LeaseDecision(acquired, has_holder_changed=True)
         case "renew":
             if not is_holder:
-                return _refuse_other_holder(lease, request, "acquire the lease first")
-            return LeaseDecision(renew_lease(lease, now_ns, term_ns))
+                return _make_not_holder_refusal(lease, request, "acquire the lease first")
+            return LeaseDecision(renew_lease(lease, now_ns, lease_duration_ns))
         case "release":
             if not is_holder:
-                return _refuse_other_holder(lease, request, "nothing to release")
-            return LeaseDecision(free_lease(lease), changed_hands=True)
+                return _make_not_holder_refusal(lease, request, "nothing to release")
+            return LeaseDecision(free_lease(lease), has_holder_changed=True)
 
 
-def _refuse_other_holder(lease: Lease, request: LeaseRequest, advice: str) -> LeaseDecision:
-    """Refuse a request of a client that does not hold the lease."""
+def _make_not_holder_refusal(lease: Lease, request: LeaseRequest, advice: str) -> LeaseDecision:
+    """Return the refusal of a request of a client that does not hold the lease."""
     return LeaseDecision(
-        lease, f"{request.holder} does not hold epoch {request.epoch}; {advice}", refusal_word="not_holder"
+        lease, f"{request.holder} does not hold epoch {request.epoch}; {advice}", refusal_code="not_holder"
     )
 
 
-def renew_lease(lease: Lease, now_ns: int, term_ns: int) -> Lease:
-    """Return the lease, extended by a term from now on."""
-    return replace(lease, expires_ns=now_ns + term_ns)
+def renew_lease(lease: Lease, now_ns: int, lease_duration_ns: int) -> Lease:
+    """Return the lease with an expiry time one lease duration from now."""
+    return replace(lease, expires_ns=now_ns + lease_duration_ns)
 
 
 def free_lease(lease: Lease) -> Lease:
-    """Return the free lease. The epoch stays, so that later commands of the last holder are rejected."""
+    """Return a lease without a holder. Its epoch stays, so that later commands of the last holder are rejected."""
     return Lease(epoch=lease.epoch)

@@ -11,12 +11,12 @@ Each unmet condition for arming has a reason as text and as one word.
 from typing import Literal, NamedTuple
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.safety.joint_limits import Mask
+from snakesim_hal.safety.joint_limits import JointMask
 from snakesim_hal.wire.messages import Description, JointCommand, LifecycleRequest, LifecycleState, Mode
 
-Event = Literal["arm", "disarm", "fault", "estop", "reset"]
+LifecycleEvent = Literal["arm", "disarm", "fault", "estop", "reset"]
 
-_TRANSITIONS: dict[tuple[LifecycleState, Event], LifecycleState] = {
+_TRANSITIONS: dict[tuple[LifecycleState, LifecycleEvent], LifecycleState] = {
     ("disarmed", "arm"): "armed",
     ("disarmed", "disarm"): "disarmed",
     ("disarmed", "fault"): "fault",
@@ -34,7 +34,7 @@ _TRANSITIONS: dict[tuple[LifecycleState, Event], LifecycleState] = {
 }
 
 
-def next_state(state: LifecycleState, event: Event) -> LifecycleState | None:
+def next_state(state: LifecycleState, event: LifecycleEvent) -> LifecycleState | None:
     """Return the state that follows, or None if the event is not allowed in this state."""
     return _TRANSITIONS.get((state, event))
 
@@ -56,12 +56,15 @@ REFUSAL_ORDER = (
 class UnmetCondition(NamedTuple):
     """A condition for arming that is not met."""
 
-    refusal: str  # one of ORDER
+    refusal: str  # one of REFUSAL_ORDER
     reason: str  # for people
 
 
 def find_address_mismatches(request: LifecycleRequest, description: Description) -> list[UnmetCondition]:
-    """Return the names in a request to arm that do not match this robot."""
+    """Return an unmet condition for each name in a request to arm that does not match this robot.
+
+    The request must name the robot, its backend, and the hash of its configuration.
+    """
     unmet: list[UnmetCondition] = []
     if request.robot != description.robot:
         reason = f"this robot is {description.robot!r}, the request names {request.robot!r}"
@@ -70,29 +73,34 @@ def find_address_mismatches(request: LifecycleRequest, description: Description)
         reason = f"this backend is {description.backend!r}, the request names {request.backend!r}"
         unmet.append(UnmetCondition("wrong_backend", reason))
     if request.config_hash != description.config_hash:
-        requested = "none"
+        requested_hash = "none"
         if request.config_hash is not None:
-            requested = repr(request.config_hash)
+            requested_hash = repr(request.config_hash)
         reason = (
-            f"the configuration is {description.config_hash!r}, the request names {requested}: read hal/description, "
-            f"and arm with its config_hash"
+            f"the configuration is {description.config_hash!r}, the request names {requested_hash}: "
+            f"read hal/description, and arm with its config_hash"
         )
         unmet.append(UnmetCondition("wrong_config", reason))
     return unmet
 
 
-def find_far_targets(command: JointCommand, angle_rad: Floats, description: Description, isolated: Mask) -> list[str]:
-    """Return a reason for each joint that a command would move at once: it must hold the pose at arming.
+def find_far_targets(
+    command: JointCommand, angle_rad: Floats, description: Description, isolated: JointMask
+) -> list[str]:
+    """Return a text for each joint that a command would move at once. At arming, a command must hold the pose.
 
     Args:
-        command: the newest command before the arming.
-        angle_rad: (n_joints,), the measured angles.
-        description: the robot as its backend describes it: joints, their limits, and the lease term.
-        isolated: (n_joints,), joints that stay passive and are not checked.
+        command: Newest command before the arming.
+        angle_rad: (n_joints,) measured angles.
+        description: Robot as its backend describes it, with `max_step_rad`.
+        isolated: (n_joints,) mask of joints that stay passive and are not checked.
+
+    Returns:
+        An empty list if the command holds every joint.
     """
     reasons: list[str] = []
     max_step_rad = description.max_step_rad
-    for joint, mode, target, angle, is_isolated in zip(
+    for joint, mode, target, measured_rad, is_isolated in zip(
         description.joints, command.mode, command.target, angle_rad.tolist(), isolated.tolist(), strict=True
     ):
         if is_isolated:
@@ -101,9 +109,9 @@ def find_far_targets(command: JointCommand, angle_rad: Floats, description: Desc
             case Mode.PASSIVE:
                 continue
             case Mode.POSITION:
-                if abs(target - angle) > max_step_rad:
+                if abs(target - measured_rad) > max_step_rad:
                     reasons.append(
-                        f"{joint.name} has a target {target - angle:+.2f} rad from its angle; at most "
+                        f"{joint.name} has a target {target - measured_rad:+.2f} rad from its angle; at most "
                         f"{max_step_rad} rad at arming"
                     )
             case _:

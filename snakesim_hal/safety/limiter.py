@@ -1,7 +1,7 @@
 """The limiter: the pure function between a command from the network and a motor. The same for every backend.
 
-`find_refusal` rejects a command as a whole. It checks, in this order: lease, freshness, layout and length, modes, and
-that every number is finite.
+`find_rejection_reason` rejects a command as a whole. It checks, in this order: lease, freshness, layout and length,
+modes, and that every number is finite.
 
 `limit_command` then limits every target of an accepted command: angle, torque, distance to the measured angle, and
 rate. The rate limit of a joint that changes mode starts from the present state of its motor, so no mode switch makes
@@ -24,7 +24,7 @@ import numpy as np
 
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
+from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, MeasuredState
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.messages import JointCommand, JointDescription, Mode
 
@@ -32,7 +32,7 @@ REACTION_PERIODS = 4  # the minimum that keeps joints from overshooting their en
 MIN_SPEED_LIMIT_RAD_S = 1e-9  # divisor for a joint that may not move
 MIN_STIFFNESS_NM_PER_RAD = 1e-9  # divisor for a joint without stiffness
 
-Refusal = Literal[
+RejectionReason = Literal[
     "no_lease",
     "wrong_epoch",
     "replayed",
@@ -49,7 +49,7 @@ _MODES = {int(mode): mode for mode in Mode}
 # --- checks of a whole command ---------------------------------------------------------------------------------
 
 
-def find_refusal(
+def find_rejection_reason(
     command: JointCommand,
     *,
     lease: Lease,
@@ -58,19 +58,19 @@ def find_refusal(
     last_sequence: int,
     age_ns: int,
     limits: JointLimits,
-) -> Refusal | None:
+) -> RejectionReason | None:
     """Return the first reason to reject a command as a whole, or None if it may be applied.
 
     Args:
-        command: the command as it was received.
-        lease: the present lease.
-        now_ns: safety time.
-        tick: the newest tick that the host has published.
-        last_sequence: sequence number of the last accepted command.
-        age_ns: how long ago the state that the command answers was published.
-        limits: the limits of the robot.
+        command: Command as it was received.
+        lease: Current lease.
+        now_ns: Safety time in ns.
+        tick: Newest tick that the host has published.
+        last_sequence: Sequence number of the last accepted command; -1 if there is none.
+        age_ns: Time in ns since the joint state that the command answers was published.
+        limits: Limits of the robot.
     """
-    if not lease.is_live(now_ns):
+    if not lease.is_held(now_ns):
         return "no_lease"
     if command.lease_epoch != lease.epoch:
         return "wrong_epoch"
@@ -82,12 +82,12 @@ def find_refusal(
         return "stale"
     if command.layout != limits.layout:
         return "wrong_layout"
-    joints = len(limits.torque_nm)
-    if len(command.mode) != joints or len(command.target) != joints:
+    joint_count = len(limits.torque_nm)
+    if len(command.mode) != joint_count or len(command.target) != joint_count:
         return "wrong_length"
-    if command.torque_limit_nm is not None and len(command.torque_limit_nm) != joints:
+    if command.torque_limit_nm is not None and len(command.torque_limit_nm) != joint_count:
         return "wrong_length"
-    if not limits.all_modes and not all(map(JointDescription.supports_mode, limits.joints, command.mode)):
+    if not limits.has_all_modes and not all(map(JointDescription.supports_mode, limits.joints, command.mode)):
         return "wrong_mode"
     if not all(map(math.isfinite, command.target)):
         return "not_finite"
@@ -102,21 +102,21 @@ def find_refusal(
 def limit_command(
     command: JointCommand,
     *,
-    measured: Measured,
-    last: Applied,
+    measured: MeasuredState,
+    last: AppliedSetpoints,
     limits: JointLimits,
     torque_fraction: Floats,
-) -> Applied:
+) -> AppliedSetpoints:
     """Limit the torque limits and the targets of an accepted command.
 
     The loop runs on plain floats: for a dozen joints that is several times faster than vectors.
 
     Args:
-        command: a command that `find_refusal` has accepted.
-        measured: the last plausible state of the joints.
-        last: the setpoints of the period before.
-        limits: the limits of the robot.
-        torque_fraction: (n_joints,), from 0 to 1; what derating leaves of each torque limit.
+        command: Command that `find_rejection_reason` has accepted.
+        measured: Last plausible state of the joints.
+        last: Setpoints of the previous period.
+        limits: Limits of the robot.
+        torque_fraction: (n_joints,) fraction of each torque limit that derating leaves, from 0 to 1.
     """
     torque_limits = _limit_torque_limits(command, last, limits, torque_fraction)
     targets: list[float] = []
@@ -137,7 +137,7 @@ def limit_command(
             continue
         start = last_target
         if mode != last_mode:
-            start = find_bumpless_target(joint, mode, angle, velocity, torque)
+            start = compute_bumpless_target(joint, mode, angle, velocity, torque)
         match mode:
             case Mode.POSITION:
                 target = _limit_angle_target(joint, requested, start, angle, limits)
@@ -146,15 +146,21 @@ def limit_command(
             case _:  # torque: passive joints have been handled above
                 target = _limit_torque_target(joint, requested, start, torque_limit, angle, velocity, limits.period_s)
         targets.append(target)
-    return Applied(np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits))
+    return AppliedSetpoints(np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits))
 
 
 def _limit_torque_limits(
-    command: JointCommand, last: Applied, limits: JointLimits, torque_fraction: Floats
+    command: JointCommand, last: AppliedSetpoints, limits: JointLimits, torque_fraction: Floats
 ) -> list[float]:
-    """Return each joint's torque limit in N·m: as requested, but at most what derating and its rate limit allow.
+    """Return each joint's torque limit in N·m: as requested, but at most what derating and the rate limit allow.
 
     A torque limit may fall at once, but rises no faster than the torque rate limit.
+
+    Args:
+        command: Accepted command. Without torque limits of its own, it requests those of the robot.
+        last: Setpoints of the previous period.
+        limits: Limits of the robot.
+        torque_fraction: (n_joints,) fraction of each torque limit that derating leaves, from 0 to 1.
     """
     requested_limits = command.torque_limit_nm
     if requested_limits is None:
@@ -166,8 +172,8 @@ def _limit_torque_limits(
     for joint, requested, derated, last_limit in zip(
         limits.joints, requested_limits, derated_limits, last_limits, strict=True
     ):
-        risen = last_limit + joint.torque_rate_limit_nm_s * period_s
-        torque_limits.append(_clamp(requested, 0.0, min(derated, risen)))
+        rate_limited = last_limit + joint.torque_rate_limit_nm_s * period_s
+        torque_limits.append(_clamp(requested, 0.0, min(derated, rate_limited)))
     return torque_limits
 
 
@@ -192,7 +198,7 @@ def _limit_velocity_target(
 ) -> float:
     """Return the velocity target in rad/s that is nearest to the requested one within all limits."""
     max_speed = joint.speed_limit_rad_s
-    low, high = velocity_bounds_at_ends(joint, angle_rad, period_s)
+    low, high = compute_velocity_bounds(joint, angle_rad, period_s)
     low = _clamp(low, -max_speed, max_speed)
     high = _clamp(high, -max_speed, max_speed)
     step = joint.acceleration_limit_rad_s2 * period_s
@@ -209,7 +215,7 @@ def _limit_torque_target(
     period_s: float,
 ) -> float:
     """Return the torque target in N·m that is nearest to the requested one within all limits."""
-    low, high = torque_bounds_at_ends(joint, angle_rad, velocity_rad_s, period_s)
+    low, high = compute_torque_bounds(joint, angle_rad, velocity_rad_s, period_s)
     low = _clamp(low, -torque_limit_nm, torque_limit_nm)
     high = _clamp(high, -torque_limit_nm, torque_limit_nm)
     step = joint.torque_rate_limit_nm_s * period_s
@@ -227,14 +233,18 @@ def _clamp(value: float, low: float, high: float) -> float:
 # --- ends of a joint -------------------------------------------------------------------------------------------
 
 
-def velocity_bounds_at_ends(joint: JointDescription, angle_rad: float, period_s: float) -> tuple[float, float]:
+def compute_velocity_bounds(joint: JointDescription, angle_rad: float, period_s: float) -> tuple[float, float]:
     """Return the minimum and maximum velocity in rad/s from which a joint can stop before its ends."""
-    speed_to_lower_end = stoppable_speed(angle_rad - joint.angle_min_rad, joint.acceleration_limit_rad_s2, period_s)
-    speed_to_upper_end = stoppable_speed(joint.angle_max_rad - angle_rad, joint.acceleration_limit_rad_s2, period_s)
+    speed_to_lower_end = compute_stoppable_speed(
+        angle_rad - joint.angle_min_rad, joint.acceleration_limit_rad_s2, period_s
+    )
+    speed_to_upper_end = compute_stoppable_speed(
+        joint.angle_max_rad - angle_rad, joint.acceleration_limit_rad_s2, period_s
+    )
     return -speed_to_lower_end, speed_to_upper_end
 
 
-def torque_bounds_at_ends(
+def compute_torque_bounds(
     joint: JointDescription, angle_rad: float, velocity_rad_s: float, period_s: float
 ) -> tuple[float, float]:
     """Return the minimum and maximum torque in N·m that keep a joint between its ends.
@@ -242,9 +252,14 @@ def torque_bounds_at_ends(
     With the velocity bounds v_min <= v <= v_max and a velocity gain k, the torque bounds are k (v_min - v) and
     k (v_max - v): what a motor in velocity mode would exert with these bounds as its target.
     """
-    speed_to_lower_end = stoppable_speed(angle_rad - joint.angle_min_rad, joint.acceleration_limit_rad_s2, period_s)
-    speed_to_upper_end = stoppable_speed(joint.angle_max_rad - angle_rad, joint.acceleration_limit_rad_s2, period_s)
-    # A low velocity gain would limit torque far from the end: so allow full torque to a motor at rest at full speed.
+    speed_to_lower_end = compute_stoppable_speed(
+        angle_rad - joint.angle_min_rad, joint.acceleration_limit_rad_s2, period_s
+    )
+    speed_to_upper_end = compute_stoppable_speed(
+        joint.angle_max_rad - angle_rad, joint.acceleration_limit_rad_s2, period_s
+    )
+    # A low velocity gain would limit the torque far from the ends. So the gain is at least the one that gives full
+    # torque for a speed error of the whole speed limit.
     max_speed = max(joint.speed_limit_rad_s, MIN_SPEED_LIMIT_RAD_S)
     gain = max(joint.velocity_gain_nm_s_per_rad, joint.torque_limit_nm / max_speed)
     low = -gain * (speed_to_lower_end + velocity_rad_s)
@@ -257,7 +272,7 @@ def torque_bounds_at_ends(
     return low, max(low, high)
 
 
-def stoppable_speed(distance_rad: float, acceleration_rad_s2: float, period_s: float) -> float:
+def compute_stoppable_speed(distance_rad: float, acceleration_rad_s2: float, period_s: float) -> float:
     """Return the maximum speed in rad/s from which a joint can stop within a distance d.
 
     The joint continues at its speed v for a reaction time t of REACTION_PERIODS, and then brakes with its acceleration
@@ -270,13 +285,23 @@ def stoppable_speed(distance_rad: float, acceleration_rad_s2: float, period_s: f
     return acceleration_rad_s2 * (math.sqrt(reaction_s**2 + 2.0 * distance_rad / acceleration_rad_s2) - reaction_s)
 
 
-def find_bumpless_target(
+def compute_bumpless_target(
     joint: JointDescription, mode: Mode, angle_rad: float, velocity_rad_s: float, torque_nm: float
 ) -> float:
-    """Return the target with which a motor that changes to `mode` keeps its present torque.
+    """Return the target with which a motor that changes to another mode keeps its current torque.
 
     A motor in position mode exerts kp (target - angle) - kd velocity, and one in velocity mode kv (target - velocity).
     Both equations are solved for the target.
+
+    Args:
+        joint: Joint with the gains of its motor.
+        mode: Mode that the motor changes to.
+        angle_rad: Measured angle.
+        velocity_rad_s: Measured velocity.
+        torque_nm: Measured torque.
+
+    Returns:
+        The target in rad, rad/s or N·m, depending on the mode.
     """
     match mode:
         case Mode.POSITION:
@@ -293,7 +318,12 @@ def find_bumpless_target(
 # --- output ----------------------------------------------------------------------------------------------------
 
 
-def make_safe_setpoints(applied: Applied, isolated: frozenset[int]) -> SafeSetpoints:
-    """Convert limited setpoints for the backend. `isolated` has the indices of isolated joints."""
+def make_safe_setpoints(applied: AppliedSetpoints, isolated: frozenset[int]) -> SafeSetpoints:
+    """Return limited setpoints in the form that a backend gets.
+
+    Args:
+        applied: Limited setpoints.
+        isolated: Indices of isolated joints.
+    """
     modes = [_MODES[code] for code in applied.mode.tolist()]
     return SafeSetpoints(modes, applied.target.tolist(), applied.torque_limit_nm.tolist(), isolated)

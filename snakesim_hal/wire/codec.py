@@ -46,11 +46,11 @@ class Decoder(Generic[MessageT]):
         """Decode a sample.
 
         Args:
-            payload: the bytes of the sample.
-            encoding: its Zenoh encoding.
+            payload: The bytes of the sample.
+            encoding: Zenoh encoding of the sample.
 
         Raises:
-            WireError: it is another message or malformed; has a reason to count by.
+            WireError: The sample is another message, or is malformed. `reason` of the error is a short code.
         """
         if encoding != self.encoding:
             detail = f"got {encoding[:MAX_ENCODING_LENGTH]!r}, want {self.encoding!r}"

@@ -42,7 +42,7 @@ class CustomMessage:
     units: dict[str, str]  # unit of each numeric field; "1": a count, a flag or a ratio
     schema: str
 
-    def numbers(self, sample: CustomSample) -> dict[str, float]:
+    def extract_numeric_values(self, sample: CustomSample) -> dict[str, float]:
         """Return the numbers of a sample by field, those of a list as `field.0`, `field.1` ...
 
         A null becomes NaN. Words and texts are left out.
@@ -66,14 +66,14 @@ def _to_number(value: float | None) -> float:
 
 
 def make_message_schema(message: Any, whose: str) -> str:
-    """Return the JSON Schema of an author's message.
+    """Return the JSON Schema of the message class of a custom sensor, after a check that it is allowed.
 
     Args:
-        message: the class, as the author's plugin gives it.
-        whose: name of the sensor, which errors begin with.
+        message: Class of the message, as the author's plugin gives it.
+        whose: Name of the sensor, which errors start with.
 
     Raises:
-        ConfigError: it is not a class that can be a message.
+        ConfigError: The class cannot be a message.
     """
     if not (isinstance(message, type) and issubclass(message, CustomSample) and message is not CustomSample):
         raise ConfigError(
@@ -98,10 +98,10 @@ def parse_custom_message(schema: str) -> CustomMessage:
     """Return the message that a JSON Schema describes; the newest SCHEMAS_CACHED of them are cached.
 
     Args:
-        schema: from a robot's description or a recording, so it may be wrong or hostile.
+        schema: JSON Schema from a robot's description or a recording, which may be wrong or hostile.
 
     Raises:
-        WireError: the schema describes no allowed message; the error's detail begins with the field.
+        WireError: The schema does not describe an allowed message. The error's detail starts with the field.
     """
     if len(schema) > MAX_CUSTOM_SCHEMA:
         raise WireError("malformed", f" has a schema of {len(schema)} characters, at most {MAX_CUSTOM_SCHEMA}")
@@ -116,10 +116,11 @@ def parse_custom_message(schema: str) -> CustomMessage:
 def _build_custom_message(schema: str) -> CustomMessage:
     """Build the message class that a JSON Schema describes, and find the units of its fields.
 
-    The text comes from another process and may be anything: the caller turns all errors into a WireError.
+    Args:
+        schema: JSON Schema from another process, which may be anything. The caller turns all errors into a WireError.
 
     Raises:
-        WireError: a field, or the number of fields, is not allowed in a message.
+        WireError: A field, or the number of fields, is not allowed in a message.
         KeyError, AttributeError, msgspec.DecodeError, or one of SCHEMA_ERRORS: the text is no schema of a message.
     """
     content = msgspec.json.decode(schema, type=dict[str, Any])
@@ -132,7 +133,7 @@ def _build_custom_message(schema: str) -> CustomMessage:
     for name, field in fields.items():
         if not _FIELD_NAME.fullmatch(name) or hasattr(CustomSample, name):
             raise WireError("malformed", f".{shorten(name)} is no name of a field: lower case, at most 40 characters")
-        field_type = _make_type(field, name, units)
+        field_type = _make_field_type(field, name, units)
         if name in required:
             definitions.append((name, field_type))
         else:
@@ -142,21 +143,21 @@ def _build_custom_message(schema: str) -> CustomMessage:
     return CustomMessage(message, units, schema)
 
 
-def _make_type(field: dict[str, Any], name: str, units: dict[str, str], *, in_list: bool = False) -> Any:
-    """Return the Python type of a field.
+def _make_field_type(field: dict[str, Any], name: str, units: dict[str, str], *, in_list: bool = False) -> Any:
+    """Return the Python type of a field, and add the unit of a numeric field to `units`.
 
     Args:
-        field: the schema of the field, or of the entries of a list.
-        name: name of the field.
-        units: gets the unit of a numeric field, by its name.
-        in_list: whether `field` describes the entries of a list.
+        field: JSON Schema of the field, or of the entries of a list.
+        name: Name of the field.
+        units: Units by the name of the field, which are changed.
+        in_list: Whether `field` describes the entries of a list.
 
     Raises:
-        WireError: the type is not allowed.
+        WireError: The type is not allowed.
     """
     match field:
         case {"anyOf": [inner, {"type": "null"}]}:
-            return _make_type(inner, name, units, in_list=in_list) | None
+            return _make_field_type(inner, name, units, in_list=in_list) | None
         case {"type": "number" | "integer"}:
             return _make_number_type(field, name, units)
         case {"type": "boolean"}:
@@ -165,10 +166,10 @@ def _make_type(field: dict[str, Any], name: str, units: dict[str, str], *, in_li
         case {"type": "array", "items": {} as entry, "maxItems": int(max_length)} if (
             not in_list and max_length <= MAX_BEAMS
         ):
-            entry_type: Any = _make_type(entry, name, units, in_list=True)
+            entry_type: Any = _make_field_type(entry, name, units, in_list=True)
             return Annotated[list[entry_type], Meta(max_length=max_length)]
         case {"type": "array", "prefixItems": [*entries]} if not in_list and 0 < len(entries) <= MAX_BEAMS:
-            entry_types = [_make_type(entry, name, units, in_list=True) for entry in entries]
+            entry_types = [_make_field_type(entry, name, units, in_list=True) for entry in entries]
             return tuple[tuple(entry_types)]
         case {"type": "string", "maxLength": int(max_length)} if not in_list:
             return Annotated[str, Meta(max_length=min(max_length, MAX_TEXT_LENGTH))]

@@ -16,32 +16,35 @@ from snakesim_hal.wire.codec import Decoder, encode
 from snakesim_hal.wire.custom_sample import CustomMessage
 from snakesim_hal.wire.messages import VERSIONS, CustomSample, Message
 
-NOT_PLAIN = (TypeError, ValueError, OverflowError, RecursionError)  # what the encoder raises
+ENCODING_ERRORS = (TypeError, ValueError, OverflowError, RecursionError)  # what the encoder raises
 MAX_VALUE_LENGTH = 100  # characters of a value that an error quotes
 # One step of the path in an error of msgspec, such as `.angle_rad` or `[3]`.
 PATH_STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
 ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
 
-_decoder = cache(Decoder[Any])
+_make_decoder = cache(Decoder[Any])
 
 
 def encode_checked(key: str, message: Message, custom: CustomMessage | None = None) -> bytes:
-    """Encode a message, after a check that readers of its key accept it.
+    """Encode a message, and check that readers of its key accept it.
 
     Args:
-        key: where it is sent, relative to the robot's namespace.
-        message: the message.
-        custom: the description of a custom sensor's message by the robot; None: its class describes it.
+        key: Key of the message, relative to the robot's namespace.
+        message: Message to encode.
+        custom: Message of a custom sensor as the robot describes it. None if the class of the message describes it.
+
+    Returns:
+        The bytes to send.
 
     Raises:
-        WireError: readers would reject it; names field, value, and what is allowed.
+        WireError: Readers would reject the message. The error names the field, its value, and what is allowed.
     """
-    expected = _find_message_type(key, message, custom)
+    expected_type = _find_message_type(key, message, custom)
     payload = encode_unchecked(message)
     try:
-        _decoder(expected).decode_payload(payload)
+        _make_decoder(expected_type).decode_payload(payload)
     except WireError as error:
-        raise WireError(error.reason, find_wrong_value(message) or error.detail) from None
+        raise WireError(error.reason, describe_invalid_field(message) or error.detail) from None
     return payload
 
 
@@ -64,48 +67,55 @@ def encode_unchecked(message: Message) -> bytes:
         raise WireError("unknown_message", f"a {type(message).__name__} is no message")
     try:
         return encode(message)
-    except NOT_PLAIN as error:
-        raise WireError("malformed", find_wrong_value(message) or f"{type(error).__name__}: {error}") from None
+    except ENCODING_ERRORS as error:
+        raise WireError("malformed", describe_invalid_field(message) or f"{type(error).__name__}: {error}") from None
 
 
-def find_wrong_value(message: Message, called: str = "") -> str:
+def describe_invalid_field(message: Message, message_label: str = "") -> str:
     """Describe the first field value of a message that readers would reject.
 
     Args:
-        message: the message.
-        called: name of the message in the text; empty means the name of its class.
+        message: Message to check.
+        message_label: Name of the message in the text. Empty for the name of its class.
 
     Returns:
         The field, its value and what is allowed; empty if each value is valid by itself.
     """
-    name = called or type(message).__name__
+    name = message_label or type(message).__name__
     for field in msgspec.structs.fields(type(message)):
         value = getattr(message, field.name)
-        where = f"{name}.{field.name}"
+        field_path = f"{name}.{field.name}"
         try:
             msgspec.msgpack.decode(encode(value), type=field.type)
         except msgspec.ValidationError as error:
-            expected, _, path = str(error).removeprefix("Expected ").partition(" - at ")
-            value, where = _follow_path(value, where, path)
-            return _describe_wrong_value(where, value, expected)
-        except NOT_PLAIN:
+            # An error of msgspec reads "Expected `float` <= 1.0 - at `$[3]`"; the path may be missing.
+            expected, _, inner_path = str(error).removeprefix("Expected ").partition(" - at ")
+            value, field_path = _follow_path(value, field_path, inner_path)
+            return _describe_wrong_value(field_path, value, expected)
+        except ENCODING_ERRORS:
             return _describe_wrong_value(
-                where, value, "plain Python numbers, texts and lists: use float() or .tolist()"
+                field_path, value, "plain Python numbers, texts and lists: use float() or .tolist()"
             )
     return ""
 
 
-def _follow_path(value: Any, where: str, path: str) -> tuple[Any, str]:
-    """Return the inner value that a path in an error of msgspec leads to, and its name."""
-    for name, index in PATH_STEP.findall(path.partition(ANY_KEY)[0]):
+def _follow_path(value: Any, field_path: str, inner_path: str) -> tuple[Any, str]:
+    """Return the inner value that a path in an error of msgspec leads to, and the whole path to it.
+
+    Args:
+        value: Value of a field.
+        field_path: Message and field, such as `JointState.angle_rad`.
+        inner_path: Path in the error of msgspec, such as `$[3]`.
+    """
+    for name, index in PATH_STEP.findall(inner_path.partition(ANY_KEY)[0]):
         if index:
             value = value[int(index)]
-            where = f"{where}[{index}]"
+            field_path = f"{field_path}[{index}]"
         else:
             value = value[name] if isinstance(value, dict) else getattr(value, name)
-            where = f"{where}.{name}"
-    return value, where
+            field_path = f"{field_path}.{name}"
+    return value, field_path
 
 
-def _describe_wrong_value(where: str, value: object, expected: str) -> str:
-    return f"{where} is {shorten(repr(value), MAX_VALUE_LENGTH)}, must be {expected}"
+def _describe_wrong_value(field_path: str, value: object, expected: str) -> str:
+    return f"{field_path} is {shorten(repr(value), MAX_VALUE_LENGTH)}, must be {expected}"

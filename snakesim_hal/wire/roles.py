@@ -65,7 +65,7 @@ _ANSWERERS: dict[str, tuple[Role, ...]] = {
 _SUFFIX_OF_NAME = {keys.PROCESS_ALL: "-$*"}
 _WITH_TOKEN = (keys.PROCESS_ALL,)  # keys of samples that have a liveliness token, too
 RECORDER = "recorder"  # the name of its process
-INJECTION = (keys.FAULT_ALL,)  # granted only for a robot whose lab file allows it
+FAULT_INJECTION_KEYS = (keys.FAULT_ALL,)  # granted only for a robot whose lab file allows it
 # What a gnc and a recorder may do only under their own names, at keys that end with `*`.
 OWN_NAME_ONLY = ("publish", "declare", "answer")
 
@@ -79,7 +79,7 @@ class Permission(NamedTuple):
 
 
 @dataclass(frozen=True)
-class KeyRights:
+class AccessRule:
     """What the roles may do at one key of the key space."""
 
     key: str
@@ -87,31 +87,31 @@ class KeyRights:
     writers: tuple[Role, ...]  # they publish, send the query, or declare the token
     answerers: tuple[Role, ...]  # they answer the query; empty for other kinds
 
-    def acts(self, role: Role) -> tuple[str, ...]:
-        """Return what a role may do here, in words: publish, read, ask, answer, declare, watch."""
+    def list_actions(self, role: Role) -> tuple[str, ...]:
+        """Return the actions that a role may take at this key: publish, read, ask, answer, declare, or watch."""
         match self.kind:
             case "query":
-                return self._query_acts(role)
+                return self._list_query_actions(role)
             case "liveliness":
-                write_acts = ["declare"]
-                read_acts = ["watch"]
+                write_actions = ["declare"]
+                read_actions = ["watch"]
             case _:
-                write_acts = ["publish"]
-                read_acts = ["read"]
+                write_actions = ["publish"]
+                read_actions = ["read"]
                 if self.has_token:
-                    write_acts.append("declare")
-                    read_acts.append("watch")
+                    write_actions.append("declare")
+                    read_actions.append("watch")
         if role in self.writers:
-            return (*write_acts, *read_acts)
-        return tuple(read_acts)
+            return (*write_actions, *read_actions)
+        return tuple(read_actions)
 
-    def _query_acts(self, role: Role) -> tuple[str, ...]:
-        acts: list[str] = []
+    def _list_query_actions(self, role: Role) -> tuple[str, ...]:
+        actions: list[str] = []
         if role in self.writers:
-            acts.append("ask")
+            actions.append("ask")
         if role in self.answerers:
-            acts.append("answer")
-        return tuple(acts)
+            actions.append("answer")
+        return tuple(actions)
 
     @property
     def has_token(self) -> bool:
@@ -119,19 +119,19 @@ class KeyRights:
         return self.kind == "liveliness" or self.key in _WITH_TOKEN
 
 
-def _make_line(row: keys.KeyRow) -> KeyRights:
+def _make_access_rule(row: keys.KeyRow) -> AccessRule:
     if row.kind == "query":
         writers = _ASKERS.get(row.key, ())
         answerers = _ANSWERERS.get(row.key, (Role.ROBOT,))
-        return KeyRights(row.key, row.kind, writers, answerers)
-    return KeyRights(row.key, row.kind, _WRITERS.get(row.writer, ()), answerers=())
+        return AccessRule(row.key, row.kind, writers, answerers)
+    return AccessRule(row.key, row.kind, _WRITERS.get(row.writer, ()), answerers=())
 
 
-TABLE: tuple[KeyRights, ...] = tuple(_make_line(row) for row in keys.SPACE)
+ACCESS_RULES: tuple[AccessRule, ...] = tuple(_make_access_rule(row) for row in keys.SPACE)
 
 _CACHE = "/@adv/**"  # where a latched key keeps its last value, and has the token of its publisher
-# Zenoh's messages for each act, as (flow, message, what follows the key).
-MESSAGES: dict[str, tuple[tuple[str, str, str], ...]] = {
+# Zenoh's messages for each action, as (flow, message, suffix of the key).
+ZENOH_MESSAGES_BY_ACTION: dict[str, tuple[tuple[str, str, str], ...]] = {
     "publish": (("ingress", "put", ""), ("egress", "declare_subscriber", "")),
     "read": (("ingress", "declare_subscriber", ""), ("egress", "put", "")),
     "ask": (("ingress", "query", ""), ("egress", "declare_queryable", ""), ("egress", "reply", "")),
@@ -143,9 +143,9 @@ MESSAGES: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("egress", "liveliness_token", ""),
     ),
 }
-# Further messages for each act at a latched key. A process queries the cache at the cache's own key, and the cache
+# Further messages for each action at a latched key. A process queries the cache at the cache's own key, and the cache
 # replies at the key of the value.
-MESSAGES_OF_LATCHED: dict[str, tuple[tuple[str, str, str], ...]] = {
+LATCHED_ZENOH_MESSAGES_BY_ACTION: dict[str, tuple[tuple[str, str, str], ...]] = {
     "publish": (
         ("ingress", "declare_queryable", _CACHE),
         ("egress", "query", _CACHE),
@@ -163,33 +163,37 @@ MESSAGES_OF_LATCHED: dict[str, tuple[tuple[str, str, str], ...]] = {
 }
 
 
-def list_permissions(role: Role, services: Iterable[str] = (), *, faults: bool = False) -> Iterator[Permission]:
-    """Yield everything that a router lets pass for a role of a robot.
+def iterate_permissions(
+    role: Role, services: Iterable[str] = (), *, allow_fault_injection: bool = False
+) -> Iterator[Permission]:
+    """Yield the rules of Zenoh's access control for a role of a robot: each message that a router lets pass.
 
     Args:
-        role: the role.
-        services: for a `gnc`, the names that it may take in `alive/*`, `hal/done/*`, `process/*` and `fault/*`.
-        faults: whether faults may be injected into the robot.
+        role: Role of a process.
+        services: Names under which a process with the role `gnc` may act, which are those of its services. They limit
+            the keys `alive/*`, `hal/done/*`, `process/*` and `fault/*`.
+        allow_fault_injection: Whether faults may be injected into the robot.
     """
-    names = _own_names(role, services)
-    # A pattern may be wider than one key: which samples pass is decided key by key.
+    allowed_names = _find_allowed_names(role, services)
+    # Every role may declare a subscription to a pattern that is wider than its rights, such as `**`. That is safe,
+    # because the router forwards a sample only with an `egress` permission for its own key.
     yield Permission("ingress", "declare_subscriber", "**")
-    for line in TABLE:
-        if line.key in INJECTION and not faults:
+    for rule in ACCESS_RULES:
+        if rule.key in FAULT_INJECTION_KEYS and not allow_fault_injection:
             continue
-        for act in line.acts(role):
-            places = [line.key]
-            if names is not None and act in OWN_NAME_ONLY:
-                places = _places_of_names(line.key, names)
-            for flow, message, suffix in _messages_of_act(line, act):
-                for place in places:
-                    yield Permission(flow, message, place + suffix)
-            if act == "publish":
+        for action in rule.list_actions(role):
+            key_exprs = [rule.key]
+            if allowed_names is not None and action in OWN_NAME_ONLY:
+                key_exprs = _make_key_exprs_of_names(rule.key, allowed_names)
+            for flow, message, key_suffix in _list_zenoh_messages(rule, action):
+                for key_expr in key_exprs:
+                    yield Permission(flow, message, key_expr + key_suffix)
+            if action == "publish":
                 # The router sends a publisher the subscriptions to its keys.
                 yield Permission("egress", "declare_subscriber", "**")
 
 
-def _own_names(role: Role, services: Iterable[str]) -> list[str] | None:
+def _find_allowed_names(role: Role, services: Iterable[str]) -> list[str] | None:
     """Return the only names under which a role may act; None for a role that may act under any name."""
     match role:
         case Role.GNC:
@@ -200,16 +204,21 @@ def _own_names(role: Role, services: Iterable[str]) -> list[str] | None:
             return None
 
 
-def _places_of_names(key: str, names: list[str]) -> list[str]:
-    """Return the keys that a pattern stands for with each of some names; a key that is no pattern as it is."""
+def _make_key_exprs_of_names(key: str, names: list[str]) -> list[str]:
+    """Return the key expressions that a pattern allows for some names.
+
+    Args:
+        key: Key of the key space. If it ends with `/*`, each name takes the place of the wildcard.
+        names: Names of services or processes.
+    """
     if not key.endswith("/*"):
         return [key]
     suffix = _SUFFIX_OF_NAME.get(key, "")
     return [key[:-1] + name + suffix for name in names]
 
 
-def _messages_of_act(line: KeyRights, act: str) -> tuple[tuple[str, str, str], ...]:
-    """Return Zenoh's messages for an act at a key, as in MESSAGES."""
-    if line.kind == "latched":
-        return (*MESSAGES[act], *MESSAGES_OF_LATCHED.get(act, ()))
-    return MESSAGES[act]
+def _list_zenoh_messages(rule: AccessRule, action: str) -> tuple[tuple[str, str, str], ...]:
+    """Return the messages of Zenoh that an action at a key needs, each as (flow, message, suffix of the key)."""
+    if rule.kind == "latched":
+        return (*ZENOH_MESSAGES_BY_ACTION[action], *LATCHED_ZENOH_MESSAGES_BY_ACTION.get(action, ()))
+    return ZENOH_MESSAGES_BY_ACTION[action]

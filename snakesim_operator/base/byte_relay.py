@@ -1,4 +1,4 @@
-"""Relays what two connections receive, in both directions."""
+"""Relays bytes between two connections, in both directions."""
 
 import asyncio
 import contextlib
@@ -10,9 +10,9 @@ CHUNK_BYTES = 64 * 1024
 Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-async def relay_bytes(one: Connection, other: Connection) -> None:
+async def relay_bytes(first: Connection, second: Connection) -> None:
     """Copy bytes in both directions until either side closes its connection. The caller closes both."""
-    await run_until_one_ends(_copy(one[0], other[1]), _copy(other[0], one[1]))
+    await run_until_one_ends(_copy_bytes(first[0], second[1]), _copy_bytes(second[0], first[1]))
 
 
 async def run_until_one_ends(*directions: Coroutine[Any, Any, None]) -> None:
@@ -26,8 +26,8 @@ async def run_until_one_ends(*directions: Coroutine[Any, Any, None]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Copy bytes as fast as the receiver takes them."""
+async def _copy_bytes(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Copy bytes from a reader to a writer, as fast as the receiver accepts them, until either side ends."""
     with contextlib.suppress(OSError):
         while data := await reader.read(CHUNK_BYTES):
             writer.write(data)

@@ -10,11 +10,14 @@ from snakesim_hal.base.errors import ConfigError, NotConnectedError, shorten
 if TYPE_CHECKING:  # takes a second to import, and most commands only check an address
     from distributed import Client
 
-CONNECT_LIMIT_S = 20.0  # for the scheduler to answer, and again for its first worker
+CONNECT_TIMEOUT_S = 20.0  # for the scheduler to answer, and again for its first worker
 
 
-def check_address(address: str | None) -> None:
-    """Check the form of a scheduler's address. Raises ConfigError if it is not tcp://HOST:PORT or tls://HOST:PORT."""
+def validate_address(address: str | None) -> None:
+    """Raise ConfigError if an address of a scheduler is not of the form tcp://HOST:PORT or tls://HOST:PORT.
+
+    None is accepted: no cluster is used.
+    """
     if address is not None and not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
         raise ConfigError(
             f"--cluster {shorten(address)}: give the scheduler as tcp://HOST:PORT", code="network/invalid-address"
@@ -22,41 +25,44 @@ def check_address(address: str | None) -> None:
 
 
 @contextmanager
-def connected(address: str) -> "Iterator[Client]":
-    """Open a client of a cluster that has at least one worker.
+def connect_to_cluster(address: str) -> "Iterator[Client]":
+    """Connect to a Dask cluster, and wait until it has a worker.
 
     Args:
-        address: of the scheduler, tcp://HOST:PORT or tls://HOST:PORT.
+        address: Address of the scheduler, tcp://HOST:PORT or tls://HOST:PORT.
+
+    Yields:
+        A client of the cluster, which is closed when the context ends.
 
     Raises:
-        NotConnectedError: the scheduler does not answer, or it has no worker.
-        ConfigError: the address is invalid, or the certificates for TLS are missing.
+        NotConnectedError: The scheduler does not answer, or it has no worker.
+        ConfigError: The address is invalid, or the certificates for TLS are missing.
     """
     from distributed import Client
 
-    check_address(address)
-    _check_certificates(address)
+    validate_address(address)
+    _check_tls_certificates(address)
     try:
-        client = Client(address, timeout=CONNECT_LIMIT_S, set_as_default=False)
+        client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError):
         raise NotConnectedError(
-            f"--cluster {address}: no Dask scheduler answers within {CONNECT_LIMIT_S:g} s",
+            f"--cluster {address}: no Dask scheduler answers within {CONNECT_TIMEOUT_S:g} s",
             code="network/nothing-listens",
         ) from None
     with client:
         try:
-            client.wait_for_workers(1, timeout=CONNECT_LIMIT_S)
+            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:
             raise NotConnectedError(
-                f"--cluster {address}: no worker within {CONNECT_LIMIT_S:g} s; start some: "
+                f"--cluster {address}: no worker within {CONNECT_TIMEOUT_S:g} s; start some: "
                 f"dask worker {address} --nthreads 1",
                 code="network/nothing-listens",
             ) from None
         yield client
 
 
-def _check_certificates(address: str) -> None:
-    """Raise ConfigError for a scheduler with TLS when this computer has no certificate for it."""
+def _check_tls_certificates(address: str) -> None:
+    """Raise ConfigError if a scheduler uses TLS, but this computer has no valid certificate for it."""
     from distributed import Security
 
     try:

@@ -6,9 +6,9 @@ A robot's computer has only the core packages; a command that needs more prints 
 from importlib.util import find_spec
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.plugins import pip_install
+from snakesim_hal.model.plugins import make_pip_install_command
 
-BRINGS = {  # import names; messages about a package name the first extra with it
+PACKAGES_BY_EXTRA = {  # import names; messages about a package mention the first extra that contains it
     "sim": ("mujoco",),
     "can": ("bitstruct", "can", "cantools"),
     "serial": ("serial",),
@@ -25,32 +25,36 @@ BRINGS = {  # import names; messages about a package name the first extra with i
 
 def is_installed(extra: str) -> bool:
     """Return whether an extra is installed."""
-    return not _missing_packages(extra)
+    return not _list_missing_packages(extra)
 
 
-def require(extra: str, who: str, otherwise: str = "") -> None:
-    """Raise ConfigError when an extra is missing.
+def require_extra(extra: str, user: str, alternative: str = "") -> None:
+    """Raise ConfigError if a package of an extra is not installed.
 
     Args:
-        extra: Its name.
-        who: The command or function that needs it.
-        otherwise: How to continue without it, added to the message.
+        extra: Name of the extra.
+        user: Command or function that needs the extra, for the message.
+        alternative: How to continue without the extra, appended to the message.
     """
-    missing = _missing_packages(extra)
+    missing = _list_missing_packages(extra)
     if missing:
         raise ConfigError(
-            f"{who} needs {', '.join(missing)}: {pip_install(extra)}{otherwise}", code="extra/not-installed"
+            f"{user} needs {', '.join(missing)}: {make_pip_install_command(extra)}{alternative}",
+            code="extra/not-installed",
         )
 
 
-def explained(error: ModuleNotFoundError) -> ConfigError | None:
-    """Return an error that names the extra with a package that cannot be imported; None when no extra has it."""
+def explain_missing_package(error: ModuleNotFoundError) -> ConfigError | None:
+    """Make an error that names the extra with a missing package; None if no extra contains the package."""
     package = (error.name or "").partition(".")[0]
-    for extra, packages in BRINGS.items():
+    for extra, packages in PACKAGES_BY_EXTRA.items():
         if package in packages:
-            return ConfigError(f"this command needs {package}: {pip_install(extra)}", code="extra/not-installed")
+            return ConfigError(
+                f"this command needs {package}: {make_pip_install_command(extra)}", code="extra/not-installed"
+            )
     return None
 
 
-def _missing_packages(extra: str) -> list[str]:
-    return [package for package in BRINGS[extra] if find_spec(package) is None]
+def _list_missing_packages(extra: str) -> list[str]:
+    """List the packages of an extra that are not installed."""
+    return [package for package in PACKAGES_BY_EXTRA[extra] if find_spec(package) is None]

@@ -15,9 +15,9 @@ def encode_png(width: int, height: int, pixels: bytes, *, bits: int, color: bool
     Args:
         width: Width in pixels.
         height: Height in pixels.
-        pixels: Rows without padding, from the top.
-        bits: Bits of a channel, 8 or 16; 16 is big endian.
-        color: Whether a pixel has the channels red, green and blue; otherwise it has one, gray.
+        pixels: Rows of pixels from the top, without padding.
+        bits: Bits per channel, 8 or 16; with 16, the bytes are big endian.
+        color: Whether a pixel has the channels red, green and blue; otherwise it has one gray channel.
 
     Returns:
         The content of the file.
@@ -31,14 +31,14 @@ def encode_png(width: int, height: int, pixels: bytes, *, bits: int, color: bool
     return b"".join(
         [
             SIGNATURE,
-            _chunk(b"IHDR", header),
-            _chunk(b"IDAT", zlib.compress(filtered, COMPRESSION_LEVEL)),
-            _chunk(b"IEND", b""),
+            _encode_chunk(b"IHDR", header),
+            _encode_chunk(b"IDAT", zlib.compress(filtered, COMPRESSION_LEVEL)),
+            _encode_chunk(b"IEND", b""),
         ]
     )
 
 
-def _chunk(name: bytes, data: bytes) -> bytes:
-    """Return a chunk: length, name, data and checksum."""
+def _encode_chunk(name: bytes, data: bytes) -> bytes:
+    """Encode a PNG chunk: length, name, data and checksum."""
     checksum = zlib.crc32(name + data)
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", checksum)

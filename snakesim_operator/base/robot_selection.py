@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
-from snakesim_hal.network.local_registry import LocalRobot, local_robots
+from snakesim_hal.network.local_registry import LocalRobot, list_local_robots
 from snakesim_hal.programs.arguments import check_network, read_session_option
 
 if TYPE_CHECKING:
@@ -17,47 +17,47 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RobotSelection:
-    """The robots that a command addresses: those on the named endpoint, else all that run on this computer."""
+    """The robots that a command addresses: those on an endpoint, or all that run on this computer."""
 
-    endpoint: str | None = None  # None: every network of a robot on this computer, and the default endpoint
-    namespace: str | None = None  # None: every robot there
-    session: "SessionFile | None" = None  # how to connect to `endpoint`, which is its first one then
+    endpoint: str | None = None  # None for all networks of robots on this computer, and the default endpoint
+    namespace: str | None = None  # None for all robots there
+    session: "SessionFile | None" = None  # credentials for `endpoint`, which is the first endpoint of the session then
 
-    def local(self) -> list[LocalRobot]:
-        """Return the addressed robots that run on this computer."""
+    def list_local_robots(self) -> list[LocalRobot]:
+        """List the addressed robots that run on this computer."""
         return [
             robot
-            for robot in local_robots()
+            for robot in list_local_robots()
             if self.endpoint in (None, robot.endpoint) and self.namespace in (None, robot.namespace)
         ]
 
-    def endpoints(self) -> list[str]:
-        """Return the endpoints of all networks to search."""
-        return [link.endpoint for link in self.networks()]
+    def list_endpoints(self) -> list[str]:
+        """List the endpoints of all networks to search."""
+        return [link.endpoint for link in self.list_networks()]
 
-    def networks(self) -> "list[Link]":
-        """Return every network to search, for the addressed namespace."""
+    def list_networks(self) -> "list[Link]":
+        """List the links to all networks to search, for the addressed namespace."""
         from snakesim_hal.network.session import Link
 
         if self.endpoint is not None:
             return [Link(self.endpoint, self.namespace, session=self.session)]
-        links = {robot.endpoint: _link_to(robot, self.namespace) for robot in self.local()}
+        links = {robot.endpoint: _make_link(robot, self.namespace) for robot in self.list_local_robots()}
         if DEFAULT_ENDPOINT not in links:
             links[DEFAULT_ENDPOINT] = Link(namespace=self.namespace)
         return list(links.values())
 
 
 def select_robots(arguments: argparse.Namespace) -> RobotSelection:
-    """Return the robots that the arguments of `add_network` address. Raises ConfigError."""
+    """Read the addressed robots from the network options of a command. Raises ConfigError if they are invalid."""
     check_network(arguments)
     session = read_session_option(arguments, or_environment=True)
     if session is not None:
-        return RobotSelection(session.endpoints[0], session.namespace_for(arguments.namespace), session)
+        return RobotSelection(session.endpoints[0], session.resolve_namespace(arguments.namespace), session)
     return RobotSelection(arguments.router or arguments.endpoint, arguments.namespace)
 
 
-def _link_to(robot: LocalRobot, namespace: str | None) -> "Link":
-    """Return how to reach a robot on this computer: by its session file, if this user may read that."""
+def _make_link(robot: LocalRobot, namespace: str | None) -> "Link":
+    """Make the link to a robot on this computer, by its session file if this user may read that."""
     from snakesim_hal.network.session import Link
     from snakesim_hal.network.session_file import read_session
 

@@ -1,4 +1,4 @@
-"""Searching the robots that a command addresses."""
+"""Finds the robots that a command addresses."""
 
 import contextlib
 import shlex
@@ -11,25 +11,30 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.robot_selection import RobotSelection
 
-CONNECT_S = 1.0
-SEARCH_S = 3.0  # to connect, and to answer: a busy computer takes more than a second, and its robot is there
-HAL_EVERYWHERE = f"**/{keys.alive_key('hal')}"
+CONNECT_TIMEOUT_S = 1.0
+SEARCH_TIMEOUT_S = 3.0  # to connect, and to answer: a busy computer takes more than a second, and its robot is there
+ALL_HALS_KEY = f"**/{keys.alive_key('hal')}"
 
 
-def flags_of(link: Link, robot: str | None) -> str:
-    """What to type after a command to address a robot; nothing for a default. robot: its own name."""
-    where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
+def make_robot_flags(link: Link, robot: str | None) -> str:
+    """Make the command-line flags that address a robot; empty for the defaults.
+
+    Args:
+        link: Link to the robot.
+        robot: Name of the robot, which is its default namespace; None to always name the namespace.
+    """
+    flags = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
     if link.session is not None:
-        where = f" --session {shlex.quote(str(link.session.path))}"
-    return where + (f" --namespace {link.namespace}" if link.namespace != robot else "")
+        flags = f" --session {shlex.quote(str(link.session.path))}"
+    return flags + (f" --namespace {link.namespace}" if link.namespace != robot else "")
 
 
-def robots_on(session: Session) -> list[str]:
-    """Return the namespaces of all robots whose HAL is alive on a network."""
-    return [namespace_of(key) for key in session.present(HAL_EVERYWHERE, SEARCH_S)]
+def find_namespaces(session: Session) -> list[str]:
+    """Find the namespaces of all robots whose HAL host is alive on a network."""
+    return [get_namespace(key) for key in session.list_tokens(ALL_HALS_KEY, SEARCH_TIMEOUT_S)]
 
 
-def namespace_of(key: str) -> str:
+def get_namespace(key: str) -> str:
     """Return the namespace of a full key, or the key itself if it has none."""
     namespace_and_key = keys.split_namespace(key)
     if namespace_and_key is None:
@@ -37,46 +42,69 @@ def namespace_of(key: str) -> str:
     return namespace_and_key[0]
 
 
-def find_robots(where: RobotSelection) -> list[Link]:
-    """Return every addressed robot that can be reached."""
+def find_robots(selection: RobotSelection) -> list[Link]:
+    """Find the links to all addressed robots that can be reached."""
     links: list[Link] = []
-    for link in where.networks():
+    for link in selection.list_networks():
         try:
-            with open_session(link, SEARCH_S) as session:
+            with open_session(link, SEARCH_TIMEOUT_S) as session:
                 if link.namespace is None:
-                    links += [replace(link, namespace=name) for name in robots_on(session)]
-                elif session.present(keys.alive_key("hal"), SEARCH_S):
+                    links += [replace(link, namespace=name) for name in find_namespaces(session)]
+                elif session.list_tokens(keys.alive_key("hal"), SEARCH_TIMEOUT_S):
                     links.append(link)
         except NotConnectedError:
             continue
     return links
 
 
-def sessions_on(where: RobotSelection, opened: contextlib.ExitStack) -> list[tuple[Link, Session]]:
-    """Open a session on every network that answers, for messages of any size. Raises NotConnectedError without one."""
+def open_sessions(selection: RobotSelection, exit_stack: contextlib.ExitStack) -> list[tuple[Link, Session]]:
+    """Open a session on every network that can be reached, for messages of any size.
+
+    Args:
+        selection: The addressed robots.
+        exit_stack: Closes the sessions.
+
+    Returns:
+        Pairs of link and session.
+
+    Raises:
+        NotConnectedError: No network can be reached.
+    """
     sessions: list[tuple[Link, Session]] = []
-    for link in where.networks():
+    for link in selection.list_networks():
         with contextlib.suppress(NotConnectedError):
-            whole = replace(link, max_bytes=MAX_IMAGE_BYTES)
-            sessions.append((link, opened.enter_context(open_session(whole, CONNECT_S))))
+            unlimited_link = replace(link, max_bytes=MAX_IMAGE_BYTES)
+            sessions.append((link, exit_stack.enter_context(open_session(unlimited_link, CONNECT_TIMEOUT_S))))
     if not sessions:
         raise NotConnectedError(
-            f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first",
+            f"nothing listens on {', '.join(selection.list_endpoints())}; start a run or a router there first",
             code="network/nothing-listens",
         )
     return sessions
 
 
-def only_robot(where: RobotSelection, command: str) -> Link:
-    """Return the single addressed robot. Raises NotConnectedError for none, RefusedError for more than one."""
-    found = find_robots(where)
-    if not found:
-        named = "" if where.namespace is None else f" named {where.namespace}"
+def find_single_robot(selection: RobotSelection, command: str) -> Link:
+    """Find the single addressed robot.
+
+    Args:
+        selection: The addressed robots.
+        command: Command line of the command, for the message about several robots.
+
+    Returns:
+        The link to the robot.
+
+    Raises:
+        NotConnectedError: No robot was found.
+        RefusedError: Several robots were found.
+    """
+    links = find_robots(selection)
+    if not links:
+        named = "" if selection.namespace is None else f" named {selection.namespace}"
         raise NotConnectedError(
-            f"no robot{named} on {', '.join(where.endpoints())}; start a run there, or give --endpoint",
+            f"no robot{named} on {', '.join(selection.list_endpoints())}; start a run there, or give --endpoint",
             code="network/no-robot",
         )
-    if len(found) > 1:
-        choices = [f"  snakesim {command}{flags_of(link, None)}" for link in found]
+    if len(links) > 1:
+        choices = [f"  snakesim {command}{make_robot_flags(link, None)}" for link in links]
         raise RefusedError("several robots found; choose one:", *choices, code="network/several-robots")
-    return found[0]
+    return links[0]

@@ -27,10 +27,10 @@ from tempfile import gettempdir, mkdtemp
 from typing import Any, Self
 
 from snakesim_hal.base import arithmetic
-from snakesim_hal.base.process import child_environment, die_with_parent, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command, set_parent_death_signal
 
-MAX_DEATHS = 5  # workers that may die while they run a call, before the call fails
-MAX_RAISES = 3  # attempts of a call that raises an exception: the cause may have been the worker
+MAX_WORKER_DEATHS = 5  # workers that may die while they run a call, before the call fails
+MAX_FAILED_ATTEMPTS = 3  # attempts of a call that raises an exception: the cause may have been the worker
 NICENESS = 10  # robots and consoles on the same computer have priority
 TEMPORARY_FOLDER_VARIABLE = "TMPDIR"  # of the environment
 # With `-m`, the classes of this module would be those of `__main__`, and would not be equal to the command's.
@@ -48,25 +48,25 @@ class CallTookTooLongError(Exception):
 
 
 @dataclass(frozen=True)
-class Returned:
+class CallResult:
     """The outcome of a call that returned."""
 
     value: Any
 
 
 @dataclass(frozen=True)
-class Raised:
+class CallFailure:
     """The outcome of a call that raised, that took too long, or that killed its workers."""
 
     error: Exception
 
 
-Outcome = Returned | Raised
+Outcome = CallResult | CallFailure
 
 
 @dataclass
-class _Call:
-    """A call that is not done yet."""
+class _PendingCall:
+    """A call that is waiting or running."""
 
     number: int
     arguments: Sequence[Any]
@@ -76,18 +76,18 @@ class _Call:
 
 
 class WorkerPool:
-    """Calls functions in processes, one call at a time in each."""
+    """Calls functions in worker processes, one call at a time in each."""
 
     def __init__(self, count: int | None = None) -> None:
-        """Make a pool without workers; they are started when they are needed.
+        """Prepare a pool. Workers are started when they are needed.
 
         Args:
-            count: maximum number of processes; None: one for each core that this process may use.
+            count: Maximum number of processes; None for one per core that this process may use.
         """
         self.size = count or len(os.sched_getaffinity(0))
         self._workers: list[_Worker] = []
         self._folder: Path | None = None
-        self._started = 0
+        self._started_worker_count = 0
 
     def __enter__(self) -> Self:
         _remove_abandoned_folders()
@@ -104,33 +104,33 @@ class WorkerPool:
             shutil.rmtree(self._folder, ignore_errors=True)
             os.close(self._lock)
 
-    def run(
-        self, function: Callable[..., Any], calls: Sequence[Sequence[Any]], limit_s: float | None = None
+    def run_calls(
+        self, function: Callable[..., Any], calls: Sequence[Sequence[Any]], timeout_s: float | None = None
     ) -> Iterator[tuple[int, Outcome]]:
         """Call a function once for each tuple of arguments.
 
         Args:
-            function: on the top level of a module, which the worker imports.
-            calls: the arguments of each call. Calls begin in this order.
-            limit_s: maximum wall time of a call, after which its worker is killed; None: no limit.
+            function: Function at the top level of a module, which the worker imports.
+            calls: Arguments of each call. Calls start in this order.
+            timeout_s: Maximum wall time of a call in s, after which its worker is killed; None for no timeout.
 
         Yields:
             The index of a call in `calls` and its outcome, as soon as the call is done.
         """
-        waiting = deque(_Call(number, arguments) for number, arguments in enumerate(calls))
-        running: dict[_Worker, _Call] = {}
+        waiting = deque(_PendingCall(number, arguments) for number, arguments in enumerate(calls))
+        running: dict[_Worker, _PendingCall] = {}
         try:
             while waiting or running:
                 while waiting and len(running) < self.size:
                     call = waiting.popleft()
                     worker = self._find_idle_worker(running)
-                    if limit_s is not None:
-                        call.deadline_s = time.monotonic() + limit_s
+                    if timeout_s is not None:
+                        call.deadline_s = time.monotonic() + timeout_s
                     worker.send((function, call.arguments))
                     running[worker] = call
                 for worker in self._wait_for_workers(running):
                     call = running.pop(worker)
-                    outcome = self._receive(worker, call)
+                    outcome = self._receive_outcome(worker, call)
                     if outcome is None:
                         waiting.appendleft(call)
                     else:
@@ -138,67 +138,66 @@ class WorkerPool:
         finally:
             # If the caller stops early, later calls must not receive the outcomes of these.
             for worker in running:
-                self._discard(worker)
+                self._kill_and_remove(worker)
 
-    def map(self, function: Callable[..., Any], calls: Sequence[Sequence[Any]]) -> list[Any]:
-        """Return the values of the calls, in their order. Raises the exception of the first call that fails."""
+    def run_and_collect(self, function: Callable[..., Any], calls: Sequence[Sequence[Any]]) -> list[Any]:
+        """Run calls and return their values in the order of the calls. Raises the exception of a call that fails."""
         values: dict[int, Any] = {}
-        for number, outcome in self.run(function, calls):
-            if isinstance(outcome, Raised):
+        for number, outcome in self.run_calls(function, calls):
+            if isinstance(outcome, CallFailure):
                 raise outcome.error
             values[number] = outcome.value
         return [values[number] for number in range(len(calls))]
 
-    def _find_idle_worker(self, running: "dict[_Worker, _Call]") -> "_Worker":
+    def _find_idle_worker(self, running: "dict[_Worker, _PendingCall]") -> "_Worker":
         """Return a worker without a call; a new one is started if there is none."""
         for worker in self._workers:
             if worker not in running:
                 return worker
         assert self._folder is not None, "the pool is used outside its `with`"
-        folder = self._folder / str(self._started)
+        folder = self._folder / str(self._started_worker_count)
         folder.mkdir()
-        self._started += 1
+        self._started_worker_count += 1
         worker = _Worker(folder)
         self._workers.append(worker)
         return worker
 
-    def _wait_for_workers(self, running: "dict[_Worker, _Call]") -> "list[_Worker]":
+    def _wait_for_workers(self, running: "dict[_Worker, _PendingCall]") -> "list[_Worker]":
         """Wait until calls are done, have failed, or take too long, and return their workers."""
-        left_s = min(call.deadline_s for call in running.values()) - time.monotonic()
-        timeout_s = None if left_s == float("inf") else max(left_s, 0.0)
+        remaining_s = min(call.deadline_s for call in running.values()) - time.monotonic()
+        timeout_s = None if remaining_s == float("inf") else max(remaining_s, 0.0)
         readable = wait([worker.connection for worker in running], timeout_s)
         now_s = time.monotonic()
         return [worker for worker, call in running.items() if worker.connection in readable or now_s >= call.deadline_s]
 
-    def _receive(self, worker: "_Worker", call: _Call) -> Outcome | None:
-        """Return the outcome of a call, or None if the call is tried again.
+    def _receive_outcome(self, worker: "_Worker", call: _PendingCall) -> Outcome | None:
+        """Receive the outcome of a call; None if the call has to be retried.
 
-        A call is tried again if its worker died or the function raised, unless this has happened too often.
+        A call is retried if its worker died or the function raised, unless this has happened too often.
 
         Args:
-            worker: The worker of the call. If it has sent nothing yet, the call has exceeded its time, and the worker
-                is ended.
-            call: The call, whose failures are counted.
+            worker: Worker of the call. If it has sent nothing yet, the call has timed out, and the worker is killed.
+            call: The call, whose failures are counted here.
         """
-        is_done = worker.connection.poll()
-        if not is_done:
-            self._discard(worker)
-            return Raised(CallTookTooLongError())
+        has_outcome = worker.connection.poll()
+        if not has_outcome:
+            self._kill_and_remove(worker)
+            return CallFailure(CallTookTooLongError())
         try:
             outcome = worker.connection.recv()
         except (EOFError, OSError):
-            self._discard(worker)
+            self._kill_and_remove(worker)
             call.deaths += 1
-            if call.deaths < MAX_DEATHS:
+            if call.deaths < MAX_WORKER_DEATHS:
                 return None
-            return Raised(WorkerDiedError())
-        if isinstance(outcome, Raised):
+            return CallFailure(WorkerDiedError())
+        if isinstance(outcome, CallFailure):
             call.raises += 1
-            if call.raises < MAX_RAISES:
+            if call.raises < MAX_FAILED_ATTEMPTS:
                 return None
         return outcome
 
-    def _discard(self, worker: "_Worker") -> None:
+    def _kill_and_remove(self, worker: "_Worker") -> None:
         """Kill a worker and remove its temporary files."""
         worker.kill()
         self._workers.remove(worker)
@@ -206,7 +205,7 @@ class WorkerPool:
 
 
 def _remove_abandoned_folders() -> None:
-    """Remove the folders of this user's pools that were killed, and could not remove them."""
+    """Remove the folders that killed pools of this user have left."""
     for folder in Path(gettempdir()).glob(f"{FOLDER_PREFIX}*"):
         with contextlib.suppress(OSError):
             state = folder.lstat()
@@ -231,10 +230,10 @@ class _Worker:
         command_end, worker_end = socket.socketpair()
         with worker_end:
             self._process = subprocess.Popen(
-                python_command("-c", WORKER_PROGRAM, str(worker_end.fileno()), str(os.getpid())),
-                env=child_environment(
-                    arithmetic.common_environment(),
-                    arithmetic.ONE_THREAD,
+                make_python_command("-c", WORKER_PROGRAM, str(worker_end.fileno()), str(os.getpid())),
+                env=make_child_environment(
+                    arithmetic.make_common_arithmetic_env(),
+                    arithmetic.SINGLE_THREAD_ENV,
                     {TEMPORARY_FOLDER_VARIABLE: str(self.folder)},
                 ),
                 stdin=subprocess.DEVNULL,
@@ -259,26 +258,29 @@ def main(argv: Sequence[str]) -> int:
     """Run the worker: receive calls and send their outcomes, until the command closes the connection.
 
     Args:
-        argv: the handle of the worker's end of the socket pair, and the process id of the command.
+        argv: File descriptor of the worker's end of the socket pair, and process id of the command.
+
+    Returns:
+        The exit code.
     """
-    handle, parent = map(int, argv)
-    die_with_parent(parent)
+    connection_fd, parent_pid = map(int, argv)
+    set_parent_death_signal(parent_pid)
     os.nice(max(NICENESS - os.nice(0), 0))  # a command that was started with `nice` keeps its priority
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with Connection(handle) as connection:
+    with Connection(connection_fd) as connection:
         while True:
             try:
                 function, arguments = connection.recv()
             except (EOFError, ConnectionResetError):
                 return 0
             try:
-                outcome: Outcome = Returned(function(*arguments))
+                outcome: Outcome = CallResult(function(*arguments))
             except Exception as error:  # noqa: BLE001 - the caller gets every exception
-                outcome = Raised(_portable(error))
+                outcome = CallFailure(_make_picklable(error))
             connection.send(outcome)
 
 
-def _portable(error: Exception) -> Exception:
+def _make_picklable(error: Exception) -> Exception:
     """Return the exception, or a RuntimeError with its text if the exception cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))

@@ -15,114 +15,127 @@ import msgspec
 from snakesim_hal.base.errors import ConfigError, WireError, shorten, suggest_word
 from snakesim_hal.base.terminal import print_json, print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Session, intersects, key_expression
+from snakesim_hal.network.session import Session, do_keys_intersect, key_expression
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import CustomSample
-from snakesim_operator.base.targets import RobotSelection, sessions_on
-from snakesim_operator.monitoring.traffic import decoder_of
+from snakesim_operator.base.targets import RobotSelection, open_sessions
+from snakesim_operator.monitoring.traffic import get_decoder
 
 RATE_PERIOD_S = 1.0
-MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower than the network
+MAX_QUEUED_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower than the network
 
 
-def list_topics(*, as_json: bool) -> int:
+def print_topics(*, as_json: bool) -> int:
     """Print the keys on which a robot publishes, with their content. Returns the exit code."""
     if as_json:
         rows = [
-            {"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about} for row in _published_rows()
+            {"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about}
+            for row in _list_published_rows()
         ]
         print_json({"topics": rows})
         return 0
-    for line in _key_lines():
+    for line in _format_key_list():
         print_line(line)
     print_stderr("`snakesim topic echo KEY` prints the messages; `snakesim topic rate` shows the rates of all keys")
     return 0
 
 
-def echo(key: str, where: RobotSelection, *, count: int | None) -> int:
+def echo_messages(key: str, selection: RobotSelection, *, count: int | None) -> int:
     """Print messages on a key, from every addressed robot.
 
     Args:
-        key: relative to the robot, wildcards allowed.
-        where: selects the robots.
-        count: of messages after which the command ends; None: it does not end.
+        key: Key relative to the robot; wildcards are allowed.
+        selection: Selects the robots.
+        count: Number of messages after which the command ends. If None, it does not end.
+
+    Returns:
+        0, the exit code of the command.
 
     Raises:
-        NotConnectedError: no robot is reachable.
-        ConfigError: there is no such key.
+        NotConnectedError: No robot is reachable.
+        ConfigError: There is no such key.
     """
-    with _listen(key, where) as queue:
+    with _subscribe_to_key(key, selection) as queue:
         _print_messages(queue, count)
     return 0
 
 
-def show_rate(key: str, where: RobotSelection, *, count: int | None, as_json: bool) -> int:
+def print_rates(key: str, selection: RobotSelection, *, count: int | None, as_json: bool) -> int:
     """Print the rate of the messages on a key once a second, from every addressed robot.
 
     Args:
-        key: relative to the robot, wildcards allowed.
-        where: selects the robots.
-        count: of seconds after which the command ends; None: it does not end.
-        as_json: whether to print one JSON object a second.
+        key: Key relative to the robot; wildcards are allowed.
+        selection: Selects the robots.
+        count: Number of seconds after which the command ends. If None, it does not end.
+        as_json: Whether to print one JSON object a second instead of text.
 
     Returns:
         The exit code: 1 if no message has arrived in the last second, otherwise 0.
 
     Raises:
-        NotConnectedError: no robot is reachable.
-        ConfigError: there is no such key.
+        NotConnectedError: No robot is reachable.
+        ConfigError: There is no such key.
     """
-    with _listen(key, where) as queue:
-        return _print_rates(queue, count, as_json=as_json)
+    with _subscribe_to_key(key, selection) as queue:
+        return _print_rate_lines(queue, count, as_json=as_json)
 
 
 @contextlib.contextmanager
-def _listen(key: str, where: RobotSelection) -> Iterator["OutputQueue"]:
-    """Subscribe to a key of every addressed robot. Raises NotConnectedError and ConfigError."""
+def _subscribe_to_key(key: str, selection: RobotSelection) -> Iterator["OutputQueue"]:
+    """Subscribe to a key of every selected robot, and yield the queue that gets the messages.
+
+    Raises:
+        NotConnectedError: No robot is reachable.
+        ConfigError: There is no such key.
+    """
     relative_key = key_expression(key.strip("/"))
-    rows = [row for row in _published_rows() if intersects(relative_key, row.key)]
+    rows = [row for row in _list_published_rows() if do_keys_intersect(relative_key, row.key)]
     if not rows:
-        hint = suggest_word(key, [row.key for row in _published_rows()]).strip()
-        lines = [*_key_lines(), hint] if hint else _key_lines()
+        hint = suggest_word(key, [row.key for row in _list_published_rows()]).strip()
+        lines = [*_format_key_list(), hint] if hint else _format_key_list()
         raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines, code="network/unknown-key")
-    prefix = "" if where.namespace is not None else "**/"
+    prefix = "" if selection.namespace is not None else "**/"
     queue = OutputQueue()
     with contextlib.ExitStack() as stack:
-        for _, session in sessions_on(where, stack):
-            _subscribe(session, queue, key_expression(f"{prefix}{relative_key}"), prefix, rows)
+        for _, session in open_sessions(selection, stack):
+            _subscribe_to_rows(session, queue, key_expression(f"{prefix}{relative_key}"), prefix, rows)
         yield queue
 
 
-def _subscribe(session: Session, queue: "OutputQueue", pattern: str, prefix: str, rows: Sequence[keys.KeyRow]) -> None:
+def _subscribe_to_rows(
+    session: Session, queue: "OutputQueue", pattern: str, prefix: str, rows: Sequence[keys.KeyRow]
+) -> None:
     """Subscribe to the latched keys and to the streams separately.
 
-    A latched value is older than the streams: a subscriber to both would drop it as too old.
+    A latched value is older than the samples of the streams: a subscriber to both would drop it as too old.
 
     Args:
-        session: of one network.
-        queue: gets the messages.
-        pattern: the requested keys, with wildcards.
-        prefix: of every key on this network.
-        rows: of the key space that the pattern matches.
+        session: Session on one network.
+        queue: Gets the messages.
+        pattern: Key expression of the requested keys, with wildcards.
+        prefix: Prefix of every key on this network: empty, or a wildcard for the namespaces of the robots.
+        rows: Rows of the key space that match the pattern.
     """
     latched_keys = [f"{prefix}{row.key}" for row in rows if row.kind == "latched"]
     for latched_key in latched_keys:
-        session.on_latched_arrival(latched_key, queue.filtered_add(lambda key: intersects(pattern, key)))
+        session.on_latched_arrival(latched_key, queue.make_filtered_add(lambda key: do_keys_intersect(pattern, key)))
     if len(latched_keys) < len(rows):
         session.on_arrival(
             pattern,
-            queue.filtered_add(lambda key: not any(intersects(latched_key, key) for latched_key in latched_keys)),
+            queue.make_filtered_add(
+                lambda key: not any(do_keys_intersect(latched_key, key) for latched_key in latched_keys)
+            ),
         )
 
 
-def _published_rows() -> list[keys.KeyRow]:
+def _list_published_rows() -> list[keys.KeyRow]:
     """Return the rows of the key space whose messages are published."""
     return [row for row in keys.SPACE if row.kind in ("stream", "latched")]
 
 
-def _key_lines() -> list[str]:
-    rows = _published_rows()
+def _format_key_list() -> list[str]:
+    rows = _list_published_rows()
     width = max(len(row.key) for row in rows)
     return [f"  {row.key:<{width}}  {row.about}" for row in rows]
 
@@ -146,25 +159,25 @@ class MeasuredRate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OutputQueue:
-    """Samples queued for the terminal; if it is too slow, the newest are dropped, and this is reported."""
+    """Queues received messages for the terminal. If the terminal is too slow, the newest are dropped and counted."""
 
     def __init__(self) -> None:
         self._arrivals: Mailbox[Arrival] = Mailbox()
         self._lock = threading.Lock()
-        self._bytes = 0
-        self._dropped = 0
+        self._queued_bytes = 0
+        self._dropped_count = 0
 
     def add(self, arrival: Arrival) -> None:
-        """Add a sample. This runs in Zenoh's threads."""
+        """Add a message, or drop it if the queue is full. This runs in Zenoh's threads."""
         with self._lock:
-            if self._bytes + len(arrival.payload) > MAX_WAITING_BYTES:
-                self._dropped += 1
+            if self._queued_bytes + len(arrival.payload) > MAX_QUEUED_BYTES:
+                self._dropped_count += 1
                 return
-            self._bytes += len(arrival.payload)
+            self._queued_bytes += len(arrival.payload)
         self._arrivals.put(arrival)
 
-    def filtered_add(self, is_selected: Callable[[str], bool]) -> Callable[[Arrival], None]:
-        """Return a function that adds a sample if `is_selected` is true for its key."""
+    def make_filtered_add(self, is_selected: Callable[[str], bool]) -> Callable[[Arrival], None]:
+        """Return a function that adds a message if `is_selected` returns true for its key."""
 
         def add_if_selected(arrival: Arrival) -> None:
             if is_selected(arrival.key):
@@ -174,29 +187,29 @@ class OutputQueue:
 
     def get(self, timeout: float | None = None) -> Arrival:
         """Return the oldest sample. Raises queue.Empty after `timeout` in s; None waits without a limit."""
-        if self._dropped and self._arrivals.empty():
-            print_stderr(f"{self._dropped} messages were dropped: they came faster than they could be printed")
-            self._dropped = 0
+        if self._dropped_count and self._arrivals.empty():
+            print_stderr(f"{self._dropped_count} messages were dropped: they came faster than they could be printed")
+            self._dropped_count = 0
         arrival = self._arrivals.get(timeout)
         with self._lock:
-            self._bytes -= len(arrival.payload)
+            self._queued_bytes -= len(arrival.payload)
         return arrival
 
 
 def _print_messages(queue: OutputQueue, count: int | None) -> None:
-    for _ in _repeat(count):
+    for _ in _count_up_to(count):
         arrival = queue.get()
         content = {"key": arrival.key, **_decode_content(arrival)}
         print_line(json.dumps(content, ensure_ascii=False, separators=(",", ":")))
 
 
-def _repeat(count: int | None) -> Iterable[int]:
-    """Return a range of this length, or an endless one."""
+def _count_up_to(count: int | None) -> Iterable[int]:
+    """Return the numbers from 0 up to a count, without the count itself. If the count is None, they do not end."""
     return itertools.count() if count is None else range(count)
 
 
 def _decode_content(arrival: Arrival) -> dict[str, Any]:
-    """Return the message, or the error that prevents its decoding, for JSON."""
+    """Return the decoded message under the name "message", or the reason why it cannot be decoded under "error"."""
     message = keys.find_message(arrival.key)
     if message is None:
         namespace_and_key = keys.split_namespace(arrival.key)
@@ -205,7 +218,7 @@ def _decode_content(arrival: Arrival) -> dict[str, Any]:
     if message is None:
         return {"error": "no message is known on this key"}
     try:
-        decoded = decoder_of(message).decode(arrival.payload, arrival.encoding)
+        decoded = get_decoder(message).decode(arrival.payload, arrival.encoding)
     except WireError as error:
         return {"error": str(error)}
     if message is CustomSample:  # as it was sent, because only its robot describes some of the fields
@@ -213,34 +226,45 @@ def _decode_content(arrival: Arrival) -> dict[str, Any]:
     return {"message": msgspec.to_builtins(decoded)}
 
 
-def _print_rates(queue: OutputQueue, count: int | None, *, as_json: bool) -> int:
-    """Print the rate of each key once in RATE_PERIOD_S. Returns 1 if nothing arrived in the last period."""
+def _print_rate_lines(queue: OutputQueue, count: int | None, *, as_json: bool) -> int:
+    """Print the rate of each key once in RATE_PERIOD_S.
+
+    Args:
+        queue: Has the received messages.
+        count: Number of periods after which this ends. If None, it does not end.
+        as_json: Whether to print one JSON object for each period instead of text.
+
+    Returns:
+        The exit code: 1 if nothing arrived in the last period, otherwise 0.
+    """
     exit_code = 0
-    for _ in _repeat(count):
-        times_ns = _collect_times(queue)
-        rates = [rate for key in sorted(times_ns) if (rate := _measure_rate(key, times_ns[key])) is not None]
-        exit_code = 0 if times_ns else 1
+    for _ in _count_up_to(count):
+        times_ns_by_key = _collect_arrival_times(queue)
+        rates = [
+            rate for key in sorted(times_ns_by_key) if (rate := _measure_rate(key, times_ns_by_key[key])) is not None
+        ]
+        exit_code = 0 if times_ns_by_key else 1
         if as_json:
             print_json({"rates": rates})
             continue
         for rate in rates:
             print_line(rate.describe())
-        if not times_ns:
+        if not times_ns_by_key:
             print_line("nothing arrives")
     return exit_code
 
 
-def _collect_times(queue: OutputQueue) -> dict[str, list[int]]:
-    """Return the arrival times of each key's messages within RATE_PERIOD_S."""
-    times_ns: dict[str, list[int]] = {}
-    deadline = time.monotonic() + RATE_PERIOD_S
-    while (left_s := deadline - time.monotonic()) > 0:
+def _collect_arrival_times(queue: OutputQueue) -> dict[str, list[int]]:
+    """Collect messages for RATE_PERIOD_S, and return their arrival times in ns by key."""
+    times_ns_by_key: dict[str, list[int]] = {}
+    deadline_s = time.monotonic() + RATE_PERIOD_S
+    while (remaining_s := deadline_s - time.monotonic()) > 0:
         try:
-            arrival = queue.get(timeout=left_s)
+            arrival = queue.get(timeout=remaining_s)
         except Empty:
             break
-        times_ns.setdefault(arrival.key, []).append(arrival.monotonic_ns)
-    return times_ns
+        times_ns_by_key.setdefault(arrival.key, []).append(arrival.monotonic_ns)
+    return times_ns_by_key
 
 
 def _measure_rate(key: str, times_ns: list[int]) -> MeasuredRate | None:

@@ -14,63 +14,63 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import TICK_TIMES, Description, Timing
-from snakesim_operator.base.targets import RobotSelection, sessions_on
+from snakesim_operator.base.targets import RobotSelection, open_sessions
 from snakesim_operator.monitoring.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
-ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
+SINGLE_MEASUREMENT_S = 2.0  # long enough for two samples of the slowest key that repeats itself
 KEY_COLUMNS = (
     f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'received':>8}"
 )
-TIMES_COLUMNS = (
+TICK_TIME_COLUMNS = (
     f"{'while armed, ms':<47} {'median':>9} {'99 %':>9} {'most':>9}  {'histogram, from the shortest to the longest'}"
 )
-BARS = "▁▂▃▄▅▆▇█"
+HISTOGRAM_BARS = "▁▂▃▄▅▆▇█"
 
 
-def top(where: RobotSelection, report: PrintLine = print_line, *, once: bool, as_json: bool) -> int:
+def show_traffic(selection: RobotSelection, print_text: PrintLine = print_line, *, once: bool, as_json: bool) -> int:
     """Measure the traffic of all selected robots, and print it every second until Ctrl-C.
 
     Args:
-        where: selects the robots.
-        report: gets the lines of the tables.
-        once: measure for ONCE_S, print one table and end.
-        as_json: print a line of JSON for each table.
+        selection: Selects the robots.
+        print_text: Prints a line of a table.
+        once: Whether to measure for SINGLE_MEASUREMENT_S, print one table and end.
+        as_json: Whether to print a line of JSON for each table.
 
     Returns:
-        0; or 1 with `once`, if nothing arrived.
+        The exit code: 1 with `once` if nothing arrived, otherwise 0.
 
     Raises:
-        NotConnectedError: no robot is reachable.
+        NotConnectedError: No robot is reachable.
     """
     with contextlib.ExitStack() as stack:
-        traffics = [_measure_traffic(link.namespace, session) for link, session in sessions_on(where, stack)]
-        drawn_lines = 0
+        traffics = [_subscribe_to_traffic(link.namespace, session) for link, session in open_sessions(selection, stack)]
+        drawn_line_count = 0
         while True:
-            time.sleep(ONCE_S if once else PERIOD_S)
-            snapshot = _take_snapshot(traffics)
+            time.sleep(SINGLE_MEASUREMENT_S if once else PERIOD_S)
+            snapshot = _evaluate_traffic(traffics)
             if as_json:
-                _report_json(snapshot, report)
+                _print_json_snapshot(snapshot, print_text)
             elif sys.stdout.isatty() and not once:
-                drawn_lines = overwrite_lines(snapshot.format_table(), drawn_lines)
+                drawn_line_count = overwrite_lines(snapshot.format_table(), drawn_line_count)
             else:
                 for line in snapshot.format_table():
-                    report(line)
+                    print_text(line)
             if once:
                 return 0 if snapshot.lines else 1
 
 
-def _measure_traffic(namespace: str | None, session: Session) -> Traffic:
-    """Subscribe to everything on a network, and return its traffic.
+def _subscribe_to_traffic(namespace: str | None, session: Session) -> Traffic:
+    """Subscribe to everything on a network, and return the object that collects what arrives from now on.
 
     Args:
-        namespace: of the only robot; None if the network has several.
-        session: on this network.
+        namespace: Namespace of the only robot that is measured. None if keys begin with the namespace of a robot.
+        session: Session on this network.
     """
     traffic = Traffic(namespace)
 
     def add_unknown_key(arrival: Arrival) -> None:
-        if not traffic.is_known(arrival.key):
+        if not traffic.is_known_key(arrival.key):
             traffic.add(arrival)
 
     # The key space is subscribed key by key, because a lab's router may grant no wildcard.
@@ -86,7 +86,7 @@ def _measure_traffic(namespace: str | None, session: Session) -> Traffic:
 
 @dataclass(frozen=True)
 class TrafficSnapshot:
-    """The traffic on all networks at one time."""
+    """The measured traffic on all networks at one time, as one table of `snakesim topic rate` prints it."""
 
     lines: Sequence[KeyTraffic]
     latencies: Sequence[Latency]
@@ -118,13 +118,13 @@ class TrafficSnapshot:
         table += [_format_key(line) for line in self.lines if line.robot == robot]
         table += [_format_latency(latency) for latency in self.latencies if latency.robot == robot]
         if robot in self.tick_times:
-            table.append(TIMES_COLUMNS)
+            table.append(TICK_TIME_COLUMNS)
             table += [_format_timing(name, timing) for name, timing in self.tick_times[robot].items()]
         return table
 
 
-def _take_snapshot(traffics: Sequence[Traffic]) -> TrafficSnapshot:
-    """Evaluate the traffic of all networks."""
+def _evaluate_traffic(traffics: Sequence[Traffic]) -> TrafficSnapshot:
+    """Measure rates, latencies and tick times of all networks now, and return them as one snapshot."""
     now_ns = time.monotonic_ns()
     lines: list[KeyTraffic] = []
     latencies: list[Latency] = []
@@ -132,15 +132,15 @@ def _take_snapshot(traffics: Sequence[Traffic]) -> TrafficSnapshot:
     descriptions: dict[str, Description] = {}
     left_out = 0
     for traffic in traffics:
-        lines += traffic.lines(now_ns)
-        latencies += traffic.latencies()
-        tick_times |= {robot: times for robot, times in traffic.tick_times().items() if times}
-        descriptions |= traffic.descriptions()
+        lines += traffic.measure_keys(now_ns)
+        latencies += traffic.measure_latencies()
+        tick_times |= {robot: times for robot, times in traffic.read_tick_times().items() if times}
+        descriptions |= traffic.read_descriptions()
         left_out += traffic.keys_left_out
     return TrafficSnapshot(lines, latencies, tick_times, descriptions, left_out)
 
 
-def _report_json(snapshot: TrafficSnapshot, report: PrintLine) -> None:
+def _print_json_snapshot(snapshot: TrafficSnapshot, print_text: PrintLine) -> None:
     """Print a snapshot as one line of JSON."""
     # A robot without a description is missing in `emulated`: whether it is emulated is unknown.
     emulated = {robot: description.emulated for robot, description in snapshot.descriptions.items()}
@@ -151,7 +151,7 @@ def _report_json(snapshot: TrafficSnapshot, report: PrintLine) -> None:
         "tick_times": snapshot.tick_times,
         "left_out": snapshot.left_out,
     }
-    print_json(msgspec.to_builtins(content), report)
+    print_json(msgspec.to_builtins(content), print_text)
 
 
 def _format_timing(name: str, timing: Timing) -> str:
@@ -159,7 +159,7 @@ def _format_timing(name: str, timing: Timing) -> str:
     max_count = max(timing.bins)
     bars = ""
     for count in timing.bins:
-        bars += BARS[(len(BARS) - 1) * count // max_count] if count else " "
+        bars += HISTOGRAM_BARS[(len(HISTOGRAM_BARS) - 1) * count // max_count] if count else " "
     description = TICK_TIMES.get(name, "")
     numbers = "".join(f" {time_us * 1e-3:>9.3f}" for time_us in (timing.median_us, timing.p99_us, timing.max_us))
     return f"{name:<10} {description:<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"

@@ -16,22 +16,22 @@ from queue import Queue
 
 import msgspec
 
-from snakesim_hal.base.process import get_user_name, on_stop_signal, stop_signals
+from snakesim_hal.base.process import call_on_stop_signals, get_user_name, list_stop_signals
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.session import Link
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_operator.base.targets import RobotSelection, only_robot
+from snakesim_operator.base.targets import RobotSelection, find_single_robot
 from snakesim_operator.recording.recorder_process import record_to_file
 
-EPISODES = "episodes.jsonl"
+LABELS_FILENAME = "episodes.jsonl"
 SUCCESS_BY_KEY = {"s": True, "f": False, "d": None}  # None: the episode is dropped
-HELP = "Enter begins an episode and ends it; then s: it succeeded, f: it failed, d: drop it. q ends"
+KEY_HELP = "Enter begins an episode and ends it; then s: it succeeded, f: it failed, d: drop it. q ends"
 
 
 class EpisodeLabel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A line of EPISODES."""
+    """The label of one episode: a line of the file LABELS_FILENAME."""
 
-    file: str  # beside it
+    file: str  # name of the recording in the same folder
     task: str
     success: bool
     who: str
@@ -39,11 +39,11 @@ class EpisodeLabel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class _InputEnded(Exception):  # noqa: N818 - no error
-    """The operator has ended the command."""
+    """The input has ended, or the operator has typed q."""
 
 
-class _Keyboard:
-    """Reads lines of the terminal in a thread, while the main thread records."""
+class _LineReader:
+    """Reads lines of the terminal in a thread while the main thread records."""
 
     def __init__(self, lines: Iterator[str]) -> None:
         self._queue: Queue[str | None] = Queue()
@@ -56,33 +56,33 @@ class _Keyboard:
         finally:  # also after bytes that are no text: the main thread must not wait for ever
             self._queue.put(None)
 
-    def interrupt(self) -> None:
-        """Act as if the input had ended."""
+    def end_input(self) -> None:
+        """End the input, as if the terminal had been closed."""
         self._queue.put(None)
 
     def next_line(self) -> str:
-        """Wait for the next line. Raises _InputEnded."""
+        """Wait for the next line and return it. Raises _InputEnded."""
         line = self._queue.get()
         if line is None or line == "q":
             raise _InputEnded
         return line
 
-    def take_line(self) -> bool:
-        """Remove a line if one has come, and return whether one had. Raises _InputEnded."""
+    def pop_line_if_any(self) -> bool:
+        """Remove a line if one has arrived, and return whether one had arrived. Raises _InputEnded."""
         if self._queue.empty():
             return False
         self.next_line()
         return True
 
 
-def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines: Iterator[str]) -> int:
+def record_demonstrations(selection: RobotSelection, folder: Path, task: str, lines: Iterator[str]) -> int:
     """Record episodes that an operator demonstrates, until the operator types q or the input ends.
 
     A full disk ends the command as well. A stop signal counts as the end of the input.
 
     Args:
-        where: Which robot to record.
-        folder: Folder for the recordings; it is created if it does not exist.
+        selection: The robot to record.
+        folder: Folder for the recordings; created if it does not exist.
         task: The task that the operator demonstrates, in words.
         lines: Lines that the operator types.
 
@@ -92,12 +92,12 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     Raises:
         SnakesimError: The robot cannot be recorded.
     """
-    link = replace(only_robot(where, "record"), max_bytes=MAX_IMAGE_BYTES)
+    link = replace(find_single_robot(selection, "record"), max_bytes=MAX_IMAGE_BYTES)
     folder.mkdir(parents=True, exist_ok=True)
-    keyboard = _Keyboard(lines)
-    on_stop_signal(keyboard.interrupt)
-    demonstrations = _Demonstrations(link, folder, task, keyboard)
-    print_line(f"{link.namespace} on {link.endpoint}, task {task!r}, into {folder}. {HELP}")
+    keyboard = _LineReader(lines)
+    call_on_stop_signals(keyboard.end_input)
+    demonstrations = _DemonstrationRecorder(link, folder, task, keyboard)
+    print_line(f"{link.namespace} on {link.endpoint}, task {task!r}, into {folder}. {KEY_HELP}")
     try:
         while not demonstrations.failure:
             keyboard.next_line()  # Enter begins an episode
@@ -105,7 +105,7 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     except _InputEnded:
         pass
     finally:
-        for number in stop_signals():
+        for number in list_stop_signals():
             signal.signal(number, signal.SIG_DFL)
     print_line(
         f"{demonstrations.saved_count} episodes; `snakesim recording export {folder} --format lerobot` makes a dataset "
@@ -114,10 +114,10 @@ def record_demonstrations(where: RobotSelection, folder: Path, task: str, lines:
     return 1 if demonstrations.failure else 0
 
 
-class _Demonstrations:
-    """Records the episodes of one call of the command."""
+class _DemonstrationRecorder:
+    """Records episodes one after another into a folder, each with its label."""
 
-    def __init__(self, link: Link, folder: Path, task: str, keyboard: _Keyboard) -> None:
+    def __init__(self, link: Link, folder: Path, task: str, keyboard: _LineReader) -> None:
         self._link = link
         self._folder = folder
         self._task = task
@@ -133,43 +133,46 @@ class _Demonstrations:
         Raises:
             _InputEnded: The operator ended the command before judging the episode.
         """
-        path = self._free_path()
-        began = datetime.now(UTC).isoformat(timespec="seconds")
+        path = self._find_free_path()
+        start_time_utc = datetime.now(UTC).isoformat(timespec="seconds")
         print_line(f"{path.name}: recording; Enter ends it")
         success = None  # as judged by the operator; None: drop the episode
         try:
-            recorder = record_to_file(self._link, path, lambda: not self._keyboard.take_line())
-            self.failure = recorder.recording.failure
+            recorder = record_to_file(self._link, path, lambda: not self._keyboard.pop_line_if_any())
+            self.failure = recorder.writer.failure
             if not self.failure:
-                message_count = recorder.recording.counts.total()
+                message_count = recorder.writer.counts.total()
                 print_line(f"{path.name}: {message_count} messages. s, f or d?")
-                success = self._read_judgment()
+                success = self._read_success()
         finally:
             if success is None:
                 path.unlink(missing_ok=True)
                 print_line(f"{path.name}: dropped")
         if success is not None:
-            label = EpisodeLabel(file=path.name, task=self._task, success=success, who=get_user_name(), began=began)
-            self._keep(label)
+            label = EpisodeLabel(
+                file=path.name, task=self._task, success=success, who=get_user_name(), began=start_time_utc
+            )
+            self._append_label(label)
 
-    def _free_path(self) -> Path:
-        """Return the first numbered path at which no recording is yet."""
+    def _find_free_path(self) -> Path:
+        """Return the first numbered path at which there is no recording yet."""
         for number in count():
             path = self._folder / f"episode-{number:03d}.mcap"
             if not path.exists():
                 return path
         raise AssertionError("count() does not end")
 
-    def _read_judgment(self) -> bool | None:
-        """Wait until the operator marks the episode. Returns whether it succeeded; None: it is dropped."""
+    def _read_success(self) -> bool | None:
+        """Wait for the judgment of the operator. Returns whether the episode succeeded, or None to drop it."""
         while True:
             key = self._keyboard.next_line()
             if key in SUCCESS_BY_KEY:
                 return SUCCESS_BY_KEY[key]
             print_line(f"{key!r}: s if it succeeded, f if it failed, d to drop it")
 
-    def _keep(self, label: EpisodeLabel) -> None:
-        with (self._folder / EPISODES).open("ab") as file:
+    def _append_label(self, label: EpisodeLabel) -> None:
+        """Append the label of an episode to the labels of the folder."""
+        with (self._folder / LABELS_FILENAME).open("ab") as file:
             file.write(msgspec.json.encode(label) + b"\n")
         self.saved_count += 1
         result = "succeeded" if label.success else "failed"

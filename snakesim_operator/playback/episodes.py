@@ -1,4 +1,4 @@
-"""Divides runs into the episodes of a data set: task, success, reward of each step, pictures.
+"""Divides runs into the episodes of a dataset: task, success, reward of each step, images.
 
 `snakesim record --episodes` leaves a folder with the file EPISODES, in which the operator labels each episode. The task
 of any other run is its scenario, and its success is that it reached the mission's goal. Without a goal, success is
@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.playback.demonstrations import EPISODES, EpisodeLabel
-from snakesim_operator.playback.pictures import Pictures, read_pictures
-from snakesim_operator.results.metrics.advance import Advance
+from snakesim_operator.playback.demonstrations import LABELS_FILENAME, EpisodeLabel
+from snakesim_operator.playback.pictures import CameraImages, read_camera_images
+from snakesim_operator.results.metrics.advance import ForwardProgress
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import find_recording
+from snakesim_operator.results.run_reader import find_recording_path
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,13 @@ class Episode:
 
     record: RunRecord
     task: str
-    success: bool | None  # None: unknown
-    reward_m: Floats | None  # (n,) advance from each row of the record to the next; None: the pose is unknown
-    rows: NDArray[np.int64]  # of the record, without a gap between them
-    pictures: dict[str, Pictures] = field(default_factory=dict[str, Pictures])  # of the whole run, by camera
-    pictures_after_tick: int = -1  # older pictures are from before a gap, and show another scene
+    success: bool | None  # None if unknown
+    reward_m: Floats | None  # (n,) advance from each row of the record to the next; None if the pose is unknown
+    rows: NDArray[np.int64]  # indices into the record, without a gap between them
+    pictures: dict[str, CameraImages] = field(
+        default_factory=dict[str, CameraImages]
+    )  # images of the whole run, by camera
+    pictures_after_tick: int = -1  # images up to this tick were taken before the gap in front of the episode
 
 
 def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> list[Episode]:
@@ -45,8 +47,8 @@ def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> li
     Args:
         runs: Folders of runs, recordings, and folders of demonstrations. A folder of demonstrations holds a recording
             for each episode, and a file of labels with the operator's judgment.
-        task: The task of all episodes in words; None: the task that each run or label names.
-        images: Whether to read the pictures of the cameras.
+        task: Task of all episodes in words; None for the task that each run or label names.
+        images: Whether to read the images of the cameras.
 
     Returns:
         The episodes, in the order of `runs`.
@@ -56,14 +58,14 @@ def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> li
     """
     episodes: list[Episode] = []
     for run in runs:
-        labels_path = run / EPISODES
+        labels_path = run / LABELS_FILENAME
         is_demonstrations = labels_path.is_file()
         if not is_demonstrations:
-            episodes += _read_run(run, task, None, images=images)
+            episodes += _read_run_episodes(run, task, None, images=images)
             continue
         for label in read_labels(labels_path):
             recording = run / label.file
-            episodes += _read_run(recording, task or label.task, label.success, images=images)
+            episodes += _read_run_episodes(recording, task or label.task, label.success, images=images)
     return episodes
 
 
@@ -76,14 +78,14 @@ def describe_gaps(episodes: Sequence[Episode]) -> list[str]:
         begin_s = after.record.time_s[before.rows[-1]]
         end_s = after.record.time_s[after.rows[0]]
         sentences.append(
-            f"{after.record.folder}: no tick is recorded between {begin_s:.2f} and {end_s:.2f} s of robot time; an "
+            f"{after.record.path}: no tick is recorded between {begin_s:.2f} and {end_s:.2f} s of robot time; an "
             f"episode ends there and another one begins"
         )
     return sentences
 
 
 def read_labels(path: Path) -> list[EpisodeLabel]:
-    """Return the operator's label of each episode. Raises ConfigError."""
+    """Read the label of each episode from a file of labels. Raises ConfigError if it cannot be read."""
     try:
         lines = path.read_bytes().splitlines()
         return [msgspec.json.decode(line, type=EpisodeLabel) for line in lines if line.strip()]
@@ -93,14 +95,14 @@ def read_labels(path: Path) -> list[EpisodeLabel]:
         ) from None
 
 
-def _read_run(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[Episode]:
+def _read_run_episodes(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[Episode]:
     """Read the episodes of one run. A gap in the record ends an episode and begins the next one.
 
     Args:
         run: Folder of a run, or a recording.
-        task: The task in words; None: the name of the scenario.
-        success: The operator's label; None: the run succeeded if it reached its goal.
-        images: Whether to read the pictures of the cameras.
+        task: Task in words; None for the name of the scenario.
+        success: Label of the operator; None if a run counts as a success when it reached its goal.
+        images: Whether to read the images of the cameras.
 
     Returns:
         The episodes in order of time. If the run succeeded, only the last one counts as a success. A run that was
@@ -108,24 +110,24 @@ def _read_run(run: Path, task: str | None, success: bool | None, *, images: bool
     """
     record = RunRecord.load(run)
     reward_m = None
-    advance = Advance.from_run(record)
-    if advance is not None:
-        reward_m = _compute_reward_m(record, advance)
-        if success is None and advance.goal_m is not None:
-            success = advance.crossed_s is not None
-    pictures: dict[str, Pictures] = {}
+    progress = ForwardProgress.from_run(record)
+    if progress is not None:
+        reward_m = _compute_reward_m(record, progress)
+        if success is None and progress.goal_distance_m is not None:
+            success = progress.goal_reached_s is not None
+    pictures: dict[str, CameraImages] = {}
     if images:
-        pictures = read_pictures(find_recording(run))
+        pictures = read_camera_images(find_recording_path(run))
 
-    stretches = record.stretches
-    if not stretches:  # the robot was never armed
-        stretches = [np.arange(0)]
+    row_groups = record.contiguous_rows
+    if not row_groups:  # the robot was never armed
+        row_groups = [np.arange(0)]
     episodes: list[Episode] = []
-    for number, rows in enumerate(stretches):
+    for number, rows in enumerate(row_groups):
         is_first = number == 0
-        is_last = number == len(stretches) - 1
+        is_last = number == len(row_groups) - 1
         episode_success = success
-        if success and not is_last:  # it ended at a gap, not at the goal
+        if success and not is_last:  # this episode ended at a gap, not at the goal
             episode_success = False
         pictures_after_tick = -1
         if not is_first:  # pictures from before the gap do not show this episode
@@ -143,10 +145,10 @@ def _read_run(run: Path, task: str | None, success: bool | None, *, images: bool
     return episodes
 
 
-def _compute_reward_m(record: RunRecord, advance: Advance) -> Floats:
-    """Return the advance from each row to the next, (n,); 0 at the end and at a gap."""
-    along_m = np.interp(record.time_s - record.time_s[0], advance.time_s, advance.along_m)
-    reward_m = np.append(np.diff(along_m), 0.0)
-    for rows in record.stretches:
+def _compute_reward_m(record: RunRecord, progress: ForwardProgress) -> Floats:
+    """Compute the advance from each row to the next in m, (n,); 0 at the last row and before a gap."""
+    advance_m = np.interp(record.time_s - record.time_s[0], progress.time_s, progress.max_advance_m)
+    reward_m = np.append(np.diff(advance_m), 0.0)
+    for rows in record.contiguous_rows:
         reward_m[rows[-1]] = 0.0
     return reward_m

@@ -16,30 +16,30 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import PrintLine, escape_invisible
-from snakesim_hal.model.textfiles import exported
+from snakesim_hal.model.textfiles import export_atomically
 from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover_recording
-from snakesim_operator.recording.stamps import Stamps
-from snakesim_operator.results.missing_data import exit_code
+from snakesim_operator.recording.stamps import LogTimeClock
+from snakesim_operator.results.missing_data import report_missing_data
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import find_recording
-from snakesim_operator.results.signals import PARQUET_UNIT, arrays, table, unit_of
+from snakesim_operator.results.run_reader import find_recording_path
+from snakesim_operator.results.signals import PARQUET_UNIT, compute_signals, find_unit, make_signal_columns
 
-MISSING = b"snakesim.missing"  # metadata of a Parquet file: JSON
+MISSING_METADATA_KEY = b"snakesim.missing"  # metadata of a Parquet file: JSON
 
 
-def export(
-    runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine, stamps: Stamps | None = None
+def export_run(
+    runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine, stamps: LogTimeClock | None = None
 ) -> int:
-    """Write one run as a file in another format.
+    """Export one run as a file in another format.
 
     Args:
         runs: The run, as the only item.
-        form: Format of the file: "csv", "parquet" or "npz" for a row each tick, "mcap" for a recording.
-        out: The file; None: beside the recording.
+        form: Format of the file: "csv", "parquet" or "npz" for a row per tick, "mcap" for a recording.
+        out: Path of the file; None for a file beside the recording.
         print_text: Prints a line.
-        stamps: With "mcap", the clock of the times in the file; None: as recorded.
+        stamps: With "mcap", the clock of the timestamps in the file; None to keep those of the recording.
 
     Returns:
         The exit code: 3 if the run is incomplete, otherwise 0.
@@ -53,43 +53,43 @@ def export(
             code="command/invalid-option",
         )
     run = runs[0]
-    path = _reserve(out or _default_path(run, form))
+    path = _check_output_path(out or _default_path(run, form))
     if form == "mcap":
-        with exported(path) as partial:
-            message_count, missing = recover_recording(find_recording(run), partial, stamps)
+        with export_atomically(path) as partial:
+            message_count, missing = recover_recording(find_recording_path(run), partial, stamps)
         print_text(f"{message_count} messages: {path}")
-        return exit_code(run, missing)
+        return report_missing_data(run, missing)
 
     record = RunRecord.load(run)
-    with exported(path) as partial:
+    with export_atomically(path) as partial:
         match form:
             case "npz":
                 _write_npz(record, partial)
             case "csv":
-                _write_csv(table(record), partial, record.missing)
+                _write_csv(make_signal_columns(record), partial, record.missing)
             case _:
-                columns = {name: values.tolist() for name, values in table(record).items()}
-                units = {name: unit_of(name, record) for name in columns}
+                columns = {name: values.tolist() for name, values in make_signal_columns(record).items()}
+                units = {name: find_unit(name, record) for name in columns}
                 metadata = None
                 if record.missing:
-                    metadata = {MISSING: json.dumps(record.missing).encode()}
+                    metadata = {MISSING_METADATA_KEY: json.dumps(record.missing).encode()}
                 write_parquet(columns, partial, metadata, units)
     print_text(f"{len(record.time_s)} ticks: {path}")
-    return exit_code(run, record.missing)
+    return report_missing_data(run, record.missing)
 
 
 def export_dataset(
     runs: Sequence[Path], out: Path | None, print_text: PrintLine, *, images: bool, task: str | None, fps: float | None
 ) -> int:
-    """Write runs as a LeRobot dataset: an episode for each run or demonstration, and one more for each gap in it.
+    """Export runs as a LeRobot dataset: an episode for each run or demonstration, and one more for each gap in it.
 
     Args:
         runs: Folders of runs or demonstrations, or recordings.
-        out: Folder of the dataset; None: beside the first run.
+        out: Folder of the dataset; None for a folder beside the first run.
         print_text: Prints a line.
-        images: Whether the pictures of the cameras are included.
-        task: The task of all episodes in words; None: the task that each run names.
-        fps: Frames per second; None: the robot's rate.
+        images: Whether the images of the cameras are included.
+        task: Task of all episodes in words; None for the task that each run names.
+        fps: Frames per second; None for the control rate of the robot.
 
     Returns:
         The exit code: 3 if a run is incomplete, otherwise 0.
@@ -97,22 +97,22 @@ def export_dataset(
     Raises:
         ConfigError: A run cannot be read, the runs do not fit together, or the folder cannot be written.
     """
-    path = _reserve(out or _default_path(runs[0], "lerobot"))
+    path = _check_output_path(out or _default_path(runs[0], "lerobot"))
     episodes = read_episodes(runs, task, images=images)
-    with exported(path) as partial:
+    with export_atomically(path) as partial:
         size = write_lerobot(episodes, partial, write_parquet, fps)
     for sentence in describe_gaps(episodes):
         print_text(sentence)
     print_text(f"{size.episodes} episodes, {size.frames} frames: {path}")
-    codes = [exit_code(episode.record.folder, episode.record.missing) for episode in episodes]
+    codes = [report_missing_data(episode.record.path, episode.record.missing) for episode in episodes]
     return max(codes)
 
 
-def _reserve(path: Path) -> Path:
-    """Return a path after checking that it can be written, and that there is no such file. Raises ConfigError."""
+def _check_output_path(path: Path) -> Path:
+    """Check that a path can be written and does not exist yet, and return it. Raises ConfigError otherwise."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch(exist_ok=False)  # before the work of minutes; not through a link, wherever it leads
+        path.touch(exist_ok=False)  # checked before minutes of work; does not follow a symbolic link
         path.unlink()
     except FileExistsError:
         what = "a symbolic link" if path.is_symlink() else "such a file"
@@ -127,7 +127,7 @@ def _reserve(path: Path) -> Path:
 
 
 def _default_path(run: Path, form: str) -> Path:
-    """Return where an export goes by default: into the run's folder, or beside a recording."""
+    """Return the default path of an export: in the folder of the run, or beside a recording."""
     base = run / "export" if run.is_dir() else run.with_suffix("")
     if form == "lerobot":
         return base.with_name(f"{base.name}-lerobot")
@@ -139,7 +139,7 @@ def _write_npz(record: RunRecord, path: Path) -> None:
     missing = np.array(record.missing, dtype=str)
     names: dict[str, Any] = {"joints": joints, "missing": missing}
     with path.open("xb") as file:
-        np.savez_compressed(file, **arrays(record), **names)
+        np.savez_compressed(file, **compute_signals(record), **names)
 
 
 def _write_csv(columns: dict[str, NDArray[Any]], path: Path, missing: Sequence[str]) -> None:
@@ -161,10 +161,10 @@ def write_parquet(
     """Write columns as a Parquet file. Needs the extra `report`.
 
     Args:
-        columns: Values by column.
-        path: The file.
+        columns: Values of each column by name.
+        path: Path of the file.
         metadata: Metadata of the schema.
-        units: Unit by column, which becomes metadata of the column; None: the columns have no units.
+        units: Unit of each column by name, stored as metadata of the column; None for columns without units.
     """
     import pyarrow
     import pyarrow.parquet

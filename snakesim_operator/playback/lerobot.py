@@ -28,28 +28,28 @@ from snakesim_operator.playback.episodes import Episode
 from snakesim_operator.playback.lerobot_statistics import (
     Statistics,
     compute_feature_statistics,
-    compute_picture_statistics,
-    merge_picture_statistics,
+    compute_image_statistics,
+    merge_image_statistics,
 )
 from snakesim_operator.results.run_log import RunRecord
 
 VERSION = "v3.0"
-MISSING = "meta/missing.json"  # of each incomplete episode; LeRobot knows no such file
-FILES_A_CHUNK = 1000
-FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-DATA = f"data/{FILE}"
-EPISODES = f"meta/episodes/{FILE}".format(chunk_index=0, file_index=0)
-INDEX = "__index_level_0__"  # pandas' name for an index without one
-COUNTED = ("frame_index", "episode_index", "index", "task_index")
+MISSING_PATH = "meta/missing.json"  # missing data of each incomplete episode; LeRobot does not define this file
+FILES_PER_CHUNK = 1000
+FILE_PATTERN = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+DATA_PATTERN = f"data/{FILE_PATTERN}"
+EPISODES_PATH = f"meta/episodes/{FILE_PATTERN}".format(chunk_index=0, file_index=0)
+TASK_COLUMN = "__index_level_0__"  # column of the task texts: the name that pandas gives to an index without a name
+INDEX_COLUMNS = ("frame_index", "episode_index", "index", "task_index")
 
-IMAGES = "observation.images."
+IMAGE_PREFIX = "observation.images."
 Frames = dict[str, NDArray[Any]]
 WriteTable = Callable[[dict[str, Any], Path, dict[bytes, bytes] | None], None]
 
 
 @dataclass(frozen=True)
 class DatasetSize:
-    """What was written."""
+    """Number of episodes and frames of a dataset."""
 
     episodes: int
     frames: int
@@ -64,171 +64,186 @@ def write_lerobot(
         episodes: Runs, or parts of runs between gaps.
         folder: Folder of the dataset.
         write_table: Writes columns as a Parquet file, with metadata of its schema.
-        fps: Frames per second, a divisor of the robot's rate; None: the robot's rate.
+        fps: Frames per second, a divisor of the control rate of the robot; None for that rate.
 
     Returns:
         The number of episodes and frames that were written. Episodes without a frame are left out.
 
     Raises:
-        ConfigError: The runs do not fit together, or a run has no frame.
+        ConfigError: The runs have different joints or rates, or a run has no frame.
     """
-    robot_hz = _common_rate_hz([episode.record for episode in episodes])
-    ticks_per_frame = _step(robot_hz, fps)
-    content = _Content.from_episodes(episodes)
-    dataset = _Dataset(folder, write_table, content, seconds_per_frame=ticks_per_frame / robot_hz)
+    robot_hz = _find_common_rate_hz([episode.record for episode in episodes])
+    ticks_per_frame = _compute_ticks_per_frame(robot_hz, fps)
+    content = _DatasetContent.from_episodes(episodes)
+    dataset = _DatasetWriter(folder, write_table, content, seconds_per_frame=ticks_per_frame / robot_hz)
 
-    frames_by_episode = [_rows(episode, content, ticks_per_frame) for episode in episodes]
+    frames_by_episode = [_select_frame_rows(episode, content, ticks_per_frame) for episode in episodes]
     folders_with_frames: set[Path] = set()
     for episode, (rows, _) in zip(episodes, frames_by_episode, strict=True):
         if len(rows):
-            folders_with_frames.add(episode.record.folder)
+            folders_with_frames.add(episode.record.path)
     for episode in episodes:
-        if episode.record.folder not in folders_with_frames:
+        if episode.record.path not in folders_with_frames:
             raise ConfigError(
-                f"{episode.record.folder}: no picture came while it was armed; export it without --images",
+                f"{episode.record.path}: no picture came while it was armed; export it without --images",
                 code="recording/missing-data",
             )
 
-    for episode, (rows, picture_numbers) in zip(episodes, frames_by_episode, strict=True):
+    for episode, (rows, image_indices) in zip(episodes, frames_by_episode, strict=True):
         if len(rows):
-            dataset.add(episode, rows, picture_numbers)
-    dataset.finish(_info(episodes[0], content, robot_hz // ticks_per_frame))
-    return DatasetSize(len(dataset.rows), dataset.frame_count)
+            dataset.add_episode(episode, rows, image_indices)
+    dataset.write_metadata(_make_dataset_info(episodes[0], content, robot_hz // ticks_per_frame))
+    return DatasetSize(len(dataset.episode_rows), dataset.frame_count)
 
 
-class _Dataset:
-    """The files of a dataset, written episode by episode."""
+class _DatasetWriter:
+    """Writes the files of a dataset: first episode by episode, then the files about the whole dataset."""
 
-    def __init__(self, folder: Path, write_table: WriteTable, content: "_Content", *, seconds_per_frame: float) -> None:
+    def __init__(
+        self, folder: Path, write_table: WriteTable, content: "_DatasetContent", *, seconds_per_frame: float
+    ) -> None:
         self._folder = folder
         self._write_table = write_table
         self._content = content
         self._seconds_per_frame = seconds_per_frame
         self._tasks: list[str] = []
-        self._frames: list[Frames] = []  # of each episode
-        self._picture_statistics: dict[str, list[Statistics]] = {camera: [] for camera in content.cameras}
+        self._frames_by_episode: list[Frames] = []  # of each episode
+        self._image_statistics: dict[str, list[Statistics]] = {camera: [] for camera in content.size_by_camera}
         self._records: list[RunRecord] = []  # of each episode
-        self.rows: list[dict[str, Any]] = []  # of meta/episodes, one for each episode
+        self.episode_rows: list[dict[str, Any]] = []  # of meta/episodes, one for each episode
         self.frame_count = 0
 
-    def add(self, episode: Episode, rows: NDArray[np.int64], shown: dict[str, NDArray[np.int64]]) -> None:
-        """Writes the frames of an episode.
+    def add_episode(
+        self, episode: Episode, rows: NDArray[np.int64], image_indices_by_camera: dict[str, NDArray[np.int64]]
+    ) -> None:
+        """Write the frames of an episode as a file, and add the episode to the metadata.
 
         Args:
-            episode: What they are of.
-            rows: Rows of its record that become frames.
-            shown: By camera, which picture each of the frames shows.
+            episode: The episode.
+            rows: (frames,) rows of the record that become frames.
+            image_indices_by_camera: For each camera, (frames,) the index of the image that each frame shows.
         """
-        number = len(self.rows)
-        count = len(rows)
+        episode_index = len(self.episode_rows)
+        frame_count = len(rows)
         if episode.task not in self._tasks:
             self._tasks.append(episode.task)
-        frames = _frames(episode, self._content, rows)
-        frames["timestamp"] = (np.arange(count) * self._seconds_per_frame).astype(np.float32)
-        frames["frame_index"] = np.arange(count)
-        frames["episode_index"] = np.full(count, number)
-        frames["index"] = np.arange(self.frame_count, self.frame_count + count)
-        frames["task_index"] = np.full(count, self._tasks.index(episode.task))
-        chunk, file = divmod(number, FILES_A_CHUNK)
+        frames = _make_frames(episode, self._content, rows)
+        frames["timestamp"] = (np.arange(frame_count) * self._seconds_per_frame).astype(np.float32)
+        frames["frame_index"] = np.arange(frame_count)
+        frames["episode_index"] = np.full(frame_count, episode_index)
+        frames["index"] = np.arange(self.frame_count, self.frame_count + frame_count)
+        frames["task_index"] = np.full(frame_count, self._tasks.index(episode.task))
+        chunk, file = divmod(episode_index, FILES_PER_CHUNK)
         row: dict[str, Any] = {
-            "episode_index": number,
+            "episode_index": episode_index,
             "tasks": [episode.task],
-            "length": count,
+            "length": frame_count,
             "data/chunk_index": chunk,
             "data/file_index": file,
             "dataset_from_index": self.frame_count,
-            "dataset_to_index": self.frame_count + count,
+            "dataset_to_index": self.frame_count + frame_count,
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
         columns: dict[str, Any] = {}
         for name, values in frames.items():
             columns[name] = list(values) if values.ndim > 1 else values
-            row |= _columns_of(name, compute_feature_statistics(values))
-        for camera, picture_numbers in shown.items():
+            row |= _make_statistics_columns(name, compute_feature_statistics(values))
+        for camera, image_indices in image_indices_by_camera.items():
             pictures = episode.pictures[camera]
-            columns[IMAGES + camera] = [
-                {"bytes": pictures.png[i], "path": f"frame-{i:06d}.png"} for i in picture_numbers
+            columns[IMAGE_PREFIX + camera] = [
+                {"bytes": pictures.png[i], "path": f"frame-{i:06d}.png"} for i in image_indices
             ]
-            statistics = compute_picture_statistics(pictures, picture_numbers)
-            self._picture_statistics[camera].append(statistics)
-            row |= _columns_of(IMAGES + camera, statistics)
-        self._write_table(columns, self._folder / DATA.format(chunk_index=chunk, file_index=file), None)
-        self._frames.append(frames)
+            statistics = compute_image_statistics(pictures, image_indices)
+            self._image_statistics[camera].append(statistics)
+            row |= _make_statistics_columns(IMAGE_PREFIX + camera, statistics)
+        self._write_table(columns, self._folder / DATA_PATTERN.format(chunk_index=chunk, file_index=file), None)
+        self._frames_by_episode.append(frames)
         self._records.append(episode.record)
-        self.rows.append(row)
-        self.frame_count += count
+        self.episode_rows.append(row)
+        self.frame_count += frame_count
 
-    def finish(self, info: dict[str, Any]) -> None:
-        """Write the files about the dataset as a whole: episodes, tasks, statistics, missing data and info.
+    def write_metadata(self, info: dict[str, Any]) -> None:
+        """Write the metadata files of the whole dataset: episodes, tasks, statistics, missing data and info.
+
+        At least one episode must have been added before.
 
         Args:
             info: Content of `meta/info.json` without the totals, which are added.
         """
-        episode_columns = {name: [row[name] for row in self.rows] for name in self.rows[0]}
-        self._write_table(episode_columns, self._folder / EPISODES, None)
-
-        task_columns = {"task_index": list(range(len(self._tasks))), INDEX: self._tasks}
-        task_metadata = {b"pandas": json.dumps(_PANDAS).encode()}
-        self._write_table(task_columns, self._folder / "meta" / "tasks.parquet", task_metadata)
-
-        statistics: dict[str, Statistics] = {}
-        for name in self._frames[0]:
-            values = np.concatenate([frames[name] for frames in self._frames])
-            statistics[name] = compute_feature_statistics(values)
-        for camera, parts in self._picture_statistics.items():
-            statistics[IMAGES + camera] = merge_picture_statistics(parts)
-        self._write_json("meta/stats.json", statistics)
-
-        missing_by_episode: dict[int, list[str]] = {}
-        for number, record in enumerate(self._records):
-            if record.missing:
-                missing_by_episode[number] = record.missing
-        if missing_by_episode:
-            self._write_json(MISSING, missing_by_episode)
-
+        self._write_episodes_and_tasks()
+        self._write_statistics()
+        self._write_missing_data()
         totals = {
-            "total_episodes": len(self.rows),
+            "total_episodes": len(self.episode_rows),
             "total_frames": self.frame_count,
             "total_tasks": len(self._tasks),
-            "splits": {"train": f"0:{len(self.rows)}"},
+            "splits": {"train": f"0:{len(self.episode_rows)}"},
         }
         self._write_json("meta/info.json", info | totals)
+
+    def _write_episodes_and_tasks(self) -> None:
+        """Write the tables of all episodes and of all tasks."""
+        episode_columns = {name: [row[name] for row in self.episode_rows] for name in self.episode_rows[0]}
+        self._write_table(episode_columns, self._folder / EPISODES_PATH, None)
+
+        task_columns = {"task_index": list(range(len(self._tasks))), TASK_COLUMN: self._tasks}
+        task_metadata = {b"pandas": json.dumps(_PANDAS_METADATA).encode()}
+        self._write_table(task_columns, self._folder / "meta" / "tasks.parquet", task_metadata)
+
+    def _write_statistics(self) -> None:
+        """Write the statistics of every feature over all episodes."""
+        statistics: dict[str, Statistics] = {}
+        for name in self._frames_by_episode[0]:
+            values = np.concatenate([frames[name] for frames in self._frames_by_episode])
+            statistics[name] = compute_feature_statistics(values)
+        for camera, parts in self._image_statistics.items():
+            statistics[IMAGE_PREFIX + camera] = merge_image_statistics(parts)
+        self._write_json("meta/stats.json", statistics)
+
+    def _write_missing_data(self) -> None:
+        """Write the missing data of incomplete episodes, if there are any."""
+        missing_by_episode: dict[int, list[str]] = {}
+        for episode_index, record in enumerate(self._records):
+            if record.missing:
+                missing_by_episode[episode_index] = record.missing
+        if missing_by_episode:
+            self._write_json(MISSING_PATH, missing_by_episode)
 
     def _write_json(self, name: str, content: Any) -> None:
         write_text(self._folder / name, json.dumps(content, indent=2) + "\n")
 
 
-def _columns_of(feature: str, statistics: Statistics) -> Statistics:
-    """Returns the columns that hold a feature's statistics in meta/episodes."""
+def _make_statistics_columns(feature: str, statistics: Statistics) -> Statistics:
+    """Make the columns of `meta/episodes` with the statistics of a feature."""
     return {f"stats/{feature}/{name}": numbers for name, numbers in statistics.items()}
 
 
 @dataclass(frozen=True)
-class _Content:
-    """What is known of every episode."""
+class _DatasetContent:
+    """The optional features of a dataset: those that are known in every episode."""
 
-    posed: bool
-    rewarded: bool
-    judged: bool
-    cameras: dict[str, tuple[int, int]]  # width and height
+    has_pose: bool
+    has_reward: bool
+    has_success: bool
+    size_by_camera: dict[str, tuple[int, int]]  # width and height
 
     @staticmethod
-    def from_episodes(episodes: Sequence[Episode]) -> "_Content":
-        """Return what is known of every one of some episodes."""
-        cameras = _camera_sizes(episodes[0])
+    def from_episodes(episodes: Sequence[Episode]) -> "_DatasetContent":
+        """Determine the features that are known in every episode."""
+        cameras = _find_camera_sizes(episodes[0])
         for episode in episodes[1:]:
-            cameras &= _camera_sizes(episode)
-        return _Content(
-            posed=all(bool(episode.record.posed.all()) for episode in episodes),
-            rewarded=all(episode.reward_m is not None for episode in episodes),
-            judged=all(episode.success is not None for episode in episodes),
-            cameras=dict(sorted(cameras)),
+            cameras &= _find_camera_sizes(episode)
+        return _DatasetContent(
+            has_pose=all(bool(episode.record.has_pose.all()) for episode in episodes),
+            has_reward=all(episode.reward_m is not None for episode in episodes),
+            has_success=all(episode.success is not None for episode in episodes),
+            size_by_camera=dict(sorted(cameras)),
         )
 
 
-def _camera_sizes(episode: Episode) -> set[tuple[str, tuple[int, int]]]:
-    """Return name, width and height of each camera that has pictures."""
+def _find_camera_sizes(episode: Episode) -> set[tuple[str, tuple[int, int]]]:
+    """Find the name, width and height of each camera with images in an episode."""
     sizes: set[tuple[str, tuple[int, int]]] = set()
     for name, pictures in episode.pictures.items():
         if pictures.ticks:
@@ -236,51 +251,53 @@ def _camera_sizes(episode: Episode) -> set[tuple[str, tuple[int, int]]]:
     return sizes
 
 
-def _step(robot_hz: int, fps: float | None) -> int:
-    """Return the number of ticks from frame to frame."""
+def _compute_ticks_per_frame(robot_hz: int, fps: float | None) -> int:
+    """Compute the number of ticks between frames. Raises ConfigError if `fps` does not divide the robot's rate."""
     if fps is None:
         return 1
-    step = max(round(robot_hz / fps), 1)
-    if fps != round(fps) or robot_hz != step * fps:
+    ticks_per_frame = max(round(robot_hz / fps), 1)
+    if fps != round(fps) or robot_hz != ticks_per_frame * fps:
         allowed = ", ".join(str(hz) for hz in range(1, robot_hz + 1) if robot_hz % hz == 0)
         raise ConfigError(
             f"--fps {fps:g}: of a robot at {robot_hz} Hz give one of {allowed}", code="command/invalid-option"
         )
-    return step
+    return ticks_per_frame
 
 
-def _rows(episode: Episode, content: _Content, step: int) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
-    """Select the rows of an episode that become frames, and the newest picture of each camera at each frame.
+def _select_frame_rows(
+    episode: Episode, content: _DatasetContent, ticks_per_frame: int
+) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
+    """Select the rows of an episode that become frames, and the newest image of each camera at each frame.
 
-    The frames begin at the first row at which every camera has taken a picture during this episode.
+    The frames start at the first row at which every camera has taken an image during this episode.
 
     Args:
         episode: The episode; its rows are indices into the record of the run.
         content: What the dataset holds, with the names of its cameras.
-        step: Number of ticks from frame to frame.
+        ticks_per_frame: Number of ticks between frames.
 
     Returns:
-        rows: (frames,) rows of the record; empty if a camera has no picture.
-        picture_numbers: For each camera, (frames,) the index of the picture that the frame shows.
+        rows: (frames,) rows of the record; empty if a camera has no image.
+        image_indices: For each camera, (frames,) the index of the image that each frame shows.
     """
     ticks = episode.record.ticks[episode.rows]
-    has_all_pictures = np.ones(len(ticks), dtype=bool)
-    newest_pictures: dict[str, NDArray[np.int64]] = {}
-    for camera in content.cameras:
-        picture_ticks = np.array(episode.pictures[camera].ticks)
-        newest = np.searchsorted(picture_ticks, ticks, side="right") - 1
-        # Pictures up to this tick were taken before the gap in front of the episode.
-        first_usable = int(np.searchsorted(picture_ticks, episode.pictures_after_tick, side="right"))
-        has_all_pictures &= newest >= first_usable
-        newest_pictures[camera] = newest
-    if not has_all_pictures.any():
+    has_all_images = np.ones(len(ticks), dtype=bool)
+    newest_images: dict[str, NDArray[np.int64]] = {}
+    for camera in content.size_by_camera:
+        image_ticks = np.array(episode.pictures[camera].ticks)
+        newest = np.searchsorted(image_ticks, ticks, side="right") - 1
+        # Images up to `pictures_after_tick` were taken before the gap in front of the episode.
+        first_usable = int(np.searchsorted(image_ticks, episode.pictures_after_tick, side="right"))
+        has_all_images &= newest >= first_usable
+        newest_images[camera] = newest
+    if not has_all_images.any():
         return episode.rows[:0], {}
-    first = int(np.argmax(has_all_pictures))
-    picture_numbers = {camera: newest[first::step] for camera, newest in newest_pictures.items()}
-    return episode.rows[first::step], picture_numbers
+    first = int(np.argmax(has_all_images))
+    image_indices = {camera: newest[first::ticks_per_frame] for camera, newest in newest_images.items()}
+    return episode.rows[first::ticks_per_frame], image_indices
 
 
-def _common_rate_hz(records: Sequence[RunRecord]) -> int:
+def _find_common_rate_hz(records: Sequence[RunRecord]) -> int:
     if any(one.description.layout != records[0].description.layout for one in records):
         raise ConfigError(
             "the runs are of robots with different joints; a dataset is of one", code="recording/not-comparable"
@@ -291,7 +308,7 @@ def _common_rate_hz(records: Sequence[RunRecord]) -> int:
             "a dataset has one rate, a whole number of Hz; export the runs of each rate apart",
             code="recording/not-comparable",
         )
-    empty = [one.folder for one in records if not len(one.time_s)]
+    empty = [one.path for one in records if not len(one.time_s)]
     if empty:
         raise ConfigError(
             f"{empty[0]} has no tick after arming, so no frame; leave it out", code="recording/missing-data"
@@ -299,31 +316,31 @@ def _common_rate_hz(records: Sequence[RunRecord]) -> int:
     return round(rate_hz)
 
 
-def _info(episode: Episode, content: _Content, fps: int) -> dict[str, Any]:
-    """Return the content of `meta/info.json` in a LeRobot dataset, without the totals.
+def _make_dataset_info(episode: Episode, content: _DatasetContent, fps: int) -> dict[str, Any]:
+    """Make the content of `meta/info.json` in a LeRobot dataset, without the totals.
 
     Args:
         episode: Any episode of the dataset, for the names of robot and joints.
-        content: What is known of every episode, and therefore becomes a feature.
+        content: Optional features of the dataset.
         fps: Frames per second.
     """
     features: dict[str, Any] = {}
-    for feature, names in _names(episode.record, posed=content.posed).items():
+    for feature, names in _list_feature_names(episode.record, has_pose=content.has_pose).items():
         features[feature] = {"dtype": "float32", "shape": [len(names)], "names": names}
-    for camera, (width, height) in content.cameras.items():
-        features[IMAGES + camera] = {
+    for camera, (width, height) in content.size_by_camera.items():
+        features[IMAGE_PREFIX + camera] = {
             "dtype": "image",
             "shape": [height, width, 3],
             "names": ["height", "width", "channels"],
         }
 
     scalar_types = {"timestamp": "float32"}
-    for feature in COUNTED:
+    for feature in INDEX_COLUMNS:
         scalar_types[feature] = "int64"
     scalar_types["next.done"] = "bool"
-    if content.rewarded:
+    if content.has_reward:
         scalar_types["next.reward"] = "float32"
-    if content.judged:
+    if content.has_success:
         scalar_types["next.success"] = "bool"
     for feature, dtype in scalar_types.items():
         features[feature] = {"dtype": dtype, "shape": [1], "names": None}
@@ -331,47 +348,47 @@ def _info(episode: Episode, content: _Content, fps: int) -> dict[str, Any]:
     return {
         "codebase_version": VERSION,
         "robot_type": episode.record.description.robot,
-        "chunks_size": FILES_A_CHUNK,
+        "chunks_size": FILES_PER_CHUNK,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": fps,
-        "data_path": DATA,
+        "data_path": DATA_PATTERN,
         "video_path": None,
         "features": features,
     }
 
 
-def _names(record: RunRecord, *, posed: bool) -> dict[str, list[str]]:
+def _list_feature_names(record: RunRecord, *, has_pose: bool) -> dict[str, list[str]]:
     joints = [joint.name for joint in record.description.joints]
     state = [f"{name}.{joint}" for name in ("angle_rad", "velocity_rad_s", "torque_nm") for joint in joints]
     pose = [*(f"position_w_m.{axis}" for axis in "xyz"), *(f"orientation.{part}" for part in "wxyz")]
     return {
-        "observation.state": [*state, *(pose if posed else [])],
+        "observation.state": [*state, *(pose if has_pose else [])],
         "action": [f"{name}.{joint}" for name in ("target", "mode") for joint in joints],
     }
 
 
-def _frames(episode: Episode, content: _Content, rows: NDArray[np.int64]) -> Frames:
-    """Return the values of the features that an episode has by itself, (n, width) or (n,), without pictures."""
+def _make_frames(episode: Episode, content: _DatasetContent, rows: NDArray[np.int64]) -> Frames:
+    """Make the values of the features of an episode, (n, width) or (n,), except indices and images."""
     record = episode.record
     state = [record.angle_rad, record.velocity_rad_s, record.torque_nm]
-    state += [record.position_w_m, record.orientation_wxyz] if content.posed else []
+    state += [record.position_w_m, record.orientation_wxyz] if content.has_pose else []
     is_last_frame = np.arange(len(rows)) == len(rows) - 1
     frames: Frames = {
         "observation.state": np.hstack(state)[rows].astype(np.float32),
         "action": np.hstack((record.target, record.mode))[rows].astype(np.float32),
         "next.done": is_last_frame,
     }
-    if content.rewarded and episode.reward_m is not None:
+    if content.has_reward and episode.reward_m is not None:
         reward_m = episode.reward_m[: episode.rows[-1] + 1]  # the last frame earns nothing beyond its episode
         frames["next.reward"] = np.add.reduceat(reward_m, rows).astype(np.float32)
-    if content.judged:
+    if content.has_success:
         frames["next.success"] = is_last_frame & bool(episode.success)
     return frames
 
 
-_PANDAS = {  # what pandas needs to read an index: https://pandas.pydata.org/docs/development/developer.html
-    "index_columns": [INDEX],
+_PANDAS_METADATA = {  # what pandas needs to read an index: https://pandas.pydata.org/docs/development/developer.html
+    "index_columns": [TASK_COLUMN],
     "column_indexes": [
         {"name": None, "field_name": None, "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
     ],
@@ -383,7 +400,7 @@ _PANDAS = {  # what pandas needs to read an index: https://pandas.pydata.org/doc
             "numpy_type": "int64",
             "metadata": None,
         },
-        {"name": None, "field_name": INDEX, "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
+        {"name": None, "field_name": TASK_COLUMN, "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
     ],
     "pandas_version": "2.0.0",
 }

@@ -1,4 +1,4 @@
-"""Computes the statistics of a LeRobot dataset: of its features, and of the color channels of its pictures."""
+"""Computes the statistics of a LeRobot dataset: of its features, and of the color channels of its images."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.playback.pictures import Pictures
+from snakesim_operator.playback.pictures import CameraImages
 
 QUANTILES_PERCENT = (1, 10, 50, 90, 99)
 CHANNELS = 3  # red, green, blue
@@ -16,10 +16,13 @@ Statistics = dict[str, Any]  # as in `meta/stats.json`
 
 
 def compute_feature_statistics(values: NDArray[Any]) -> Statistics:
-    """Return minimum, maximum, mean, standard deviation and quantiles of a feature.
+    """Compute minimum, maximum, mean, standard deviation and quantiles of a feature.
 
     Args:
         values: (n,) or (n, width) values.
+
+    Returns:
+        For each statistic by name a list with an item for each column; and `count`, the number of values.
     """
     columns = values.astype(np.float64).reshape(len(values), -1)
     statistics: Statistics = {
@@ -35,20 +38,20 @@ def compute_feature_statistics(values: NDArray[Any]) -> Statistics:
     return statistics
 
 
-def compute_picture_statistics(pictures: Pictures, shown: NDArray[np.int64]) -> Statistics:
-    """Return the statistics of each color channel, 0 to 1, without quantiles.
+def compute_image_statistics(images: CameraImages, image_indices: NDArray[np.int64]) -> Statistics:
+    """Compute the statistics of each color channel, 0 to 1, without quantiles.
 
     Args:
-        pictures: The pictures of one camera.
-        shown: Numbers of the pictures to count, (n,).
+        images: Images of one camera.
+        image_indices: (n,) indices of the images that count.
     """
-    mean = np.array(pictures.channel_means)[shown].mean(axis=0)
-    mean_of_squares = np.array(pictures.channel_squares)[shown].mean(axis=0)
-    return _format_channels(pictures.channel_min, pictures.channel_max, mean, mean_of_squares, len(shown))
+    mean = np.array(images.channel_means)[image_indices].mean(axis=0)
+    mean_of_squares = np.array(images.channel_squares)[image_indices].mean(axis=0)
+    return _format_channels(images.channel_min, images.channel_max, mean, mean_of_squares, len(image_indices))
 
 
-def merge_picture_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """Return the statistics of several episodes together."""
+def merge_image_statistics(parts: Sequence[Statistics]) -> Statistics:
+    """Merge the image statistics of several episodes, weighted by their numbers of images."""
     minima = _stack_channels(parts, "min")
     maxima = _stack_channels(parts, "max")
     means = _stack_channels(parts, "mean")
@@ -61,16 +64,16 @@ def merge_picture_statistics(parts: Sequence[Statistics]) -> Statistics:
 
 
 def _stack_channels(parts: Sequence[Statistics], name: str) -> Floats:
-    """Return one of the statistics of all parts, (parts, 3)."""
+    """Return one statistic of all parts as an array, (parts, 3)."""
     return np.array([part[name] for part in parts]).reshape(-1, CHANNELS)
 
 
 def _format_channels(minimum: Floats, maximum: Floats, mean: Floats, mean_of_squares: Floats, count: int) -> Statistics:
-    """Return statistics as LeRobot has them, (3, 1, 1) each, from arrays of shape (3,)."""
+    """Format statistics as LeRobot expects them, (3, 1, 1) each, from arrays of shape (3,)."""
     variance = np.maximum(mean_of_squares - np.square(mean), 0.0)
-    numbers = {"min": minimum, "max": maximum, "mean": mean, "std": np.sqrt(variance)}
+    array_by_name = {"min": minimum, "max": maximum, "mean": mean, "std": np.sqrt(variance)}
     statistics: Statistics = {}
-    for name, value in numbers.items():
+    for name, value in array_by_name.items():
         statistics[name] = value.reshape(CHANNELS, 1, 1).tolist()
     statistics["count"] = [count]
     return statistics

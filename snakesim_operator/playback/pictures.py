@@ -1,4 +1,4 @@
-"""Reads the pictures of a recording's cameras for a data set: color as it is, depth as gray."""
+"""Reads the camera images of a recording for a dataset: color as recorded, depth as gray."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,24 +18,24 @@ Rgb = NDArray[np.uint8]
 
 
 @dataclass
-class Pictures:
-    """The pictures of one camera, in the order of their ticks. All numbers are 0 to 1."""
+class CameraImages:
+    """Images of one camera in the order of their ticks, and statistics of their color channels from 0 to 1."""
 
     width: int
     height: int
     ticks: list[int] = field(default_factory=list[int])
     png: list[bytes] = field(default_factory=list[bytes])
 
-    # Mean and mean of squares of each picture, (3,).
+    # Mean and mean of squares of the color channels of each image, (3,).
     channel_means: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
     channel_squares: list[NDArray[np.float64]] = field(default_factory=list[NDArray[np.float64]])
 
-    # Extremes over all pictures, (3,).
+    # Extremes of the color channels over all images, (3,).
     channel_min: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
     channel_max: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def add(self, tick: int, rgb: Rgb) -> None:
-        """Add a picture, (height * width * 3,) or (height, width, 3)."""
+        """Add an image, (height * width * 3,) or (height, width, 3), as PNG and to the statistics."""
         pixels = rgb.reshape(-1, 3) / 255.0
         self.ticks.append(tick)
         self.png.append(encode_png(self.width, self.height, rgb.tobytes(), bits=8, color=True))
@@ -45,19 +45,19 @@ class Pictures:
         self.channel_max = np.maximum(self.channel_max, pixels.max(axis=0))
 
 
-def read_pictures(path: Path) -> dict[str, Pictures]:
+def read_camera_images(path: Path) -> dict[str, CameraImages]:
     """Read the color and depth images of all cameras in a recording.
 
-    Pictures are left out if they are damaged, if they are not newer than the one before, or if their size differs from
-    the camera's first.
+    An image is left out if it is damaged, if it is not newer than the previous one, or if its size differs from that of
+    the first image of its camera.
 
     Args:
-        path: The recording.
+        path: Path of the recording.
 
     Returns:
-        Pictures by camera. A camera `head` has its color images at `head`, and its depth images at `head_depth`.
+        Images by name of the camera: color images of a camera `head` as `head`, its depth images as `head_depth`.
     """
-    pictures_by_camera: dict[str, Pictures] = {}
+    images_by_camera: dict[str, CameraImages] = {}
     for recorded in RecordingReader(path).read_messages((keys.COLOR_ALL, keys.DEPTH_ALL)):
         _, kind, name = recorded.key.split("/")
         try:
@@ -65,14 +65,14 @@ def read_pictures(path: Path) -> dict[str, Pictures]:
         except WireError:
             continue
         camera = name if kind == "color" else f"{name}_depth"
-        pictures = pictures_by_camera.setdefault(camera, Pictures(image.width, image.height))
-        has_same_size = (image.width, image.height) == (pictures.width, pictures.height)
+        camera_images = images_by_camera.setdefault(camera, CameraImages(image.width, image.height))
+        has_same_size = (image.width, image.height) == (camera_images.width, camera_images.height)
         if not has_same_size or not _is_complete(image):
             continue
-        is_newer = not pictures.ticks or image.tick > pictures.ticks[-1]
+        is_newer = not camera_images.ticks or image.tick > camera_images.ticks[-1]
         if is_newer:
-            pictures.add(image.tick, _rgb_of(image))
-    return pictures_by_camera
+            camera_images.add(image.tick, _convert_to_rgb(image))
+    return images_by_camera
 
 
 def _is_complete(image: ColorImage | DepthImage) -> bool:
@@ -83,11 +83,11 @@ def _is_complete(image: ColorImage | DepthImage) -> bool:
     return len(image.rgb) == 3 * pixel_count
 
 
-def _rgb_of(image: ColorImage | DepthImage) -> Rgb:
-    """Return the pixels of an image.
+def _convert_to_rgb(image: ColorImage | DepthImage) -> Rgb:
+    """Convert an image to RGB pixels.
 
-    Depth is gray in three equal channels, as policies want it: 255 at the camera's maximum range, 0 where nothing was
-    measured.
+    Depth becomes gray in three equal channels, as policies expect it: 255 at the maximum range of the camera, 0 where
+    nothing was measured.
     """
     if not isinstance(image, DepthImage):
         return np.frombuffer(image.rgb, np.uint8)

@@ -18,7 +18,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, format_encoding
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.missing_data import exit_code
+from snakesim_operator.results.missing_data import report_missing_data
 from snakesim_operator.results.recording_contents import read_recording
 
 MAX_PAUSE_S = 10.0  # between two messages, whatever their times are
@@ -26,26 +26,26 @@ REORDER_WINDOW_NS = 1_000_000_000  # an image may arrive this long after the clo
 ORDER_WITHIN_TICK = {keys.CLOCK: 1, keys.APPLIED: 2}  # samples come first
 
 
-def in_robot_order(reader: RecordingReader) -> Iterator[RecordedMessage]:
-    """Yield all messages in the order of robot time: the samples of a tick, its clock, what was applied in it.
+def iterate_in_robot_time_order(reader: RecordingReader) -> Iterator[RecordedMessage]:
+    """Yield all messages in the order of robot time: samples of a tick, then its clock, then its applied setpoints.
 
-    The file has them in the order of their arrival, in which the messages of one tick may be mixed.
+    The file contains them in the order of their arrival, in which the messages of one tick may be mixed.
     """
     waiting: list[tuple[int, int, int, RecordedMessage]] = []
     arrival_number = count()
     clock_ns = 0
     for recorded in reader.read_messages():
         rank = ORDER_WITHIN_TICK.get(recorded.key, 0)
-        heapq.heappush(waiting, (recorded.time_ns, rank, next(arrival_number), recorded))
+        heapq.heappush(waiting, (recorded.robot_time_ns, rank, next(arrival_number), recorded))
         if recorded.key == keys.CLOCK:
-            clock_ns = recorded.time_ns
+            clock_ns = recorded.robot_time_ns
         while waiting[0][0] < clock_ns - REORDER_WINDOW_NS:
             yield heapq.heappop(waiting)[-1]
     while waiting:
         yield heapq.heappop(waiting)[-1]
 
 
-def play(
+def play_recording(
     path: Path,
     lines: Iterator[str],
     print_text: PrintLine,
@@ -55,22 +55,22 @@ def play(
     rate: float,
     step: bool,
 ) -> int:
-    """Play a recording once.
+    """Publish the messages of a recording once, on a Zenoh network of its own.
 
     Args:
-        path: The recording.
+        path: Path of the recording.
         lines: Lines that the user types.
         print_text: Prints a line.
-        endpoint: Zenoh endpoint to listen on; None: the default one.
-        namespace: Namespace to publish in; None: the robot's name.
-        rate: Robot time over wall time.
-        step: Play one tick at each line of input, instead of with the recorded timing.
+        endpoint: Zenoh endpoint to listen on; None for the default endpoint.
+        namespace: Namespace to publish in; None for the name of the robot.
+        rate: Robot time divided by wall time.
+        step: Whether to play one tick at each line of input, instead of with the recorded timing.
 
     Returns:
-        The exit code.
+        The exit code: 3 if the recording is incomplete, otherwise 0.
 
     Raises:
-        ConfigError: The file is no recording.
+        ConfigError: The file is not a recording.
         NotConnectedError: The endpoint cannot be used.
     """
     robot = read_recording(path, (keys.DESCRIPTION,)).description
@@ -78,27 +78,27 @@ def play(
     namespace = namespace or default_namespace
     link = Link(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, max_bytes=MAX_IMAGE_BYTES)
     reader = RecordingReader(path)
-    messages = in_robot_order(reader)
+    messages = iterate_in_robot_time_order(reader)
     with open_session(link) as session:
-        how = "Enter plays a tick" if step else f"{rate:g} x real time"
-        print_text(f"playing {path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
+        playback_mode = "Enter plays a tick" if step else f"{rate:g} x real time"
+        print_text(f"playing {path} on {link.endpoint}, namespace {namespace}: {playback_mode}; Ctrl-C ends it")
         player = _Player(session)
-        timing = _Timing(rate)
-        for time_ns, simultaneous in groupby(messages, lambda recorded: recorded.time_ns):
+        playback_clock = _PlaybackClock(rate)
+        for time_ns, simultaneous in groupby(messages, lambda recorded: recorded.robot_time_ns):
             if step:
                 print_text(f"{time_ns * 1e-9:.3f} s")
                 if next(lines, None) is None:
                     break
             else:
-                timing.wait_until(time_ns)
+                playback_clock.wait_until(time_ns)
             for recorded in simultaneous:
                 player.publish(recorded)
         print_text(f"{player.count} messages played")
-    return exit_code(path, reader.missing)
+    return report_missing_data(path, reader.missing)
 
 
-class _Timing:
-    """Maps robot time to wall time. After a long pause, as of lost messages, the mapping begins anew."""
+class _PlaybackClock:
+    """Maps robot time to wall time. After a long pause, such as for lost messages, the mapping starts again."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate  # robot time over wall time
@@ -124,13 +124,15 @@ class _Player:
         self.count = 0
 
     def publish(self, recorded: RecordedMessage) -> None:
-        """Publish a message as it was. Ignores messages of keys that are not SnakeSIM's."""
+        """Publish a message as it was recorded. Messages at keys that SnakeSIM does not define are ignored."""
         row = keys.find_row(recorded.key)
         if row is None or row.message is None or recorded.encoding != format_encoding(row.message):
             return
         publisher = self._publishers.get(recorded.key)
         if publisher is None:
-            declare = self._session.latched_publisher if row.kind == "latched" else self._session.publisher
+            declare = (
+                self._session.declare_latched_publisher if row.kind == "latched" else self._session.declare_publisher
+            )
             publisher = declare(recorded.key, row.message)
             self._publishers[recorded.key] = publisher
         publisher.send(recorded.payload)

@@ -7,27 +7,27 @@ from pathlib import Path
 
 
 class GrowingFile:
-    """The part of a file that an MCAP writer needs. After the creation, only `flush` raises OSError."""
+    """A new file that buffers in memory what is written. After its creation, only `flush` raises OSError."""
 
     def __init__(self, path: Path) -> None:
         """Create the file. Raises OSError; FileExistsError if the file exists."""
-        self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self._written_bytes = 0
-        self._waiting = bytearray()
+        self._file_descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._flushed_bytes = 0
+        self._buffer = bytearray()
 
     @property
-    def waiting_bytes(self) -> int:
-        """Return the number of bytes that the disk does not have."""
-        return len(self._waiting)
+    def buffered_bytes(self) -> int:
+        """Return the number of written bytes that are not on the disk yet."""
+        return len(self._buffer)
 
     def write(self, data: bytes) -> int:
-        """Add bytes, and return their number."""
-        self._waiting += data
+        """Append bytes to the buffer, and return their number."""
+        self._buffer += data
         return len(data)
 
     def tell(self) -> int:
-        """Return the position of the next byte."""
-        return self._written_bytes + len(self._waiting)
+        """Return the position in the file at which the next byte is written."""
+        return self._flushed_bytes + len(self._buffer)
 
     def flush(self) -> None:
         """Write the buffered bytes to the disk: either all of them, or none.
@@ -36,26 +36,26 @@ class GrowingFile:
             OSError: The disk does not take all of them. The file then ends where it ended before, and the buffered
                 bytes are lost.
         """
-        written_count = 0
+        written_bytes = 0
         try:
-            while written_count < len(self._waiting):
-                count = os.write(self._handle, self._waiting[written_count:])
-                if count == 0:
+            while written_bytes < len(self._buffer):
+                newly_written_bytes = os.write(self._file_descriptor, self._buffer[written_bytes:])
+                if newly_written_bytes == 0:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                written_count += count
+                written_bytes += newly_written_bytes
         except OSError:
-            self._cut_back()
+            self._truncate_to_last_flush()
             raise
         finally:
-            self._waiting.clear()
-        self._written_bytes += written_count
+            self._buffer.clear()
+        self._flushed_bytes += written_bytes
 
-    def _cut_back(self) -> None:
-        """Remove the bytes behind the last complete flush."""
+    def _truncate_to_last_flush(self) -> None:
+        """Remove the bytes that an incomplete flush has written, so that the file ends at the last complete one."""
         with contextlib.suppress(OSError):
-            os.ftruncate(self._handle, self._written_bytes)
-            os.lseek(self._handle, self._written_bytes, os.SEEK_SET)
+            os.ftruncate(self._file_descriptor, self._flushed_bytes)
+            os.lseek(self._file_descriptor, self._flushed_bytes, os.SEEK_SET)
 
     def close(self) -> None:
         """Close the file; waiting bytes are not written."""
-        os.close(self._handle)
+        os.close(self._file_descriptor)

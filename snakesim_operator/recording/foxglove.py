@@ -19,8 +19,8 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message as Protobuf
 
 from snakesim_hal.base.errors import SnakesimError
-from snakesim_hal.model.placement import place_scene
-from snakesim_hal.model.scenario import RunConfig, capsules_at_start
+from snakesim_hal.model.placement import place_scene_obstacles
+from snakesim_hal.model.scenario import RunConfig, make_start_capsules
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
@@ -38,19 +38,19 @@ from snakesim_hal.wire.messages import (
     WorldContact,
 )
 from snakesim_operator.recording import shapes
-from snakesim_operator.recording.body_frames import BodyMessages
+from snakesim_operator.recording.body_frames import BodyMessageEncoder
 from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_name_part, make_topic
 from snakesim_operator.recording.state_messages import ContactForces, StateMessages
 
-# Periods of what is shown, in robot time.
+# Periods at which messages for viewers are made, in robot time.
 MOTION_PERIOD_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
 IMAGE_PERIOD_NS = 200_000_000  # 5 Hz: all images are in the raw channels
 SCENE_PERIOD_NS = 1_000_000_000  # what seldom changes is repeated, so that it is found wherever a viewer starts
-SILENCE_NS = 5_000_000_000  # older messages are not shown as if they were current
+MAX_MESSAGE_AGE_NS = 5_000_000_000  # older messages are not shown as if they were current
 
 DEPTH_PREFIX = "sensor/depth/"
 COLOR_PREFIX = "sensor/color/"
-_KEPT_KEYS = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
+_CACHED_KEYS = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
 
 BasePose = tuple[Sequence[float], Sequence[float]]  # position (3,) in m and orientation wxyz (4,) of link 0
 
@@ -65,30 +65,34 @@ class PoseAndContacts(msgspec.Struct, frozen=True):
     contacts: list[WorldContact]
 
 
-class FoxgloveChannels:
-    """Converts one robot's messages for viewers."""
+class FoxgloveConverter:
+    """Converts one robot's messages into messages for Foxglove viewers."""
 
     def __init__(self, robot_name: str) -> None:
-        """Start without any knowledge of the robot. robot_name: its name in the topics."""
+        """Start without any knowledge of the robot.
+
+        Args:
+            robot_name: Name of the robot in the viewer topics.
+        """
         self._robot_name = robot_name
 
         # What the robot has published.
-        self._newest: dict[str, tuple[bytes, int]] = {}  # by key: payload, and its robot time in ns
+        self._newest_by_key: dict[str, tuple[bytes, int]] = {}  # by key: payload, and its robot time in ns
         self._robot: Description | None = None
-        self._frames: BodyMessages | None = None
-        self._custom_types: dict[str, CustomMessage] = {}  # messages of the robot's custom sensors, by key
+        self._body_encoder: BodyMessageEncoder | None = None
+        self._custom_message_by_key: dict[str, CustomMessage] = {}  # messages of the robot's custom sensors, by key
         self._true_obstacles = shapes.draw_obstacles([], "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
 
-        # What has been shown.
-        self._due_ns: dict[str, int] = {}  # when something is shown next
+        # When messages for viewers are made next.
+        self._due_ns_by_subject: dict[str, int] = {}  # robot time at which a drawing or an image is made next
         self._state_due_ns = 0
         self._state_messages = StateMessages()
 
     def convert(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
         """Convert a message of the robot into messages for a Foxglove viewer.
 
-        Drawings are not made for each message but at fixed periods, from the newest messages; a message only triggers
-        those that are due.
+        Drawings are made at fixed periods from the newest messages, not for each message. The clock message triggers
+        the drawings that are due.
 
         Args:
             key: Key of the robot's message.
@@ -98,19 +102,19 @@ class FoxgloveChannels:
         Returns:
             The messages for viewers; empty if nothing is due, or if the message cannot be decoded.
         """
-        if key in _KEPT_KEYS:
-            self._newest[key] = (payload, time_ns)
+        if key in _CACHED_KEYS:
+            self._newest_by_key[key] = (payload, time_ns)
         match key:
             case keys.JOINTS:
                 return self._convert_joints(payload, time_ns)
             case keys.STATUS:
-                return self._make_state(time_ns)
+                return self._make_state_messages(time_ns)
             case keys.CONTROL_STATE:
-                return self._make_state(time_ns, with_reference=True)
+                return self._make_state_messages(time_ns, with_reference=True)
             case keys.CONTACTS:
                 return self._convert_contacts(payload)
             case keys.CLOCK:
-                return self._make_drawings(time_ns)
+                return self._make_due_drawings(time_ns)
             case keys.DESCRIPTION:
                 self._set_robot(payload)
                 return []
@@ -119,7 +123,7 @@ class FoxgloveChannels:
                 return []
             case _ if key.startswith((DEPTH_PREFIX, COLOR_PREFIX)):
                 return self._convert_image(key, payload, time_ns)
-            case _ if key in self._custom_types:
+            case _ if key in self._custom_message_by_key:
                 return self._convert_custom_sample(key, payload, time_ns)
             case _:
                 return []
@@ -130,46 +134,54 @@ class FoxgloveChannels:
         with suppress(SnakesimError, *UNDECODABLE):
             robot: Description = _get_decoder(Description).decode(payload)
             if len(robot.links) == len(robot.joints) + 1:
-                frames = BodyMessages(robot)
+                frames = BodyMessageEncoder(robot)
                 custom_types = find_custom_messages(robot)
                 self._robot = robot
-                self._frames = frames
-                self._custom_types = custom_types
+                self._body_encoder = frames
+                self._custom_message_by_key = custom_types
 
     def _set_true_obstacles(self, payload: bytes) -> None:
-        """Place the obstacles of the run's configuration, as the simulator does."""
+        """Compute the obstacles of the run from its configuration, placed as the simulator places them."""
         with suppress(SnakesimError, *UNDECODABLE):
             content = _get_decoder(Configuration).decode(payload).content
             config = msgspec.json.decode(content, type=RunConfig)
-            placed = place_scene(config.scene, capsules_at_start(config))  # checked when the run began
+            placed = place_scene_obstacles(config.scene, make_start_capsules(config))  # checked when the run began
             obstacles = [body.obstacle for body in placed]
             self._true_obstacles = shapes.draw_obstacles(obstacles, "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
 
     # --- when something is due
 
-    def _is_due(self, subject: str, time_ns: int, period_ns: int) -> bool:
-        """Return whether a subject is to be shown now; then it is next due a period later.
+    def _check_due_and_reschedule(self, subject: str, time_ns: int, period_ns: int) -> bool:
+        """Return whether a drawing is due now; if it is, schedule its next time one period later.
 
-        A time that is more than a period before the due time means that robot time has started over.
+        Args:
+            subject: What is drawn, as an identifier of the schedule.
+            time_ns: Robot time now.
+            period_ns: Period at which the subject is drawn.
         """
-        due_ns = self._due_ns.get(subject, 0)
-        if due_ns - period_ns <= time_ns < due_ns:
+        due_ns = self._due_ns_by_subject.get(subject, 0)
+        # A time more than a period before the due time means that robot time has started over.
+        has_time_started_over = time_ns < due_ns - period_ns
+        if time_ns < due_ns and not has_time_started_over:
             return False
-        self._due_ns[subject] = time_ns + period_ns
+        self._due_ns_by_subject[subject] = time_ns + period_ns
         return True
 
-    def _read_fresh(self, key: str, time_ns: int) -> bytes | None:
-        """Return the newest payload of a key; None if it is silent, or robot time has started over since."""
-        if key not in self._newest:
+    def _get_recent_payload(self, key: str, time_ns: int) -> bytes | None:
+        """Return the newest payload of a key; None if there is none, or if it is too old.
+
+        A payload from the future is one from before robot time has started over, and counts as too old.
+        """
+        if key not in self._newest_by_key:
             return None
-        payload, written_ns = self._newest[key]
-        if 0 <= time_ns - written_ns <= SILENCE_NS:
+        payload, written_ns = self._newest_by_key[key]
+        if 0 <= time_ns - written_ns <= MAX_MESSAGE_AGE_NS:
             return payload
         return None
 
-    def _decode_fresh(self, key: str, message_type: type[Any], time_ns: int) -> Any:
-        """Return the newest message of a key; None if there is no fresh one that can be decoded."""
-        payload = self._read_fresh(key, time_ns)
+    def _decode_recent(self, key: str, message_type: type[Any], time_ns: int) -> Any:
+        """Return the newest message of a key; None if there is no recent one that can be decoded."""
+        payload = self._get_recent_payload(key, time_ns)
         if payload is None:
             return None
         return _decode(message_type, payload)
@@ -178,7 +190,7 @@ class FoxgloveChannels:
 
     def _convert_joints(self, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
         joints: JointState | None = _decode(JointState, payload)
-        frames = self._frames
+        frames = self._body_encoder
         if frames is None or joints is None or not joints.has_joint_count(frames.joint_count):
             return []
         encoded = frames.encode_joint_states(joints, time_ns)
@@ -192,16 +204,24 @@ class FoxgloveChannels:
         forces = ContactForces.sum_contacts(contacts, len(self._robot.links))
         return [self._encode_json("contact_forces", forces)]
 
-    def _make_state(self, time_ns: int, *, with_reference: bool = False) -> list[FoxgloveMessage]:
-        """Return the state of host and controller, what is new of it as a log, and the reference if it is selected."""
+    def _make_state_messages(self, time_ns: int, *, with_reference: bool = False) -> list[FoxgloveMessage]:
+        """Make the messages about the state of host and controller.
+
+        Args:
+            time_ns: Robot time now.
+            with_reference: Whether to add the reference angles of the controller, if they are known.
+
+        Returns:
+            The state, a log entry for each change of it, and the reference angles if they are requested.
+        """
         self._state_due_ns = time_ns + MOTION_PERIOD_NS
-        status = self._read_fresh(keys.STATUS, time_ns)
-        control = self._read_fresh(keys.CONTROL_STATE, time_ns)
-        update = self._state_messages.update(status, control, time_ns)
+        status = self._get_recent_payload(keys.STATUS, time_ns)
+        control = self._get_recent_payload(keys.CONTROL_STATE, time_ns)
+        update = self._state_messages.update_state(status, control, time_ns)
         messages = [self._encode_json("state", update.state)]
         for log in update.new_logs:
             messages.append(self._encode_protobuf("log", log))
-        frames = self._frames
+        frames = self._body_encoder
         if with_reference and frames is not None and len(update.reference_rad) == frames.joint_count:
             encoded = frames.encode_references(update.reference_rad, time_ns)
             topic = make_topic(self._robot_name, "joint_references")
@@ -209,17 +229,26 @@ class FoxgloveChannels:
         return messages
 
     def _convert_custom_sample(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
-        """Return a custom sensor's sample as JSON with its own schema, which viewers plot, and at times its frame."""
+        """Convert a custom sensor's sample into JSON with its own schema, which viewers plot, and add its frame if due.
+
+        Args:
+            key: Key of the sample.
+            payload: The encoded sample.
+            time_ns: Robot time of the sample.
+
+        Returns:
+            The messages; empty if the sample cannot be decoded, or if its link is unknown.
+        """
         robot = self._robot
-        sample = _decode_custom(self._custom_types[key], payload)
+        sample = _decode_custom_sample(self._custom_message_by_key[key], payload)
         if robot is None or sample is None or sample.link >= len(robot.links):
             return []
         name = make_name_part(key.rpartition("/")[2])
         messages: list[FoxgloveMessage] = []
-        if self._is_due(key, time_ns, MOTION_PERIOD_NS):
+        if self._check_due_and_reschedule(key, time_ns, MOTION_PERIOD_NS):
             link = robot.links[sample.link].name
             frame_id = f"{name}_frame"
-            mount = shapes.make_frame(time_ns, link, frame_id, sample.position_l, sample.orientation_l_wxyz)
+            mount = shapes.make_frame_transform(time_ns, link, frame_id, sample.position_l, sample.orientation_l_wxyz)
             messages.append(self._encode_frame(mount))
         messages.append(self._encode_json(f"custom/{name}", sample))
         return messages
@@ -235,9 +264,10 @@ class FoxgloveChannels:
             time_ns: Robot time of the image.
 
         Returns:
-            The messages; empty if no image is due, or if it cannot be decoded or does not fit to the robot.
+            The messages; empty if no image is due, if it cannot be decoded, or if it contradicts the description of
+            the robot.
         """
-        if not self._is_due(key, time_ns, IMAGE_PERIOD_NS):
+        if not self._check_due_and_reschedule(key, time_ns, IMAGE_PERIOD_NS):
             return []
         message_type = DepthImage if key.startswith(DEPTH_PREFIX) else ColorImage
         image: Any = _decode(message_type, payload)
@@ -249,8 +279,8 @@ class FoxgloveChannels:
         topic = f"{camera_name}/{kind}"
         frame_id = f"{camera_name}_{kind}_optical_frame"
         link_name = robot.links[image.link].name
-        orientation = shapes.rotate_to_optical(image.orientation_l_wxyz)
-        camera_frame = shapes.make_frame(time_ns, link_name, frame_id, image.position_l, orientation)
+        orientation = shapes.compute_optical_orientation(image.orientation_l_wxyz)
+        camera_frame = shapes.make_frame_transform(time_ns, link_name, frame_id, image.position_l, orientation)
         raw_image = shapes.make_raw_image(image, frame_id, time_ns)
         calibration = shapes.make_calibration(image, frame_id, time_ns)
         return [
@@ -259,7 +289,7 @@ class FoxgloveChannels:
             self._encode_protobuf(f"{topic}/camera_info", calibration),
         ]
 
-    def _make_drawings(self, time_ns: int) -> list[FoxgloveMessage]:
+    def _make_due_drawings(self, time_ns: int) -> list[FoxgloveMessage]:
         """Make transforms, pose, contact forces and scene for viewers, from the newest messages of the robot.
 
         Args:
@@ -268,59 +298,59 @@ class FoxgloveChannels:
         Returns:
             The messages; empty if no drawing is due, or if the robot or its joint angles are unknown.
         """
-        if not self._is_due("moving", time_ns, MOTION_PERIOD_NS):
+        if not self._check_due_and_reschedule("moving", time_ns, MOTION_PERIOD_NS):
             return []
         robot = self._robot
-        frames = self._frames
-        joints: JointState | None = self._decode_fresh(keys.JOINTS, JointState, time_ns)
-        world: PoseAndContacts | None = self._decode_fresh(keys.WORLD, PoseAndContacts, time_ns)
+        frames = self._body_encoder
+        joints: JointState | None = self._decode_recent(keys.JOINTS, JointState, time_ns)
+        world: PoseAndContacts | None = self._decode_recent(keys.WORLD, PoseAndContacts, time_ns)
         if robot is None or frames is None:
             return []
         if joints is None or not joints.has_joint_count(len(robot.joints)):
             return []
-        base = self._find_base(world, time_ns)
+        base = self._find_base_pose(world, time_ns)
         transforms = frames.fill_transforms(joints.angle_rad, base, time_ns)
         messages = [self._encode_protobuf("tf", transforms)]
         if base is not None:
-            messages.append(self._encode_protobuf("pose", _make_pose(base, time_ns)))
+            messages.append(self._encode_protobuf("pose", _make_pose_in_frame(base, time_ns)))
         if world is not None:
             forces = shapes.draw_forces(world.contacts, time_ns)
             messages.append(self._encode_scene("forces", [forces]))
         # Messages of host and controller trigger the state. If both are silent, the state must show that.
         if self._state_due_ns <= time_ns:
-            messages += self._make_state(time_ns)
-        messages += self._make_scene(robot, time_ns)
+            messages += self._make_state_messages(time_ns)
+        messages += self._make_due_scene_messages(robot, time_ns)
         return messages
 
-    def _make_scene(self, robot: Description, time_ns: int) -> list[FoxgloveMessage]:
-        """Return what seldom changes, as far as it is due: body, obstacles, map and path."""
+    def _make_due_scene_messages(self, robot: Description, time_ns: int) -> list[FoxgloveMessage]:
+        """Make the drawings that seldom change: body, obstacles, map and path, each if it is due."""
         messages: list[FoxgloveMessage] = []
-        if self._is_due("body", time_ns, SCENE_PERIOD_NS):
+        if self._check_due_and_reschedule("body", time_ns, SCENE_PERIOD_NS):
             links = shapes.draw_body(robot, time_ns)
             messages.append(self._encode_scene("body", links))
             self._true_obstacles.timestamp.CopyFrom(shapes.make_timestamp(time_ns))
             messages.append(self._encode_scene("obstacles", [self._true_obstacles]))
-        world: World | None = self._decode_when_due(keys.WORLD, World, time_ns)
+        world: World | None = self._decode_if_scene_due(keys.WORLD, World, time_ns)
         if world is not None:
             obstacles = shapes.draw_obstacles(world.obstacles, "map", shapes.MAP_COLOR, time_ns)
             messages.append(self._encode_scene("map", [obstacles]))
-        trajectory: Trajectory | None = self._decode_when_due(keys.TRAJECTORY, Trajectory, time_ns)
+        trajectory: Trajectory | None = self._decode_if_scene_due(keys.TRAJECTORY, Trajectory, time_ns)
         if trajectory is not None:
             path = shapes.draw_path(trajectory.path_w, time_ns)
             messages.append(self._encode_scene("path", [path]))
         return messages
 
-    def _decode_when_due(self, key: str, message_type: type[Any], time_ns: int) -> Any:
-        """Return the newest message of a key if the scene is due to show it; else None."""
-        if key not in self._newest:
+    def _decode_if_scene_due(self, key: str, message_type: type[Any], time_ns: int) -> Any:
+        """Return the newest message of a key if its drawing in the scene is due; else None."""
+        if key not in self._newest_by_key:
             return None
-        if not self._is_due(key, time_ns, SCENE_PERIOD_NS):
+        if not self._check_due_and_reschedule(key, time_ns, SCENE_PERIOD_NS):
             return None
-        return self._decode_fresh(key, message_type, time_ns)
+        return self._decode_recent(key, message_type, time_ns)
 
-    def _find_base(self, world: PoseAndContacts | None, time_ns: int) -> BasePose | None:
-        """Return the pose of link 0: the measured one, else the one that the world model estimates."""
-        pose: Pose | None = self._decode_fresh(keys.POSE, Pose, time_ns)
+    def _find_base_pose(self, world: PoseAndContacts | None, time_ns: int) -> BasePose | None:
+        """Return the pose of link 0: the measured one, else the one estimated by the world model, else None."""
+        pose: Pose | None = self._decode_recent(keys.POSE, Pose, time_ns)
         if pose is not None:
             return pose.position_w, pose.orientation_wxyz
         if world is not None:
@@ -351,14 +381,14 @@ def _decode(message_type: type[Any], payload: bytes) -> Any:
     return None
 
 
-def _decode_custom(kind: CustomMessage, payload: bytes) -> Any:
+def _decode_custom_sample(custom_message: CustomMessage, payload: bytes) -> Any:
     """Return the decoded sample of a custom sensor, or None if the payload does not fit its type."""
     with suppress(*UNDECODABLE):
-        return msgspec.msgpack.decode(payload, type=kind.message)
+        return msgspec.msgpack.decode(payload, type=custom_message.message)
     return None
 
 
-def _make_pose(base: BasePose, time_ns: int) -> PoseInFrame:
+def _make_pose_in_frame(base: BasePose, time_ns: int) -> PoseInFrame:
     position_w, orientation_wxyz = base
     message = PoseInFrame(timestamp=shapes.make_timestamp(time_ns), frame_id=shapes.WORLD_FRAME)
     position = message.pose.position

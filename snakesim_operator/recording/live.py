@@ -15,13 +15,13 @@ from snakesim_operator.recording.foxglove_topics import (
     make_schema,
     make_topic,
 )
-from snakesim_operator.recording.origin_relay import HOST, OriginRelay, choose_hidden_host
+from snakesim_operator.recording.origin_relay import HOST, OriginRelay, choose_random_loopback_host
 
 if TYPE_CHECKING:
     import foxglove
 
 
-class LiveServer:
+class FoxgloveLiveServer:
     """Sends messages to every viewer that has subscribed to their topic; a slow viewer loses the oldest."""
 
     def __init__(self, robot: str, port: int, origins: Collection[str], report: Callable[[str], None]) -> None:
@@ -41,11 +41,11 @@ class LiveServer:
         self._channel_type = foxglove.Channel
         self._schema_type = foxglove.Schema
         self._context = foxglove.Context()
-        self._channels: dict[str, foxglove.Channel] = {}
+        self._channel_by_topic: dict[str, foxglove.Channel] = {}
         # Before the first viewer: it would not get a channel that is made while it connects.
         for name, message_type in COMMON_TOPICS.items():
             self._add_channel(make_topic(robot, name), message_type)
-        hidden_host = choose_hidden_host()
+        hidden_host = choose_random_loopback_host()
         try:
             self._server = foxglove.start_server(name=robot, host=hidden_host, port=0, context=self._context)
         except RuntimeError as error:
@@ -55,7 +55,7 @@ class LiveServer:
 
     def send(self, message: FoxgloveMessage, time_ns: int) -> None:
         """Send one message to the viewers. time_ns: robot time."""
-        channel = self._channels.get(message.topic)
+        channel = self._channel_by_topic.get(message.topic)
         if channel is None:
             channel = self._add_channel(message.topic, message.message_type)
         channel.log(message.payload, log_time=time_ns)
@@ -68,7 +68,7 @@ class LiveServer:
             message_encoding=schema.message_encoding,
             context=self._context,
         )
-        self._channels[topic] = channel
+        self._channel_by_topic[topic] = channel
         return channel
 
     def __enter__(self) -> Self:

@@ -13,7 +13,7 @@ UNKNOWN_KEYS = "keys that are not known"  # of messages whose channel is lost to
 
 @dataclass
 class LossGap:
-    """Messages that are lost in one place."""
+    """Messages that are lost in one interval of robot time."""
 
     begin_ns: int  # robot time of the newest message before the gap
     end_ns: int | None = None  # robot time of the next readable message; None: there is none
@@ -25,12 +25,12 @@ class Losses:
     """Everything that one file has lost."""
 
     gaps: list[LossGap] = field(default_factory=list[LossGap])
-    damages: list[str] = field(default_factory=list[str])  # position and kind of the first damages
+    damage_descriptions: list[str] = field(default_factory=list[str])  # position and kind of the first damages
     damage_count: int = 0  # number of all damages
-    cut_ns: int | None = None  # the file has no end; robot time of its newest message
-    misplaced: int = 0  # messages behind later ones of their key
-    earlier: list[str] = field(default_factory=list[str])  # losses of the file that this one was copied from
-    dropped: dict[str, int] = field(default_factory=dict[str, int])  # by key: the disk was too slow
+    truncated_at_ns: int | None = None  # the file has no end; robot time of its newest message
+    misplaced_count: int = 0  # messages behind later ones of their key
+    earlier_losses: list[str] = field(default_factory=list[str])  # losses of the file that this one was copied from
+    dropped_count_by_key: dict[str, int] = field(default_factory=dict[str, int])  # by key: the disk was too slow
 
     @property
     def lost_by_key(self) -> Counter[str]:
@@ -38,22 +38,27 @@ class Losses:
         return sum((gap.lost for gap in self.gaps), Counter[str]())
 
     def add_damage(self, position: int, reason: str, newest_ns: int) -> None:
-        """Count a place that cannot be read.
+        """Count a part of the file that cannot be read, and start a gap there.
 
         Args:
-            position: In bytes from the beginning of the file.
-            reason: What is damaged.
-            newest_ns: Robot time of the newest message before it.
+            position: Position of the damage, in bytes from the beginning of the file.
+            reason: Description of the damage.
+            newest_ns: Robot time of the newest message before the damage, in ns.
         """
         self.damage_count += 1
-        if len(self.damages) < MAX_GAPS_SHOWN:
-            self.damages.append(f"{reason} at byte {position}")
+        if len(self.damage_descriptions) < MAX_GAPS_SHOWN:
+            self.damage_descriptions.append(f"{reason} at byte {position}")
         self.open_gap(newest_ns)
 
-    def open_gap(self, begin_ns: int, end_ns: int | None = None) -> None:
-        """Begin a gap at this robot time; beyond MAX_GAPS, extend the last one."""
+    def open_gap(self, start_ns: int, end_ns: int | None = None) -> None:
+        """Start a gap; if there are MAX_GAPS already, extend the last one instead.
+
+        Args:
+            start_ns: Robot time at which the gap starts, in ns.
+            end_ns: Robot time at which it ends, in ns. None if that is not known yet.
+        """
         if len(self.gaps) < MAX_GAPS:
-            self.gaps.append(LossGap(begin_ns, end_ns))
+            self.gaps.append(LossGap(start_ns, end_ns))
         else:
             self.gaps[-1].end_ns = end_ns
 
@@ -68,25 +73,25 @@ class Losses:
         if self.damage_count:
             texts.append(self._describe_damages())
         texts += self._describe_gaps()
-        if self.cut_ns is not None:
+        if self.truncated_at_ns is not None:
             texts.append(
-                f"its end: it breaks off at {self.cut_ns * 1e-9:.2f} s of robot time, because the recorder was killed, "
-                "the disk was full, or the file was cut"
+                f"its end: it breaks off at {self.truncated_at_ns * 1e-9:.2f} s of robot time, because "
+                "the recorder was killed, the disk was full, or the file was cut"
             )
-        if self.misplaced:
-            misplaced = _format_count(self.misplaced, "message")
+        if self.misplaced_count:
+            misplaced = _format_count(self.misplaced_count, "message")
             texts.append(f"its order: {misplaced} behind later ones of the same key")
-        dropped_count = sum(self.dropped.values())
+        dropped_count = sum(self.dropped_count_by_key.values())
         if dropped_count:
             dropped = _format_count(dropped_count, "message")
-            texts.append(f"{dropped}, dropped because the disk was too slow: {_list_keys(self.dropped)}")
-        earlier_texts = [f"before it was copied: {text}" for text in self.earlier if text not in texts]
+            texts.append(f"{dropped}, dropped because the disk was too slow: {_list_keys(self.dropped_count_by_key)}")
+        earlier_texts = [f"before it was copied: {text}" for text in self.earlier_losses if text not in texts]
         return texts + earlier_texts
 
     def _describe_damages(self) -> str:
-        text = f"damaged in {_format_count(self.damage_count, 'place')}: {'; '.join(self.damages)}"
-        if self.damage_count > len(self.damages):
-            text += f" and {self.damage_count - len(self.damages)} more"
+        text = f"damaged in {_format_count(self.damage_count, 'place')}: {'; '.join(self.damage_descriptions)}"
+        if self.damage_count > len(self.damage_descriptions):
+            text += f" and {self.damage_count - len(self.damage_descriptions)} more"
         return text
 
     def _describe_gaps(self) -> list[str]:
@@ -102,17 +107,20 @@ class Losses:
 
 
 def _describe_gap(gap: LossGap) -> str:
-    begin_s = gap.begin_ns * 1e-9
+    start_s = gap.begin_ns * 1e-9
     if gap.end_ns is None:
-        interval = f"after {begin_s:.2f} s"
+        interval = f"after {start_s:.2f} s"
     else:
-        interval = f"between {begin_s:.2f} s and {gap.end_ns * 1e-9:.2f} s"
+        interval = f"between {start_s:.2f} s and {gap.end_ns * 1e-9:.2f} s"
     count = _format_count(gap.lost.total(), "message")
     return f"{count} {interval} of robot time: {_list_keys(gap.lost)}"
 
 
 def _list_keys(counts: Mapping[str, int]) -> str:
-    """Return keys with their counts: the robot's own before those for viewers, then the largest counts first."""
+    """Return a text with keys and their message counts: the robot's own keys first, then topics made for viewers.
+
+    Within each of these groups, the largest counts come first. Only MAX_KEYS_SHOWN keys are listed.
+    """
 
     def rank(entry: tuple[str, int]) -> tuple[bool, int, str]:
         key, count = entry

@@ -13,31 +13,37 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_operator.recording.chunks import HEAD, MAX_RECORD_BYTES, DamagedError, parse_record, read_chunk_length
-from snakesim_operator.recording.writer import ABOUT
+from snakesim_operator.recording.chunks import (
+    MAX_RECORD_BYTES,
+    RECORD_HEADER,
+    CorruptFileError,
+    parse_record,
+    read_chunk_length,
+)
+from snakesim_operator.recording.writer import METADATA_NAME
 
-READ_OPCODES = (Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.MESSAGE)
-CUT = "the file ends in the middle of a record"
+OPCODES_TO_READ = (Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.MESSAGE)
+TRUNCATED = "the file ends in the middle of a record"
 
 _FIRST_PRIVATE_OPCODE = 0x80
-_END_OF_OPCODES = 0x10
-_MESSAGE_INDEX_HEAD_BYTES = 6  # channel number (2 bytes), then the length of the entries (4 bytes)
+_FIRST_UNDEFINED_OPCODE = 0x10
+_MESSAGE_INDEX_HEADER_BYTES = 6  # channel number (2 bytes), then the length of the entries (4 bytes)
 _MESSAGE_INDEX_ENTRY_BYTES = 16
 
 # Searching behind damage.
-_SEARCH_BYTES = 1024 * 1024  # read at once
-_PATTERN_BYTES = 64  # the longest match of _INTACT_RECORD, and enough of a chunk for its lengths
-_INTACT_RECORD = re.compile(  # a chunk of a known compression, a recorder's metadata, or the end of the messages
+_SEARCH_BLOCK_BYTES = 1024 * 1024  # read at once
+_MAX_PATTERN_BYTES = 64  # the longest match of _RECORD_START_PATTERN, and enough of a chunk for its lengths
+_RECORD_START_PATTERN = re.compile(  # a chunk of a known compression, a recorder's metadata, or the end of the messages
     rb"\x06[\s\S]{4}\0{4}[\s\S]{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4})[\s\S]{4}\0{4}"
-    rb"|\x0c[\s\S]{4}\0{4}\x08\0{3}" + ABOUT.encode() + rb"|\x0f\x04\0{7}[\s\S]{4}[\x01-\x0f]"
+    rb"|\x0c[\s\S]{4}\0{4}\x08\0{3}" + METADATA_NAME.encode() + rb"|\x0f\x04\0{7}[\s\S]{4}[\x01-\x0f]"
 )
 
 # The end of a file: DATA_END, the summary, the footer, the magic bytes.
 _CRC_BYTES = 4
-_DATA_END_HEAD = HEAD.pack(Opcode.DATA_END, _CRC_BYTES)
+_DATA_END_HEADER = RECORD_HEADER.pack(Opcode.DATA_END, _CRC_BYTES)
 _FOOTER_CONTENT_BYTES = 20  # two offsets and a CRC
-_FOOTER_HEAD = HEAD.pack(Opcode.FOOTER, _FOOTER_CONTENT_BYTES)
-_FOOTER_BYTES = HEAD.size + _FOOTER_CONTENT_BYTES + len(MCAP0_MAGIC)
+_FOOTER_HEADER = RECORD_HEADER.pack(Opcode.FOOTER, _FOOTER_CONTENT_BYTES)
+_FOOTER_BYTES = RECORD_HEADER.size + _FOOTER_CONTENT_BYTES + len(MCAP0_MAGIC)
 _SUMMARY_OPCODES = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 
 
@@ -49,110 +55,123 @@ class RawRecord(NamedTuple):
     end: int  # position of the next record
 
 
-def read_record(file: BinaryIO, position: int, size: int) -> RawRecord:
+def read_record(file: BinaryIO, position: int, file_size: int) -> RawRecord:
     """Read the MCAP record at a position of a file. Its content is read only if a reader needs it.
 
     Args:
         file: The file.
         position: Position of the record, in bytes from the beginning of the file.
-        size: Size of the file in bytes.
+        file_size: Size of the file in bytes.
 
     Returns:
-        The record. Its content is empty if its kind is neither a chunk nor one of READ_OPCODES.
+        The record. Its content is empty if its kind is neither a chunk nor one of OPCODES_TO_READ.
 
     Raises:
-        DamagedError: There is no intact record at this position.
+        CorruptFileError: There is no intact record at this position.
         OSError: The file cannot be read.
     """
     file.seek(position)
-    head = file.read(HEAD.size)
-    if len(head) < HEAD.size:
-        raise DamagedError(CUT)
-    opcode, content_length = HEAD.unpack(head)
-    content_begin = position + HEAD.size
-    record_end = content_begin + content_length
-    is_known = 0 < opcode < _END_OF_OPCODES
+    header = file.read(RECORD_HEADER.size)
+    if len(header) < RECORD_HEADER.size:
+        raise CorruptFileError(TRUNCATED)
+    opcode, content_length = RECORD_HEADER.unpack(header)
+    content_start = position + RECORD_HEADER.size
+    record_end = content_start + content_length
+    is_known = 0 < opcode < _FIRST_UNDEFINED_OPCODE
     is_private = opcode >= _FIRST_PRIVATE_OPCODE
     if not is_known and not is_private:
-        raise DamagedError("no record")
-    if record_end > size:
-        raise DamagedError(CUT)
-    _check_length(file, content_begin, opcode, content_length)
+        raise CorruptFileError("no record")
+    if record_end > file_size:
+        raise CorruptFileError(TRUNCATED)
+    _validate_content_length(file, content_start, opcode, content_length)
 
-    is_needed = opcode == Opcode.CHUNK or opcode in READ_OPCODES
+    is_needed = opcode == Opcode.CHUNK or opcode in OPCODES_TO_READ
     if not is_needed:
         return RawRecord(opcode, b"", record_end)
     if content_length > MAX_RECORD_BYTES:
-        raise DamagedError(f"a record of {content_length / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
-    file.seek(content_begin)
+        raise CorruptFileError(f"a record of {content_length / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
+    file.seek(content_start)
     content = file.read(content_length)
     if len(content) != content_length:
-        raise DamagedError(CUT)
+        raise CorruptFileError(TRUNCATED)
     return RawRecord(opcode, content, record_end)
 
 
-def _check_length(file: BinaryIO, begin: int, opcode: int, length: int) -> None:
-    """Check the length that a record's head states against the lengths in its content.
+def _validate_content_length(file: BinaryIO, content_start: int, opcode: int, stated_length: int) -> None:
+    """Check the content length in a record's header against the lengths that the content itself states.
 
-    Only chunks, message indexes and the end of the data state or have a known length; other kinds pass.
+    The content of chunks and message indexes states its length, and the content of DATA_END has a fixed length. Other
+    kinds of records are not checked.
 
     Args:
         file: The file; its position changes.
-        begin: Position of the record's content.
+        content_start: Position of the record's content, in bytes from the beginning of the file.
         opcode: Kind of the record.
-        length: Length of the content in bytes, as the head states it.
+        stated_length: Length of the content in bytes, as the header of the record states it.
 
     Raises:
-        DamagedError: The lengths contradict each other.
+        CorruptFileError: The lengths contradict each other.
         OSError: The file cannot be read.
     """
     match opcode:
         case Opcode.CHUNK:
-            file.seek(begin)
-            content_start = file.read(_PATTERN_BYTES)
-            if length != read_chunk_length(content_start):
-                raise DamagedError("a chunk whose lengths contradict each other")
+            file.seek(content_start)
+            content_prefix = file.read(_MAX_PATTERN_BYTES)
+            if stated_length != read_chunk_length(content_prefix):
+                raise CorruptFileError("a chunk whose lengths contradict each other")
         case Opcode.MESSAGE_INDEX:
-            file.seek(begin)
-            index_head = file.read(_MESSAGE_INDEX_HEAD_BYTES)
-            entries_bytes = int.from_bytes(index_head[2:], "little")
+            file.seek(content_start)
+            index_header = file.read(_MESSAGE_INDEX_HEADER_BYTES)
+            entries_bytes = int.from_bytes(index_header[2:], "little")
             is_whole_entries = entries_bytes % _MESSAGE_INDEX_ENTRY_BYTES == 0
-            if length != _MESSAGE_INDEX_HEAD_BYTES + entries_bytes or not is_whole_entries:
-                raise DamagedError("an index whose lengths contradict each other")
+            if stated_length != _MESSAGE_INDEX_HEADER_BYTES + entries_bytes or not is_whole_entries:
+                raise CorruptFileError("an index whose lengths contradict each other")
         case Opcode.DATA_END:
-            if length != _CRC_BYTES:
-                raise DamagedError("an end that is none")
+            if stated_length != _CRC_BYTES:
+                raise CorruptFileError("an end that is none")
         case _:
             pass
 
 
-def find_next_record(file: BinaryIO, position: int, size: int) -> int | None:
-    """Return the position of the next intact record at which reading can continue; None if there is none.
+def find_next_record(file: BinaryIO, position: int, file_size: int) -> int | None:
+    """Find the next intact record at which reading can continue after damage.
 
-    Raises OSError.
+    Args:
+        file: The file; its position changes.
+        position: Position at which the search starts, in bytes from the beginning of the file.
+        file_size: Size of the file in bytes.
+
+    Returns:
+        The position of the record, or None if there is no intact record.
+
+    Raises:
+        OSError: The file cannot be read.
     """
-    while position < size:
+    while position < file_size:
         file.seek(position)
-        block = file.read(_SEARCH_BYTES + _PATTERN_BYTES)
-        for candidate in _find_candidates(block):
+        block = file.read(_SEARCH_BLOCK_BYTES + _MAX_PATTERN_BYTES)
+        for offset in _find_possible_record_offsets(block):
             try:
-                read_record(file, position + candidate, size)
-            except DamagedError:
+                read_record(file, position + offset, file_size)
+            except CorruptFileError:
                 continue
-            return position + candidate
-        position += _SEARCH_BYTES
+            return position + offset
+        position += _SEARCH_BLOCK_BYTES
     return None
 
 
-def _find_candidates(block: bytes) -> Iterator[int]:
-    """Yield the offsets within the first _SEARCH_BYTES of a block at which a record may begin; they may overlap."""
-    begin = 0
+def _find_possible_record_offsets(block: bytes) -> Iterator[int]:
+    """Yield the offsets at which a record may begin, within the first _SEARCH_BLOCK_BYTES of a block.
+
+    The found patterns may overlap, so that an accidental match hides no record.
+    """
+    search_start = 0
     while True:
-        match = _INTACT_RECORD.search(block, begin)
-        if match is None or match.start() >= _SEARCH_BYTES:
+        match = _RECORD_START_PATTERN.search(block, search_start)
+        if match is None or match.start() >= _SEARCH_BLOCK_BYTES:
             return
         yield match.start()
-        begin = match.start() + 1
+        search_start = match.start() + 1
 
 
 def read_summary(file: BinaryIO) -> list[McapRecord]:
@@ -162,21 +181,21 @@ def read_summary(file: BinaryIO) -> list[McapRecord]:
         file: The file; its position changes.
 
     Raises:
-        DamagedError: The file has no intact end.
+        CorruptFileError: The file has no intact end.
         OSError: The file cannot be read.
     """
     summary = _read_summary_bytes(file)
     view = memoryview(summary)
     records: list[McapRecord] = []
     position = 0
-    while position + HEAD.size <= len(summary):
-        opcode, content_length = HEAD.unpack_from(summary, position)
-        content_begin = position + HEAD.size
-        content_end = content_begin + content_length
+    while position + RECORD_HEADER.size <= len(summary):
+        opcode, content_length = RECORD_HEADER.unpack_from(summary, position)
+        content_start = position + RECORD_HEADER.size
+        content_end = content_start + content_length
         if opcode in _SUMMARY_OPCODES:
             if content_end > len(summary):
-                raise DamagedError("a summary whose lengths contradict each other")
-            records.append(parse_record(opcode, view[content_begin:content_end]))
+                raise CorruptFileError("a summary whose lengths contradict each other")
+            records.append(parse_record(opcode, view[content_start:content_end]))
         position = content_end
     return records
 
@@ -188,33 +207,33 @@ def _read_summary_bytes(file: BinaryIO) -> bytes:
     the stated position is wrong; then the summary is looked for behind the last DATA_END record.
 
     Raises:
-        DamagedError: The file has no footer, or no summary fits its checksum.
+        CorruptFileError: The file has no footer, or no summary fits its checksum.
         OSError: The file cannot be read.
     """
-    size = file.seek(0, os.SEEK_END)
-    footer_position = size - _FOOTER_BYTES
+    file_size = file.seek(0, os.SEEK_END)
+    footer_position = file_size - _FOOTER_BYTES
     if footer_position <= 0:
-        raise DamagedError(CUT)
+        raise CorruptFileError(TRUNCATED)
     file.seek(footer_position)
     footer = file.read(_FOOTER_BYTES)
-    if not footer.endswith(MCAP0_MAGIC) or footer[: HEAD.size] != _FOOTER_HEAD:
-        raise DamagedError(CUT)
+    if not footer.endswith(MCAP0_MAGIC) or footer[: RECORD_HEADER.size] != _FOOTER_HEADER:
+        raise CorruptFileError(TRUNCATED)
     # Content of the footer: begin of the summary (8 bytes), begin of its offsets (8 bytes), checksum (4 bytes).
     footer_before_crc = footer[:25]
     stated_position = int.from_bytes(footer[9:17], "little")
     expected_crc = int.from_bytes(footer[25:29], "little")
 
     # A summary that is larger than MAX_RECORD_BYTES is not read.
-    tail_position = max(footer_position - MAX_RECORD_BYTES, 0)
-    file.seek(tail_position)
-    tail = file.read(footer_position - tail_position)
-    stated_begin = stated_position - tail_position
-    begin_after_data = tail.rfind(_DATA_END_HEAD) + len(_DATA_END_HEAD) + _CRC_BYTES
-    for begin in (stated_begin, begin_after_data):
+    tail_start = max(footer_position - MAX_RECORD_BYTES, 0)
+    file.seek(tail_start)
+    tail = file.read(footer_position - tail_start)
+    stated_start = stated_position - tail_start
+    start_after_data = tail.rfind(_DATA_END_HEADER) + len(_DATA_END_HEADER) + _CRC_BYTES
+    for summary_start in (stated_start, start_after_data):
         summary = b""
-        if 0 < begin <= len(tail):
-            summary = tail[begin:]
+        if 0 < summary_start <= len(tail):
+            summary = tail[summary_start:]
         actual_crc = zlib.crc32(footer_before_crc, zlib.crc32(summary))
         if expected_crc and actual_crc == expected_crc:
             return summary
-    raise DamagedError("a summary whose checksum does not fit")
+    raise CorruptFileError("a summary whose checksum does not fit")

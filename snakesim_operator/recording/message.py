@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 
-RECORDING = "recording.mcap"  # name of the file in the folder of a run
-RAW_ONLY = "record messages as on the wire alone, without topics for Foxglove and PlotJuggler"  # help of the option
+RECORDING_FILENAME = "recording.mcap"  # name of the file in the folder of a run
+RAW_ONLY_HELP = (
+    "record messages as on the wire alone, without topics for Foxglove and PlotJuggler"  # help of the option
+)
 
 
 @dataclass(frozen=True)
@@ -13,5 +15,5 @@ class RecordedMessage:
     key: str
     payload: bytes
     encoding: str  # on the wire
-    time_ns: int  # robot time
-    wall_ns: int  # wall clock at the recorder
+    robot_time_ns: int  # robot time
+    wall_time_ns: int  # wall clock at the recorder

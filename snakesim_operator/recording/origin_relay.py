@@ -10,18 +10,18 @@ from collections.abc import Callable, Collection
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_operator.base.byte_relay import relay_bytes
-from snakesim_operator.base.page_origin import explain_head_refusal
+from snakesim_operator.base.page_origin import explain_request_refusal
 
 HOST = "127.0.0.1"
-MAX_HEAD_BYTES = 16 * 1024
-HEAD_TIMEOUT_S = 5.0
+MAX_HEADER_BYTES = 16 * 1024
+HEADER_TIMEOUT_S = 5.0
 MAX_CONNECTIONS = 64
 MAX_REASONS_REPORTED = 64  # a page could otherwise fill the terminal
-END_OF_HEAD = b"\r\n\r\n"
-FORBIDDEN = b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+END_OF_HEADER = b"\r\n\r\n"
+FORBIDDEN_RESPONSE = b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
-def choose_hidden_host() -> str:
+def choose_random_loopback_host() -> str:
     """Return a random loopback address. A page cannot guess it: with its port it is one of about 2^37."""
     octets = [str(1 + secrets.randbelow(254)) for _ in range(3)]
     return "127." + ".".join(octets)
@@ -47,11 +47,11 @@ class OriginRelay:
         self._server_address = server
         self._origins = origins
         self._report = report
-        self._reported: set[str] = set()  # reasons
+        self._reported_reasons: set[str] = set()  # reasons
         self._connections: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         try:
-            listening = asyncio.start_server(self._serve, HOST, port, limit=MAX_HEAD_BYTES)
+            listening = asyncio.start_server(self._serve_connection, HOST, port, limit=MAX_HEADER_BYTES)
             self._listener = self._loop.run_until_complete(listening)
         except OSError as error:
             self._loop.close()
@@ -75,7 +75,7 @@ class OriginRelay:
             task.cancel()
         await asyncio.gather(*self._connections, return_exceptions=True)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until either side closes it."""
         task = asyncio.current_task()
         assert task is not None
@@ -90,29 +90,31 @@ class OriginRelay:
             writer.close()
 
     async def _check_and_relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        head = await asyncio.wait_for(reader.readuntil(END_OF_HEAD), HEAD_TIMEOUT_S)
-        refusal = explain_head_refusal(head, self._origins)
+        request_header = await asyncio.wait_for(reader.readuntil(END_OF_HEADER), HEADER_TIMEOUT_S)
+        refusal = explain_request_refusal(request_header, self._origins)
         if refusal is not None:
             self._report_refusal(refusal)
-            writer.write(FORBIDDEN)
+            writer.write(FORBIDDEN_RESPONSE)
             await writer.drain()
             return
-        await self._relay(head, reader, writer)
+        await self._relay_connection(request_header, reader, writer)
 
     def _report_refusal(self, reason: str) -> None:
         """Report each reason once."""
-        if reason not in self._reported and len(self._reported) < MAX_REASONS_REPORTED:
-            self._reported.add(reason)
+        if reason not in self._reported_reasons and len(self._reported_reasons) < MAX_REASONS_REPORTED:
+            self._reported_reasons.add(reason)
             self._report(f"Foxglove: refused a viewer: {reason}; if you trust it: --foxglove-origin ORIGIN")
 
-    async def _relay(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _relay_connection(
+        self, request_header: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         """Pass a viewer's request on, and copy bytes in both directions until one of the sides closes its connection.
 
         For a slow viewer the server drops whole messages; this relay does not know where a message ends.
         """
         from_server, to_server = await asyncio.open_connection(*self._server_address)
         try:
-            to_server.write(head)
+            to_server.write(request_header)
             await relay_bytes((reader, writer), (from_server, to_server))
         finally:
             to_server.close()

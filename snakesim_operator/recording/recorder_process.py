@@ -20,109 +20,134 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
-from snakesim_hal.base.process import on_stop_signal
+from snakesim_hal.base.process import call_on_stop_signals
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
-from snakesim_hal.network.process_entries import own_entry, show_process
-from snakesim_hal.network.run_key import is_proven, own_run_key
+from snakesim_hal.network.process_entries import make_own_entry, publish_process_entry
+from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
 from snakesim_hal.network.session import Link, Session
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.network.waiting import open_session_when_ready
-from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
-from snakesim_hal.programs.service_program import ProcessOptions, process_options
+from snakesim_hal.programs.arguments import add_network_arguments, add_parent, add_scenario_arguments
+from snakesim_hal.programs.service_program import ProcessOptions, read_process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.roles import RECORDER
-from snakesim_operator.recording.message import RAW_ONLY, RECORDING
-from snakesim_operator.recording.shown_messages import Show
-from snakesim_operator.recording.stamps import Stamps
-from snakesim_operator.recording.tap import Tap
+from snakesim_operator.recording.message import RAW_ONLY_HELP, RECORDING_FILENAME
+from snakesim_operator.recording.shown_messages import OnViewerMessage
+from snakesim_operator.recording.stamps import LogTimeClock
+from snakesim_operator.recording.tap import MessageTap
 from snakesim_operator.recording.writer import RecordingWriter
 
 CYCLE_S = 0.02
 LAST_MESSAGES_TIMEOUT_S = 2.0  # at the end, for messages that are on their way
-QUIET_CYCLES = 2  # at the end: after so many cycles without a message, none is on its way
-NICE = 10  # a robot's own processes have precedence
+QUIET_CYCLES_AT_END = 2  # at the end: after so many cycles without a message, none is on its way
+NICENESS = 10  # a robot's own processes have precedence
 MAX_HOSTS = 100  # files: one for each host that a robot had
 EXIT_DISK_FULL = 4
 
 
 class Recorder:
-    """Writes a robot's messages into a file, and begins a new file when the robot gets a new host."""
+    """Writes a robot's messages into a file, and starts a new file when the robot gets a new host."""
 
-    def __init__(self, path: Path, shown_as: str | None, show: Show | None = None, stamps: Stamps = "robot") -> None:
-        """Begin the first file. The arguments are those of RecordingWriter. Raises OSError if it cannot be created."""
+    def __init__(
+        self,
+        path: Path,
+        viewer_robot_name: str | None,
+        on_viewer_message: OnViewerMessage | None = None,
+        log_time_clock: LogTimeClock = "robot",
+    ) -> None:
+        """Start the first file.
+
+        Args:
+            path: Path of the new file.
+            viewer_robot_name: Name of the robot in topics for viewers. If None, only the robot's messages are recorded.
+            on_viewer_message: Called with each message that is made for viewers. None if not needed.
+            log_time_clock: Clock of the log times.
+
+        Raises:
+            OSError: The file cannot be created.
+        """
         self.path = path
-        self._shown_as = shown_as
-        self._show = show
-        self._stamps: Stamps = stamps
-        self._began = datetime.now(UTC)
-        self.recording = RecordingWriter(path, shown_as, show, stamps)
+        self._viewer_robot_name = viewer_robot_name
+        self._on_viewer_message = on_viewer_message
+        self._log_time_clock: LogTimeClock = log_time_clock
+        self._start_time = datetime.now(UTC)
+        self.writer = RecordingWriter(path, viewer_robot_name, on_viewer_message, log_time_clock)
 
-        # What a new host changes: its description comes, and robot time starts over, in either order.
-        self._latched: dict[str, Arrival] = {}  # newest messages that each file begins with, by key
-        self._host: str | None = None
+        # A new host publishes its description, and robot time starts over, in either order.
+        self._latched_arrivals: dict[str, Arrival] = {}  # newest messages that each file begins with, by key
+        self._host_id: str | None = None
         self._host_count = 1
-        self._host_is_new = False  # and has no file
-        self._restarted_clock: Arrival | None = None  # the newest clock, if time went back and has no file
+        self._awaits_new_host_clock = False  # a new host has described itself, and its file is not started yet
+        self._restarted_clock: Arrival | None = None  # newest clock since robot time went back, until a file starts
 
-    def write(self, arrival: Arrival) -> None:
-        """Write one message. Once the description and the first clock of a new host have come, begin a new file."""
+    def write_arrival(self, arrival: Arrival) -> None:
+        """Write one message. Once the description and the first clock of a new host have come, start a new file."""
         if arrival.key in (keys.DESCRIPTION, keys.CONFIG, keys.STATUS):
-            self._latched[arrival.key] = arrival
+            self._latched_arrivals[arrival.key] = arrival
             if arrival.key == keys.DESCRIPTION:
-                self._read_host(arrival.payload)
-        self.recording.write_arrival(arrival)
+                self._detect_new_host(arrival.payload)
+        self.writer.write_arrival(arrival)
         if arrival.key == keys.CLOCK:
-            has_restarted = self._restarted_clock is not None or self.recording.time.went_back
+            has_restarted = self._restarted_clock is not None or self.writer.message_clock.has_gone_back
             if has_restarted:
                 self._restarted_clock = arrival
-        if self._host_is_new and self._restarted_clock is not None:
-            self._begin_next_file(self._restarted_clock)
+        if self._awaits_new_host_clock and self._restarted_clock is not None:
+            self._start_next_file(self._restarted_clock)
 
-    def close(self, dropped: dict[str, int]) -> str:
+    def close(self, dropped_count_by_key: dict[str, int]) -> str:
         """Write metadata and index into the file, and close it.
 
         Args:
-            dropped: Number of dropped messages by key, which the file then states.
+            dropped_count_by_key: Number of dropped messages by key, which the file then states.
 
         Returns:
-            Why the file is incomplete, or an empty text.
+            The reason why the file is incomplete; empty if it is complete.
         """
         about = {
             "version": version("snakesim"),
-            "began": self._began.isoformat(),
-            "dropped": dropped,
+            "began": self._start_time.isoformat(),
+            "dropped": dropped_count_by_key,
         }
-        self.recording.close(about)
-        return self.recording.failure
+        self.writer.close(about)
+        return self.writer.failure
 
-    def _read_host(self, payload: bytes) -> None:
-        """Note whether a description comes from a new host; an unproven one is ignored."""
+    def _detect_new_host(self, payload: bytes) -> None:
+        """Compare the host in a description with the current host, and remember if it is a new one.
+
+        A description whose origin cannot be verified is ignored.
+        """
         with contextlib.suppress(*UNDECODABLE):
             robot = msgspec.msgpack.decode(payload, type=Description)
-            if is_proven(robot, own_run_key()):
-                if self._host is not None and robot.host != self._host:
-                    self._host_is_new = True
-                self._host = robot.host
+            if has_valid_proof(robot, read_own_run_key()):
+                if self._host_id is not None and robot.host != self._host_id:
+                    self._awaits_new_host_clock = True
+                self._host_id = robot.host
 
-    def _begin_next_file(self, clock: Arrival) -> None:
-        """Keep what was written under another name, and begin a new file with the latched messages and a clock."""
-        self._host_is_new = False
+    def _start_next_file(self, clock: Arrival) -> None:
+        """Complete the current file under another name, and start a new file after a change of the host.
+
+        The new file begins with the latched messages and the clock. Beyond MAX_HOSTS files, nothing changes.
+
+        Args:
+            clock: The newest clock message of the new host.
+        """
+        self._awaits_new_host_clock = False
         self._restarted_clock = None
         if self._host_count >= MAX_HOSTS:
             return
         self._host_count += 1
         self.close({})
         self.path.rename(self._find_free_path())
-        self.recording = RecordingWriter(self.path, self._shown_as, self._show, self._stamps)
-        for arrival in (*self._latched.values(), clock):
-            self.recording.write_arrival(arrival)
+        self.writer = RecordingWriter(self.path, self._viewer_robot_name, self._on_viewer_message, self._log_time_clock)
+        for arrival in (*self._latched_arrivals.values(), clock):
+            self.writer.write_arrival(arrival)
 
     def _find_free_path(self) -> Path:
-        """Return the first of NAME-1, NAME-2 and so on that does not exist."""
+        """Return the first path of NAME-1, NAME-2 and so on that does not exist."""
         numbers = count(1)
         while True:
             path = self.path.with_stem(f"{self.path.stem}-{next(numbers)}")
@@ -134,11 +159,11 @@ def record_to_file(
     link: Link,
     path: Path,
     should_continue: Callable[[], bool],
-    show: Show | None = None,
+    on_viewer_message: OnViewerMessage | None = None,
     *,
     raw_only: bool = False,
-    after_host: bool = False,
-    stamps: Stamps = "robot",
+    wait_for_host_exit: bool = False,
+    log_time_clock: LogTimeClock = "robot",
 ) -> Recorder:
     """Record a robot until the caller ends it or the disk is full.
 
@@ -146,10 +171,10 @@ def record_to_file(
         link: How to reach the robot.
         path: The new file.
         should_continue: Returns whether to continue; called in each cycle.
-        show: Gets each message that is made for viewers.
+        on_viewer_message: Gets each message that is made for viewers.
         raw_only: Record messages as on the wire alone, without topics for viewers.
-        after_host: At the end, wait until the robot's host has left the network.
-        stamps: The clock of the log times.
+        wait_for_host_exit: At the end, wait until the robot's host has left the network.
+        log_time_clock: The clock of the log times.
 
     Returns:
         The recorder with its closed file.
@@ -158,26 +183,41 @@ def record_to_file(
         ConfigError: The file exists or cannot be created.
         NotConnectedError: There was no network at the link until the end. No file is created.
     """
-    with _connect(link, should_continue) as session:
-        return _record_session(
-            session, link, path, should_continue, show, raw_only=raw_only, after_host=after_host, stamps=stamps
+    with _connect_when_ready(link, should_continue) as session:
+        return _record_until_stopped(
+            session,
+            link,
+            path,
+            should_continue,
+            on_viewer_message,
+            raw_only=raw_only,
+            wait_for_host_exit=wait_for_host_exit,
+            log_time_clock=log_time_clock,
         )
 
 
 @contextlib.contextmanager
-def _connect(link: Link, should_continue: Callable[[], bool] = lambda: True) -> Iterator[Session]:
-    """Connect as soon as there is a network, unless the recording ends before."""
-    give_up_s = time.monotonic() + SERVICE_START_LIMIT_S
+def _connect_when_ready(link: Link, should_continue: Callable[[], bool] = lambda: True) -> Iterator[Session]:
+    """Connect as soon as the robot's network can be reached, and yield the session.
+
+    Args:
+        link: How to reach the robot.
+        should_continue: Returns whether to continue; called while the network is awaited.
+
+    Raises:
+        NotConnectedError: The network could not be reached in time, or until the recording was ended.
+    """
+    deadline_s = time.monotonic() + SERVICE_START_LIMIT_S
     is_stopped = False
 
-    def keeps_waiting() -> bool:
+    def should_keep_waiting() -> bool:
         nonlocal is_stopped
         is_stopped = not should_continue()
-        return not is_stopped and time.monotonic() < give_up_s
+        return not is_stopped and time.monotonic() < deadline_s
 
     with contextlib.ExitStack() as stack:
         try:
-            session = stack.enter_context(open_session_when_ready(link, keeps_waiting))
+            session = stack.enter_context(open_session_when_ready(link, should_keep_waiting))
         except NotConnectedError as error:
             if not is_stopped:
                 raise
@@ -188,16 +228,16 @@ def _connect(link: Link, should_continue: Callable[[], bool] = lambda: True) -> 
         yield session
 
 
-def _record_session(
+def _record_until_stopped(
     session: Session,
     link: Link,
     path: Path,
     should_continue: Callable[[], bool],
-    show: Show | None = None,
+    on_viewer_message: OnViewerMessage | None = None,
     *,
     raw_only: bool,
-    after_host: bool,
-    stamps: Stamps = "robot",
+    wait_for_host_exit: bool,
+    log_time_clock: LogTimeClock = "robot",
 ) -> Recorder:
     """Record the messages of a robot over a session that is open, until the caller ends it or the disk is full.
 
@@ -206,10 +246,10 @@ def _record_session(
         link: How to reach the robot, with its namespace.
         path: The new file.
         should_continue: Called in every cycle; returns whether to continue.
-        show: Gets each message that is made for viewers.
+        on_viewer_message: Gets each message that is made for viewers.
         raw_only: Whether to record only the messages as on the wire, without those for viewers.
-        after_host: Whether to record until the host's last messages have arrived.
-        stamps: The clock of the log times.
+        wait_for_host_exit: Whether to record until the host's last messages have arrived.
+        log_time_clock: The clock of the log times.
 
     Returns:
         The recorder, whose file is closed.
@@ -217,33 +257,33 @@ def _record_session(
     Raises:
         ConfigError: The file cannot be created.
     """
-    shown_as = None
+    viewer_robot_name = None
     if not raw_only:
-        shown_as = link.namespace or "robot"
+        viewer_robot_name = link.namespace or "robot"
     try:
-        recorder = Recorder(path, shown_as, show, stamps)
+        recorder = Recorder(path, viewer_robot_name, on_viewer_message, log_time_clock)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file", code="file/not-writable") from error
-    tap = Tap(session)
-    hosts = _watch_hosts(session)
+    tap = MessageTap(session)
+    present_hosts = _track_present_hosts(session)
     session.declare_alive(RECORDER)
-    show_process(session, own_entry(RECORDER))
-    while should_continue() and not recorder.recording.failure:
+    publish_process_entry(session, make_own_entry(RECORDER))
+    while should_continue() and not recorder.writer.failure:
         _write_arrivals(tap, recorder)
         time.sleep(CYCLE_S)
-    if after_host:
-        _write_last_messages(tap, recorder, hosts)
+    if wait_for_host_exit:
+        _write_last_messages(tap, recorder, present_hosts)
     _write_arrivals(tap, recorder)
-    for key, number in sorted(tap.dropped.items()):
-        print_stderr(f"{number} messages on {key} were dropped: the disk was too slow")
-    failure = recorder.close(dict(tap.dropped))
+    for key, dropped_count in sorted(tap.dropped_count_by_key.items()):
+        print_stderr(f"{dropped_count} messages on {key} were dropped: the disk was too slow")
+    failure = recorder.close(dict(tap.dropped_count_by_key))
     if failure:
         print_stderr(f"recording ended: {failure}")
     return recorder
 
 
-def _watch_hosts(session: Session) -> set[str]:
-    """Return a set that holds the liveliness keys of the hosts that are present, from now on."""
+def _track_present_hosts(session: Session) -> set[str]:
+    """Return a set that is updated, from now on, with the liveliness keys of the hosts on the network."""
     hosts: set[str] = set()
 
     def update(key: str, is_present: bool) -> None:
@@ -252,35 +292,43 @@ def _watch_hosts(session: Session) -> set[str]:
         else:
             hosts.discard(key)
 
-    session.on_alive(update, keys.alive_key(HAL))
+    session.on_token_change(update, keys.alive_key(HAL))
     return hosts
 
 
-def _write_last_messages(tap: Tap, recorder: Recorder, hosts: set[str]) -> None:
-    """Write what an ending host still sends, until it has left and no message is on its way.
+def _write_last_messages(tap: MessageTap, recorder: Recorder, present_hosts: set[str]) -> None:
+    """Write the last messages of a run, until the host has left and no message is on its way.
 
-    In a run the recorder ends last, so messages of the others may wait in the network.
+    In a run the recorder ends last, so messages of the other processes may still be queued in the network.
+
+    Args:
+        tap: Has the messages that have arrived.
+        recorder: Writes the messages.
+        present_hosts: Liveliness keys of the hosts on the network; other threads update the set.
     """
-    give_up_s = time.monotonic() + LAST_MESSAGES_TIMEOUT_S
+    deadline_s = time.monotonic() + LAST_MESSAGES_TIMEOUT_S
     quiet_cycles = 0
-    while quiet_cycles < QUIET_CYCLES and time.monotonic() < give_up_s:
+    while quiet_cycles < QUIET_CYCLES_AT_END and time.monotonic() < deadline_s:
         arrival_count = _write_arrivals(tap, recorder)
-        if arrival_count > 0 or hosts:
+        if arrival_count > 0 or present_hosts:
             quiet_cycles = 0
         else:
             quiet_cycles += 1
         time.sleep(CYCLE_S)
 
 
-def _write_arrivals(tap: Tap, recorder: Recorder) -> int:
-    """Write what has arrived since the last call, and return the number of messages."""
-    arrivals = tap.drain()
+def _write_arrivals(tap: MessageTap, recorder: Recorder) -> int:
+    """Write the messages that have arrived since the last call, and return their number.
+
+    In lockstep, as the newest clock states it, the tap is made lossless until it has dropped a message.
+    """
+    arrivals = tap.take_arrivals()
     for arrival in arrivals:
-        recorder.write(arrival)
-    clock = recorder.recording.time.clock
-    if clock is not None and not tap.dropped:
-        tap.lossless = clock.clock_mode == "lockstep"
-    recorder.recording.flush_when_due()
+        recorder.write_arrival(arrival)
+    clock = recorder.writer.message_clock.newest_clock
+    if clock is not None and not tap.dropped_count_by_key:
+        tap.is_lossless = clock.clock_mode == "lockstep"
+    recorder.writer.flush_when_due()
     return len(arrivals)
 
 
@@ -292,32 +340,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(description="Record a run.")
     parser.add_argument("--out", type=Path, default=Path(), help="folder of the run")
-    parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
-    add_scenario(parser)
-    add_network(parser, "")
+    parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY_HELP)
+    add_scenario_arguments(parser)
+    add_network_arguments(parser, "")
     add_parent(parser)
     arguments = parser.parse_args(argv)
-    return run_tool(f"snakesim {RECORDER}", lambda: _record_run(process_options(arguments)))
+    return run_tool(f"snakesim {RECORDER}", lambda: _record_run_until_stop_signal(read_process_options(arguments)))
 
 
-def _record_run(options: ProcessOptions) -> int:
-    """Record as a child process of a run, with a low priority.
+def _record_run_until_stop_signal(options: ProcessOptions) -> int:
+    """Record as a child process of a run, with a low priority, until a stop signal. Return the exit code.
 
-    Until it is connected, a stop signal ends the process at once: it has no file that it would have to close, and the
-    network of a run that has ended never opens.
+    Until it is connected, a stop signal ends the process at once: there is no file to close yet, and the network of a
+    run that has ended never opens.
     """
-    os.nice(NICE)
+    os.nice(NICENESS)
     # A batch process: its threads are woken by each message, and must not displace the robot's processes.
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    path = options.arguments.out / RECORDING
+    path = options.arguments.out / RECORDING_FILENAME
     raw_only = options.arguments.raw_only
-    with _connect(options.link) as session:
+    with _connect_when_ready(options.link) as session:
         stop_signals: list[bool] = []
-        on_stop_signal(lambda: stop_signals.append(True))
-        recorder = _record_session(
-            session, options.link, path, lambda: not stop_signals, raw_only=raw_only, after_host=True
+        call_on_stop_signals(lambda: stop_signals.append(True))
+        recorder = _record_until_stopped(
+            session, options.link, path, lambda: not stop_signals, raw_only=raw_only, wait_for_host_exit=True
         )
-    if recorder.recording.failure:
+    if recorder.writer.failure:
         return EXIT_DISK_FULL
     return 0
 

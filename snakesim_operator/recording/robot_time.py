@@ -5,8 +5,8 @@ import msgspec
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 
-MAX_AWAY_NS = 1_000_000_000  # a tick further away from the clock is wrong, or belongs to another host
-LATEST_NS = 2**63 - 1  # the file stores unsigned 64 bits; readers use signed ones
+MAX_CLOCK_DISTANCE_NS = 1_000_000_000  # a tick further away from the clock is wrong, or belongs to another host
+MAX_STORED_TIME_NS = 2**63 - 1  # the file stores unsigned 64 bits; readers use signed ones
 
 
 class _DatedFields(msgspec.Struct):
@@ -17,7 +17,7 @@ class _DatedFields(msgspec.Struct):
 
 
 class _ClockFields(msgspec.Struct):
-    """The fields of a clock that are needed here."""
+    """The fields of a clock message that are needed here; the rest of it is skipped."""
 
     tick: int
     period_ns: int
@@ -30,43 +30,43 @@ class MessageClock:
     def __init__(self) -> None:
         self._dated_decoder = msgspec.msgpack.Decoder(_DatedFields)
         self._clock_decoder = msgspec.msgpack.Decoder(_ClockFields)
-        self.clock: _ClockFields | None = None  # the newest one
-        self.went_back = False  # the newest clock is earlier than the previous one
-        self._now_ns = 0  # by the newest clock
+        self.newest_clock: _ClockFields | None = None  # the newest one
+        self.has_gone_back = False  # the newest clock is earlier than the previous one
+        self._newest_clock_ns = 0  # robot time by the newest clock; 0 before the first one
 
-    def date(self, key: str, payload: bytes) -> int:
-        """Return the robot time at which a recorded message is filed, in ns.
+    def find_robot_time_ns(self, key: str, payload: bytes) -> int:
+        """Return the robot time in ns under which a message is recorded.
 
-        This is the time of the tick that the message names. If the message names no tick, or one more than MAX_AWAY_NS
-        from the newest clock, it is the time of the newest clock. Before the first clock, it is the timestamp in the
-        message. A clock message itself sets the newest clock.
+        This is the time of the tick in the message. If the message has no tick, or a tick more than
+        MAX_CLOCK_DISTANCE_NS from the newest clock, it is the time of the newest clock. Before the first clock, it is
+        the timestamp in the message. A clock message itself becomes the newest clock.
 
         Args:
             key: Key at which the message was published.
-            payload: The encoded message.
+            payload: The encoded message. If it cannot be decoded, the time of the newest clock is returned.
         """
         try:
             if key == keys.CLOCK:
-                return self._set_clock(self._clock_decoder.decode(payload))
-            dated = self._dated_decoder.decode(payload)
+                return self._update_newest_clock(self._clock_decoder.decode(payload))
+            fields = self._dated_decoder.decode(payload)
         except UNDECODABLE:
-            return self._now_ns
-        if self.clock is None:
-            return _limit(dated.timestamp_ns or 0)
-        if dated.tick is not None:
-            tick_ns = dated.tick * self.clock.period_ns
-            is_near_clock = abs(tick_ns - self._now_ns) <= MAX_AWAY_NS
+            return self._newest_clock_ns
+        if self.newest_clock is None:
+            return _clamp_time_ns(fields.timestamp_ns or 0)
+        if fields.tick is not None:
+            tick_ns = fields.tick * self.newest_clock.period_ns
+            is_near_clock = abs(tick_ns - self._newest_clock_ns) <= MAX_CLOCK_DISTANCE_NS
             if tick_ns >= 0 and is_near_clock:
                 return tick_ns
-        return self._now_ns
+        return self._newest_clock_ns
 
-    def _set_clock(self, clock: _ClockFields) -> int:
-        """Take in the newest clock, and return its robot time in ns."""
-        self.went_back = self.clock is not None and clock.tick < self.clock.tick
-        self.clock = clock
-        self._now_ns = _limit(clock.tick * clock.period_ns)
-        return self._now_ns
+    def _update_newest_clock(self, clock: _ClockFields) -> int:
+        """Store a clock message as the newest one, and return its robot time in ns."""
+        self.has_gone_back = self.newest_clock is not None and clock.tick < self.newest_clock.tick
+        self.newest_clock = clock
+        self._newest_clock_ns = _clamp_time_ns(clock.tick * clock.period_ns)
+        return self._newest_clock_ns
 
 
-def _limit(time_ns: int) -> int:
-    return min(max(time_ns, 0), LATEST_NS)
+def _clamp_time_ns(time_ns: int) -> int:
+    return min(max(time_ns, 0), MAX_STORED_TIME_NS)

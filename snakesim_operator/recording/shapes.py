@@ -34,30 +34,38 @@ TRUE_OBSTACLE_COLOR = Color(r=0.55, g=0.55, b=0.58, a=1.0)
 MAP_COLOR = Color(r=0.95, g=0.60, b=0.10, a=0.45)  # transparent: it covers the true obstacles
 FORCE_COLOR = Color(r=0.85, g=0.15, b=0.20, a=1.0)
 PATH_COLOR = Color(r=0.20, g=0.65, b=0.30, a=1.0)
-ARROW_M_PER_N = 0.01
-MAX_ARROW_M = 0.5
-SHAFT_DIAMETER_M = 0.012
-HEAD_DIAMETER_M = 0.03
+ARROW_LENGTH_M_PER_N = 0.01
+MAX_ARROW_LENGTH_M = 0.5
+ARROW_SHAFT_DIAMETER_M = 0.012
+ARROW_HEAD_DIAMETER_M = 0.03
 PATH_WIDTH_M = 0.01
 PATH_HEIGHT_M = 0.005  # above the ground, else the ground hides parts of it
 
 MAX_DEPTH_MM = 65535  # 16 bits
 
 _UPRIGHT = Quaternion(w=1.0)
-_Z_TO_X = Quaternion(w=math.sqrt(0.5), y=math.sqrt(0.5))  # lays a cylinder along the link
+_ROTATION_FROM_Z_TO_X = Quaternion(w=math.sqrt(0.5), y=math.sqrt(0.5))  # lays a cylinder along the link
 _OPTICAL_IN_CAMERA = (0.5, -0.5, 0.5, -0.5)  # wxyz: Foxglove's camera frame in the robot's
 
 
 def make_timestamp(time_ns: int) -> Timestamp:
-    """Return a robot time as a timestamp."""
+    """Return a robot time in ns as a protobuf timestamp."""
     return Timestamp(seconds=time_ns // 1_000_000_000, nanos=time_ns % 1_000_000_000)
 
 
-def make_frame(
-    time_ns: int, parent: str, child: str, position: Sequence[float], wxyz: Sequence[float]
+def make_frame_transform(
+    time_ns: int, parent: str, child: str, position: Sequence[float], orientation_wxyz: Sequence[float]
 ) -> FrameTransform:
-    """Return the pose of the frame `child` in the frame `parent`."""
-    w, x, y, z = wxyz
+    """Return a FrameTransform with the pose of a child frame in its parent frame.
+
+    Args:
+        time_ns: Robot time.
+        parent: Name of the parent frame.
+        child: Name of the child frame.
+        position: (3,) position of the child frame in the parent frame, m.
+        orientation_wxyz: (4,) orientation of the child frame in the parent frame.
+    """
+    w, x, y, z = orientation_wxyz
     return FrameTransform(
         timestamp=make_timestamp(time_ns),
         parent_frame_id=parent,
@@ -67,10 +75,14 @@ def make_frame(
     )
 
 
-def rotate_to_optical(camera_wxyz: Sequence[float]) -> tuple[float, float, float, float]:
-    """Return the orientation of Foxglove's camera frame for a camera of this orientation.
+def compute_optical_orientation(camera_wxyz: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return the orientation of Foxglove's optical frame for a camera of the robot, as a quaternion wxyz.
 
-    It is the quaternion product p q of the camera's orientation p and of the optical frame q in the camera.
+    It is the quaternion product p q of the camera's orientation p and the orientation q of the optical frame in the
+    camera's frame.
+
+    Args:
+        camera_wxyz: (4,) orientation of the camera.
     """
     pw, px, py, pz = camera_wxyz
     qw, qx, qy, qz = _OPTICAL_IN_CAMERA
@@ -83,12 +95,12 @@ def rotate_to_optical(camera_wxyz: Sequence[float]) -> tuple[float, float, float
 
 
 def draw_body(robot: Description, time_ns: int) -> list[SceneEntity]:
-    """Return the links as capsules, each in its own frame."""
+    """Return one scene entity for each link: a capsule in the frame of the link."""
     return [_draw_link(link, time_ns) for link in robot.links]
 
 
 def _draw_link(link: LinkDescription, time_ns: int) -> SceneEntity:
-    middle = Pose(position=Vector3(x=0.5 * link.length_m), orientation=_Z_TO_X)
+    middle = Pose(position=Vector3(x=0.5 * link.length_m), orientation=_ROTATION_FROM_Z_TO_X)
     diameter_m = 2 * link.radius_m
     return SceneEntity(
         timestamp=make_timestamp(time_ns),
@@ -97,8 +109,8 @@ def _draw_link(link: LinkDescription, time_ns: int) -> SceneEntity:
         frame_locked=True,
         cylinders=[_make_cylinder(middle, link.radius_m, link.length_m, BODY_COLOR)],
         spheres=[
-            _make_ball(0.0, 0.0, 0.0, diameter_m, BODY_COLOR),
-            _make_ball(link.length_m, 0.0, 0.0, diameter_m, BODY_COLOR),
+            _make_sphere(0.0, 0.0, 0.0, diameter_m, BODY_COLOR),
+            _make_sphere(link.length_m, 0.0, 0.0, diameter_m, BODY_COLOR),
         ],
     )
 
@@ -121,7 +133,7 @@ def draw_obstacles(obstacles: Iterable[Obstacle], name: str, color: Color, time_
         match obstacle.shape:
             case "sphere":
                 diameter_m = 2 * obstacle.radius_m
-                entity.spheres.append(_make_ball(x, y, z, diameter_m, color))
+                entity.spheres.append(_make_sphere(x, y, z, diameter_m, color))
             case "box":
                 half_x_m, half_y_m, half_z_m = obstacle.half_size_m
                 size = Vector3(x=2 * half_x_m, y=2 * half_y_m, z=2 * half_z_m)
@@ -135,8 +147,8 @@ def draw_forces(contacts: Iterable[WorldContact], time_ns: int) -> SceneEntity:
     """Return contact forces on the body as one entity of a Foxglove scene: an arrow at each contact.
 
     Args:
-        contacts: Contacts in the world frame. An arrow is ARROW_M_PER_N long for each newton, and at most MAX_ARROW_M;
-            a contact without force has none.
+        contacts: Contacts in the world frame. The length of an arrow is proportional to the force, and at most
+            MAX_ARROW_LENGTH_M. A contact without force has no arrow.
         time_ns: Robot time.
     """
     entity = SceneEntity(timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id="forces")
@@ -144,15 +156,15 @@ def draw_forces(contacts: Iterable[WorldContact], time_ns: int) -> SceneEntity:
         force_n = math.hypot(*contact.force_w)
         if force_n <= 0.0:
             continue
-        length_m = min(ARROW_M_PER_N * force_n, MAX_ARROW_M)
+        length_m = min(ARROW_LENGTH_M_PER_N * force_n, MAX_ARROW_LENGTH_M)
         x, y, z = contact.position_w
-        orientation = _rotate_x_to(contact.force_w, force_n)
+        orientation = _compute_rotation_from_x_axis(contact.force_w, force_n)
         arrow = ArrowPrimitive(
             pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=orientation),
             shaft_length=0.8 * length_m,
-            shaft_diameter=SHAFT_DIAMETER_M,
+            shaft_diameter=ARROW_SHAFT_DIAMETER_M,
             head_length=0.2 * length_m,
-            head_diameter=HEAD_DIAMETER_M,
+            head_diameter=ARROW_HEAD_DIAMETER_M,
             color=FORCE_COLOR,
         )
         entity.arrows.append(arrow)
@@ -160,7 +172,12 @@ def draw_forces(contacts: Iterable[WorldContact], time_ns: int) -> SceneEntity:
 
 
 def draw_path(points_w: Iterable[Sequence[float]], time_ns: int) -> SceneEntity:
-    """Return a planned path as a line on the ground."""
+    """Return a planned path as a scene entity with a line on the ground.
+
+    Args:
+        points_w: Points of the path in the world frame; only x and y are used, m.
+        time_ns: Robot time.
+    """
     line = LinePrimitive(
         type=LinePrimitive.LINE_STRIP,
         pose=Pose(orientation=_UPRIGHT),
@@ -175,8 +192,8 @@ def make_raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) 
     """Return a camera image as a Foxglove message: color as rgb8, depth as 16UC1 in millimeters.
 
     Args:
-        image: The image.
-        frame_id: Optical frame of the camera.
+        image: The image as the robot publishes it.
+        frame_id: Name of the optical frame of the camera.
         time_ns: Robot time of the image.
     """
     if isinstance(image, ColorImage):
@@ -229,14 +246,19 @@ def _make_cylinder(pose: Pose, radius_m: float, length_m: float, color: Color) -
     return CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=color)
 
 
-def _make_ball(x: float, y: float, z: float, diameter_m: float, color: Color) -> SpherePrimitive:
+def _make_sphere(x: float, y: float, z: float, diameter_m: float, color: Color) -> SpherePrimitive:
     size = Vector3(x=diameter_m, y=diameter_m, z=diameter_m)
     pose = Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT)
     return SpherePrimitive(pose=pose, size=size, color=color)
 
 
-def _rotate_x_to(vector: Sequence[float], length: float) -> Quaternion:
-    """Return the shortest rotation from the x axis to a vector of this length."""
+def _compute_rotation_from_x_axis(vector: Sequence[float], length: float) -> Quaternion:
+    """Return the shortest rotation that turns the x axis into the direction of a vector.
+
+    Args:
+        vector: (3,) vector.
+        length: Length of the vector, above 0.
+    """
     x, y, z = (value / length for value in vector)
     if x < -0.999999:
         return Quaternion(z=1.0)  # half a turn about z; the formula below would divide by 0

@@ -18,7 +18,7 @@ _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """`/ROBOT/state`. Unknown texts are empty, unknown numbers are left out."""
+    """The message on `/ROBOT/state`. Unknown texts are empty, unknown numbers are left out."""
 
     lifecycle: str
     lifecycle_reason: str
@@ -36,7 +36,10 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
-    """`/ROBOT/contact_forces`: on each link in its own frame, tail to head, summed over its contacts."""
+    """The message on `/ROBOT/contact_forces`: the force on each link in the link's frame, summed over its contacts.
+
+    The links are in the order from tail to head.
+    """
 
     along_n: list[float]
     left_n: list[float]
@@ -44,7 +47,12 @@ class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def sum_contacts(cls, contacts: Contacts, link_count: int) -> Self:
-        """Return the forces of a sample, for a robot of so many links; contacts of other links are ignored."""
+        """Return the sum of the contact forces on each link of a robot.
+
+        Args:
+            contacts: Contacts of one sample. Contacts of links that the robot does not have are ignored.
+            link_count: Number of links of the robot.
+        """
         along_n = [0.0] * link_count
         left_n = [0.0] * link_count
         up_n = [0.0] * link_count
@@ -93,24 +101,24 @@ class StateUpdate(NamedTuple):
 
 
 class StateMessages:
-    """Makes the state message, and log entries when the state changes."""
+    """Makes the state message for viewers, and log entries when the state changes."""
 
     def __init__(self) -> None:
-        self._logged: dict[str, tuple[str, str]] = {}  # by source: state, and its reason without numbers
+        self._last_logged_by_source: dict[str, tuple[str, str]] = {}  # by source: state, and its reason without numbers
 
-    def update(self, status: bytes | None, control: bytes | None, time_ns: int) -> StateUpdate:
+    def update_state(self, status_payload: bytes | None, control_payload: bytes | None, time_ns: int) -> StateUpdate:
         """Combine the newest messages of host and controller into the state that viewers show.
 
         Args:
-            status: Newest payload of `hal/status`; None if the host is silent.
-            control: Newest payload of `control/state`; None if the controller is silent.
+            status_payload: Newest payload of `hal/status`; None if the host publishes none.
+            control_payload: Newest payload of `control/state`; None if the controller publishes none.
             time_ns: Robot time.
 
         Returns:
-            The state, log entries about what changed since the last call, and the controller's reference angles in rad.
+            The state, log entries about changes since the last call, and the controller's reference angles in rad.
         """
-        host_state = _decode_status(status)
-        control_state = _decode_control(control)
+        host_state = _decode_status(status_payload)
+        control_state = _decode_control(control_payload)
         state = State(
             # Reported by the host.
             lifecycle=host_state.lifecycle,
@@ -139,34 +147,48 @@ class StateMessages:
             time_ns: Robot time.
 
         Returns:
-            An entry for each of both whose state, or the reason of it, differs from the last call; often none.
+            One entry for each of host and controller whose state, or the reason of it, has changed since the last
+            call; often empty.
         """
         host_level = Log.INFO
         if state.lifecycle in ("fault", "estop"):
             host_level = Log.ERROR
         host_reason, _, _ = state.lifecycle_reason.partition("; ")
-        host_entry = self._make_log("hal", state.lifecycle, host_reason, host_level, time_ns)
+        host_entry = self._make_log_if_changed("hal", state.lifecycle, host_reason, host_level, time_ns)
 
         control_level = Log.INFO
         if state.jammed or state.saturated:
             control_level = Log.WARNING
-        control_entry = self._make_log("control", state.locomotion, state.reason, control_level, time_ns)
+        control_entry = self._make_log_if_changed("control", state.locomotion, state.reason, control_level, time_ns)
         return [entry for entry in (host_entry, control_entry) if entry is not None]
 
-    def _make_log(self, source: str, name: str, reason: str, level: "Log.Level.ValueType", time_ns: int) -> Log | None:
-        """Return a log entry for the state of a source, or None if it is logged or was never known."""
-        if not name:
-            if source not in self._logged:
+    def _make_log_if_changed(
+        self, source: str, state_name: str, reason: str, level: "Log.Level.ValueType", time_ns: int
+    ) -> Log | None:
+        """Return a log entry for the state of a source, if it differs from the entry that was logged last.
+
+        Args:
+            source: Publisher of the state: "hal" or "control".
+            state_name: Name of the state; empty if the source publishes no state.
+            reason: Reason of the state.
+            level: Severity of the entry.
+            time_ns: Robot time.
+
+        Returns:
+            The entry. None if the state is unchanged, or if the source has never published a state.
+        """
+        if not state_name:
+            if source not in self._last_logged_by_source:
                 return None
-            name = "silent"
+            state_name = "silent"
             reason = f"the state of {source} is no longer published"
             level = Log.ERROR
         reason_without_numbers = _NUMBER.sub("#", reason)  # a force or an age that changes is no new state
-        content = (name, reason_without_numbers)
-        if self._logged.get(source) == content:
+        content = (state_name, reason_without_numbers)
+        if self._last_logged_by_source.get(source) == content:
             return None
-        self._logged[source] = content
-        return Log(timestamp=make_timestamp(time_ns), level=level, name=source, message=f"{name}: {reason}")
+        self._last_logged_by_source[source] = content
+        return Log(timestamp=make_timestamp(time_ns), level=level, name=source, message=f"{state_name}: {reason}")
 
 
 def _decode_status(payload: bytes | None) -> _StatusFields:

@@ -16,63 +16,63 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 
-MAX_BYTES = 64 * 1024 * 1024
-LIMIT_S = 2.0  # for a disk to take messages, in lockstep
-RECEIVE_NS = 1_000_000  # between two rests, in lockstep
-REST_S = 0.005  # less than the kernel can hold on a connection
+MAX_QUEUED_BYTES = 64 * 1024 * 1024
+DISK_TIMEOUT_S = 2.0  # for a disk to take messages, in lockstep
+RECEIVE_DURATION_NS = 1_000_000  # between two rests, in lockstep
+REST_DURATION_S = 0.005  # less than the kernel can hold on a connection
 ROOM_POLL_S = 0.001
 
 
-class Tap:
-    """Receives every message below one robot's namespace, in Zenoh's threads, until the recorder takes them."""
+class MessageTap:
+    """Queues every message below one robot's namespace, in Zenoh's threads, until the recorder takes them."""
 
     def __init__(self, session: Session) -> None:
-        """Subscribe to every key of a robot. Messages wait until the recorder takes them, within a limit of memory.
+        """Subscribe to every key of a robot. Messages are queued until the recorder takes them; memory is bounded.
 
         Args:
             session: Session on the robot's network.
         """
-        self.lossless = False  # whether the network waits for room; set in lockstep
-        self.dropped: Counter[str] = Counter()  # by key
-        self._waiting: deque[Arrival] = deque()
-        self._waiting_bytes = 0
+        self.is_lossless = False  # whether the network waits for room; set in lockstep
+        self.dropped_count_by_key: Counter[str] = Counter()  # by key
+        self._queue: deque[Arrival] = deque()
+        self._queued_bytes = 0
         self._next_rest_ns = 0
         self._lock = threading.Lock()
         for row in keys.SPACE:
             if row.kind == "latched":
-                session.on_latched_arrival(row.key, self._receive)
+                session.on_latched_arrival(row.key, self._queue_or_drop)
             elif row.kind == "stream":
                 # Urgent: otherwise each key had a thread, which would wake with every message.
-                session.on_urgent_arrival(row.key, self._receive)
+                session.on_urgent_arrival(row.key, self._queue_or_drop)
 
-    def drain(self) -> list[Arrival]:
-        """Return what has arrived since the last call, in order."""
+    def take_arrivals(self) -> list[Arrival]:
+        """Return the messages that have arrived since the last call, in order, and remove them from the queue."""
         with self._lock:
-            arrivals = list(self._waiting)
-            self._waiting.clear()
-            self._waiting_bytes = 0
+            arrivals = list(self._queue)
+            self._queue.clear()
+            self._queued_bytes = 0
         return arrivals
 
-    def _receive(self, arrival: Arrival) -> None:
-        """Keep a message, or drop it if there is no room. This runs in Zenoh's threads."""
-        if self.lossless and arrival.monotonic_ns > self._next_rest_ns:
-            time.sleep(REST_S)
-            self._next_rest_ns = time.monotonic_ns() + RECEIVE_NS
+    def _queue_or_drop(self, arrival: Arrival) -> None:
+        """Queue a message, or drop and count it if the queue is full. This runs in Zenoh's threads."""
+        if self.is_lossless and arrival.monotonic_ns > self._next_rest_ns:
+            time.sleep(REST_DURATION_S)
+            self._next_rest_ns = time.monotonic_ns() + RECEIVE_DURATION_NS
         size = len(arrival.payload)
-        if self.lossless and self._waiting_bytes + size > MAX_BYTES:
+        if self.is_lossless and self._queued_bytes + size > MAX_QUEUED_BYTES:
             self._wait_for_room(size)
         with self._lock:
-            if self._waiting_bytes + size > MAX_BYTES:
-                self.dropped[arrival.key] += 1
+            if self._queued_bytes + size > MAX_QUEUED_BYTES:
+                self.dropped_count_by_key[arrival.key] += 1
                 return
-            self._waiting_bytes += size
-            self._waiting.append(arrival)
+            self._queued_bytes += size
+            self._queue.append(arrival)
 
     def _wait_for_room(self, size: int) -> None:
         """Wait until a message of this size finds room; after LIMIT_S, never wait again."""
-        give_up_s = time.monotonic() + LIMIT_S
-        while self._waiting_bytes + size > MAX_BYTES:
-            if time.monotonic() > give_up_s:
-                self.lossless = False
+        deadline_s = time.monotonic() + DISK_TIMEOUT_S
+        while self._queued_bytes + size > MAX_QUEUED_BYTES:
+            if time.monotonic() > deadline_s:
+                self.is_lossless = False
                 return
             time.sleep(ROOM_POLL_S)

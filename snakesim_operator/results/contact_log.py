@@ -1,4 +1,4 @@
-"""The contact forces of a run, as compact arrays: one row for each contact in each sample of the contact sensor."""
+"""Stores the contact forces of a run in compact arrays: a row for each contact in each sample of the sensor."""
 
 import re
 from array import array
@@ -17,15 +17,17 @@ MAX_OBSTACLES = 200  # each needs three columns of a table
 
 @dataclass(frozen=True, eq=False)
 class ContactLog:
-    """Contact forces of obstacles on the links, by samples in time order."""
+    """Contact forces of obstacles on the links, in the order of the samples."""
 
     ticks: NDArray[np.int64]  # (s,) of the samples; ascending
     obstacles: list[str] = field(default_factory=list[str])  # names of those that were touched, sorted
 
     # One row for each contact.
-    sample: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) index into `ticks`
-    link: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) from 0 at the tail
-    obstacle: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) index into `obstacles`
+    sample_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) index into `ticks`
+    link_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) from 0 at the tail
+    obstacle_index: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros(0, np.int64)
+    )  # (c,) index into `obstacles`
     force_l_n: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) on the body, in the link's frame
 
 
@@ -33,54 +35,54 @@ class ContactCollector:
     """Collects the contacts of a run while its messages are read."""
 
     def __init__(self) -> None:
-        """Start without any sample."""
+        """Prepare a collector without samples."""
         self._ticks = array("q")
         self._sample = array("q")
         self._link = array("q")
         self._obstacle = array("q")
         self._force_l_n = array("d")
-        self._obstacle_numbers: dict[str, int] = {}
+        self._obstacle_index_by_name: dict[str, int] = {}
 
-    def add(self, contacts: Contacts) -> None:
+    def add_sample(self, contacts: Contacts) -> None:
         """Add one sample of the contact sensor."""
         sample = len(self._ticks)
         self._ticks.append(contacts.tick)
         for contact in contacts.contacts:
             self._sample.append(sample)
             self._link.append(contact.link)
-            self._obstacle.append(self._number_obstacle(contact.obstacle))
+            self._obstacle.append(self._get_obstacle_index(contact.obstacle))
             self._force_l_n.extend(contact.force_l)
 
     def make_log(self) -> ContactLog:
-        """Return what was collected, in the order of the ticks. The last sample of a tick counts."""
+        """Return the collected contacts in the order of their ticks. Only the last sample of each tick is used."""
         ticks = np.array(self._ticks, dtype=np.int64)
         unique_ticks, index_from_end = np.unique(ticks[::-1], return_index=True)
         retained_rows = len(ticks) - 1 - index_from_end
-        place = np.full(len(ticks), -1, dtype=np.int64)  # of each sample in the log
-        place[retained_rows] = np.arange(len(retained_rows))
-        sample = place[np.array(self._sample, dtype=np.int64)]
+        new_sample_index = np.full(len(ticks), -1, dtype=np.int64)  # of each collected sample; -1: it is dropped
+        new_sample_index[retained_rows] = np.arange(len(retained_rows))
+        sample = new_sample_index[np.array(self._sample, dtype=np.int64)]
         rows = np.flatnonzero(sample >= 0)
         rows = rows[np.argsort(sample[rows], kind="stable")]
-        obstacles = sorted(self._obstacle_numbers, key=_make_sort_key)
-        place_of_number = np.zeros(len(obstacles), dtype=np.int64)
-        for i, name in enumerate(obstacles):
-            place_of_number[self._obstacle_numbers[name]] = i
+        obstacles = sorted(self._obstacle_index_by_name, key=_make_sort_key)
+        new_obstacle_index = np.zeros(len(obstacles), dtype=np.int64)
+        for index, name in enumerate(obstacles):
+            new_obstacle_index[self._obstacle_index_by_name[name]] = index
         return ContactLog(
             ticks=unique_ticks,
             obstacles=obstacles,
-            sample=sample[rows],
-            link=np.array(self._link, dtype=np.int64)[rows],
-            obstacle=place_of_number[np.array(self._obstacle, dtype=np.int64)[rows]],
+            sample_index=sample[rows],
+            link_index=np.array(self._link, dtype=np.int64)[rows],
+            obstacle_index=new_obstacle_index[np.array(self._obstacle, dtype=np.int64)[rows]],
             force_l_n=np.array(self._force_l_n, dtype=float).reshape(-1, 3)[rows],
         )
 
-    def _number_obstacle(self, name: str | None) -> int:
-        """Return the number of an obstacle, and count it if it is new."""
+    def _get_obstacle_index(self, name: str | None) -> int:
+        """Return the index of an obstacle, and add the obstacle if it is new. None stands for UNIDENTIFIED."""
         name = name or UNIDENTIFIED
-        numbers = self._obstacle_numbers
-        if name not in numbers and len(numbers) >= MAX_OBSTACLES:
+        index_by_name = self._obstacle_index_by_name
+        if name not in index_by_name and len(index_by_name) >= MAX_OBSTACLES:
             name = OTHER
-        return numbers.setdefault(name, len(numbers))
+        return index_by_name.setdefault(name, len(index_by_name))
 
 
 def _make_sort_key(name: str) -> list[tuple[bool, int, str]]:

@@ -7,10 +7,10 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.atomic_write import write_atomically
-from snakesim_hal.network.local_registry import state_folder
+from snakesim_hal.network.local_registry import get_state_folder
 from snakesim_hal.wire.codec import UNDECODABLE
 
-MAX_WRITE_S = 1.0  # a hanging disk must not keep the run from ending
+WRITE_TIMEOUT_S = 1.0  # a hanging disk must not keep the run from ending
 
 
 class LastRun(msgspec.Struct, frozen=True, kw_only=True):
@@ -21,26 +21,31 @@ class LastRun(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def save_last_run(folder: str, ended: str) -> None:
-    """Store which run has finished. Ignores write errors, and waits at most MAX_WRITE_S for the disk."""
+    """Store which run has finished. Write errors are ignored, and the disk is awaited for WRITE_TIMEOUT_S at most.
+
+    Args:
+        folder: Path of the run folder.
+        ended: "complete", or a sentence on how the run ended.
+    """
     last_run = LastRun(folder=folder, ended=ended)
-    thread = threading.Thread(target=_write, args=(last_run,), daemon=True)
+    thread = threading.Thread(target=_write_last_run, args=(last_run,), daemon=True)
     thread.start()
-    thread.join(MAX_WRITE_S)
+    thread.join(WRITE_TIMEOUT_S)
 
 
 def read_last_run() -> LastRun | None:
     """Return the last run, or None if none is stored."""
     with contextlib.suppress(OSError, *UNDECODABLE):
-        return msgspec.json.decode(_find_file().read_bytes(), type=LastRun)
+        return msgspec.json.decode(_get_last_run_path().read_bytes(), type=LastRun)
     return None
 
 
-def _find_file() -> Path:
-    return state_folder() / "last-run.json"
+def _get_last_run_path() -> Path:
+    return get_state_folder() / "last-run.json"
 
 
-def _write(last_run: LastRun) -> None:
-    with contextlib.suppress(OSError, ValueError):  # ValueError: the folder's name is no text
-        file = _find_file()
+def _write_last_run(last_run: LastRun) -> None:
+    with contextlib.suppress(OSError, ValueError):  # ValueError: the name of the folder is not valid text
+        file = _get_last_run_path()
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, msgspec.json.encode(last_run))

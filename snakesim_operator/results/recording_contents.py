@@ -35,22 +35,23 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.results.contact_log import ContactCollector, ContactLog
-from snakesim_operator.results.missing_data import describe_undecodable
+from snakesim_operator.results.missing_data import describe_undecodable_messages
 
 if TYPE_CHECKING:
     from snakesim_operator.recording.reader import RecordingReader
 
-SERVICE_STREAMS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
-"""What guidance, navigation and control publish."""
-OUTPUTS = (*SERVICE_STREAMS, keys.CUSTOM_ALL, keys.CONTACTS)
-"""What the host's black box does not have."""
-CONTROLLER = "controller"  # ends the names of columns with numbers that a controller defined
-SAME_TIME_S = 1e-9  # two times that differ by less are of one tick
+SERVICE_OUTPUT_KEYS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
+"""Keys of the messages that guidance, navigation and control publish."""
+OUTPUT_KEYS = (*SERVICE_OUTPUT_KEYS, keys.CUSTOM_ALL, keys.CONTACTS)
+"""Keys of the messages that the black box of the host does not contain."""
+CONTROLLER_SUFFIX = "controller"  # last part of the names of columns with values that a controller defined
+TIME_TOLERANCE_S = 1e-9  # times that differ by less belong to the same tick
 MAX_WORLDS_PER_S = 20.0  # as often as control publishes its state
-_TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.JOINT_COMMAND)
+# Keys whose messages belong to one tick each.
+_TICK_KEYS = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.JOINT_COMMAND)
 _JOINT_COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm")  # of the messages at keys.JOINTS
 _SETPOINT_COLUMNS = ("target", "torque_limit_nm")  # of the messages at keys.APPLIED
-ALL: tuple[str, ...] = (*OUTPUTS, *_TICKED, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+RUN_KEYS: tuple[str, ...] = (*OUTPUT_KEYS, *_TICK_KEYS, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
 
 
 _decoder: Callable[[type[Any]], Decoder[Any]] = cache(Decoder)
@@ -63,12 +64,12 @@ class RunOutputs:
     control: list[ControlState] = field(default_factory=list[ControlState])  # in time order
     worlds: list[World] = field(default_factory=list[World])  # in time order, at most MAX_WORLDS_PER_S
     trajectories: list[Trajectory] = field(default_factory=list[Trajectory])  # in time order, one for each path
-    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # by tick of a cycle of navigation
     custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns that sensors and controllers define
     contact_log: ContactLog = field(default_factory=lambda: ContactCollector().make_log())
     replay_of: str = ""  # the recording whose sensors the services read; empty: a run
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
-    unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
+    unreached: list[str] = field(default_factory=list[str])  # those of them about data that never reached the recorder
 
 
 @dataclass
@@ -83,43 +84,47 @@ class RecordingContents:
     status: Status | None = None
 
     # Messages of the run.
-    streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_STREAMS})
+    streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_OUTPUT_KEYS})
     messages_by_tick: dict[str, dict[int, Any]] = field(  # key -> tick -> message
-        default_factory=lambda: {key: {} for key in _TICKED}
+        default_factory=lambda: {key: {} for key in _TICK_KEYS}
     )
     custom: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])  # custom sensors
     contacts: ContactCollector = field(default_factory=ContactCollector)
     contact_summaries: dict[int, tuple[float, int]] = field(  # tick -> strongest force in N, number of obstacles
         default_factory=dict[int, tuple[float, int]]
     )
-    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # by tick of a cycle of navigation
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     replay_of: str = ""  # the recording whose sensors these are
 
     # Missing data.
-    refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
+    undecodable_counts: Counter[str] = field(
+        default_factory=Counter[str]
+    )  # messages that cannot be decoded, by key and reason
     missing: list[str] = field(default_factory=list[str])
-    ticks: int = 0  # with setpoints as applied
-    ticks_lost: int | None = 0  # of these, as the file itself reports; None: it does not report that
-    last_tick_ns: int | None = None  # robot time of the last of them
-    finished: bool = True  # the file has an end
+    applied_tick_count: int = 0  # with setpoints as applied
+    lost_tick_count: int | None = 0  # of these, as the file itself reports; None: it does not report that
+    last_applied_time_ns: int | None = None  # robot time of the last of them
+    is_finished: bool = True  # the file has an end
 
-    def add(self, recorded: RecordedMessage) -> None:
-        """Add one message at a key of ALL, in the order of the file."""
+    def add_message(self, recorded: RecordedMessage) -> None:
+        """Decode and store one message at a key of RUN_KEYS. Messages are added in the order of the file."""
         if keys.find_row_key(recorded.key) == keys.CUSTOM_ALL:
-            self.custom.setdefault(recorded.key, []).append(recorded)  # their schema is in the description
+            self.custom.setdefault(recorded.key, []).append(
+                recorded
+            )  # decoded later: their schema is in the description
             return
         message_type = keys.find_message(recorded.key)
         if message_type is None:
             return
         try:
             message = _decoder(message_type).decode(recorded.payload, recorded.encoding)
-            self._keep(recorded.key, message, recorded.wall_ns)
+            self._store_message(recorded.key, message, recorded.wall_time_ns)
         except WireError as error:
-            self.refused[f"{recorded.key}: {error}"[:200]] += 1
+            self.undecodable_counts[f"{recorded.key}: {error}"[:200]] += 1
 
-    def _keep(self, key: str, message: Any, wall_ns: int) -> None:
-        """Store a decoded message by its type, as far as the record of a run needs it.
+    def _store_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Store a decoded message by its type, if the record of a run needs it.
 
         Args:
             key: Key at which the message was published.
@@ -134,7 +139,7 @@ class RecordingContents:
             case Status():
                 self.status = message
             case Clock(paused=True):
-                pass  # a paused clock names no tick
+                pass  # a paused clock belongs to no tick
             case Trajectory():
                 self.searched_nodes[message.tick] = message.searched_nodes
                 self._add_to_stream(key, message)
@@ -145,51 +150,54 @@ class RecordingContents:
                 if message.arm_session:
                     self.armed_wall_ns.append(wall_ns)
             case Contacts():
-                self.contacts.add(message)
+                self.contacts.add_sample(message)
                 self.contact_summaries[message.tick] = summarize_contacts(message)
             case _:
                 self.messages_by_tick[key][message.tick] = message
 
     def _add_to_stream(self, key: str, message: Any) -> None:
-        """Append a message of a service, unless the stream does not need it after the one before."""
+        """Append a message of a service, unless it adds nothing to the last stored message of that key."""
         stream = self.streams[key]
-        if not stream or _is_stored(stream[-1], message):
+        if not stream or _should_store(stream[-1], message):
             stream.append(message)
 
-    def describe_unreached(self, ticks: int) -> list[str]:
-        """Describe the ticks that did not reach the recorder: nothing in the file itself shows them.
+    def describe_unrecorded_ticks(self, ticks: int) -> list[str]:
+        """Describe the ticks that did not reach the recorder, which the file itself cannot show.
 
         Args:
-            ticks: How many ticks the run had, as another source reports.
+            ticks: Number of ticks of the run, as another source reports it.
+
+        Returns:
+            One sentence, or none if no tick was lost or if the number of lost ticks is unknown.
         """
-        if self.ticks_lost is None:
+        if self.lost_tick_count is None:
             return []
-        lost = ticks - self.ticks - self.ticks_lost
+        lost = ticks - self.applied_tick_count - self.lost_tick_count
         if lost <= 0:
             return []
-        if self.last_tick_ns is None:
+        if self.last_applied_time_ns is None:
             last = "none came"
         else:
-            last = f"the last that came is of {self.last_tick_ns * 1e-9:.2f} s"
+            last = f"the last that came is of {self.last_applied_time_ns * 1e-9:.2f} s"
         return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
 
     def collect_outputs(self, robot: Description, time_s: Floats, unreached: Sequence[str] = ()) -> RunOutputs:
-        """Return what guidance, navigation, control and custom sensors published in the run.
+        """Collect what guidance, navigation, control and custom sensors published in the run.
 
         Args:
-            robot: The robot that has the custom sensors.
-            time_s: (n,) robot time of each row, for the columns of custom sensors and of the controller's telemetry.
+            robot: Description of the robot, with its custom sensors.
+            time_s: (n,) robot time of each row in s, for the columns of custom sensors and controller telemetry.
             unreached: Sentences about data that did not reach the recorder.
         """
         control = self.streams[keys.CONTROL_STATE].copy()
-        # At the end of a run the host stops its clock, and control reports PowerOff: this is not a part of the run.
+        # At the end of a run the host stops its clock, and control reports PowerOff, which is not part of the run.
         while control and control[-1].state == "PowerOff":
             control.pop()
 
-        # Messages of custom sensors are decoded only now, so that some may be refused only now.
-        refused_before = self.refused.copy()
+        # Messages of custom sensors are decoded only now, so further messages may turn out to be undecodable.
+        counts_before = self.undecodable_counts.copy()
         sensor_columns = self.make_custom_columns(robot, time_s)
-        newly_undecodable = describe_undecodable(self.refused - refused_before)
+        newly_undecodable = describe_undecodable_messages(self.undecodable_counts - counts_before)
 
         telemetry_columns = make_telemetry_columns(control, time_s)
         return RunOutputs(
@@ -204,9 +212,9 @@ class RecordingContents:
             unreached=list(unreached),
         )
 
-    def make_columns(self, robot: Description) -> dict[str, NDArray[Any]]:
-        """Return a row for each tick since the first arming, in columns that are named as in the black box."""
-        rows = self._rows(len(robot.joints))
+    def make_tick_columns(self, robot: Description) -> dict[str, NDArray[Any]]:
+        """Make columns with a row for each tick since the first arming, with the names of the black box."""
+        rows = self._build_tick_rows(len(robot.joints))
         row_count = len(rows)
         shape = (row_count, len(robot.joints))
         ticks = np.array([row.tick for row in rows], dtype=np.int64)
@@ -226,45 +234,50 @@ class RecordingContents:
             columns[name] = np.array([getattr(row.setpoints, name) for row in rows], dtype=float).reshape(shape)
         return columns
 
-    def _rows(self, joint_count: int) -> list["_Row"]:
-        """Return a row for each armed tick at which joint state, applied setpoints and clock are all known.
+    def _build_tick_rows(self, joint_count: int) -> list["_TickRow"]:
+        """Build a row for each armed tick at which joint state, applied setpoints and clock are all known.
 
         Pose and contacts may be published less often than joint states: a row has their newest samples.
 
         Args:
-            joint_count: Number of joints; a joint state of another size is left out.
+            joint_count: Number of joints. A joint state of another size is left out.
+
+        Returns:
+            The rows in order of their ticks. The pose is NaN before its first sample; contacts are 0 before theirs.
         """
         joint_states = self.messages_by_tick[keys.JOINTS]
-        applied = self.messages_by_tick[keys.APPLIED]
+        applied_commands = self.messages_by_tick[keys.APPLIED]
         clocks = self.messages_by_tick[keys.CLOCK]
         poses = self.messages_by_tick[keys.POSE]
         contacts = self.contact_summaries
-        rows: list[_Row] = []
+        rows: list[_TickRow] = []
         newest_pose = [np.nan] * 7
-        peak_n = 0.0
+        contact_peak_n = 0.0
         contact_count = 0
         for tick in sorted(joint_states.keys() | poses.keys() | contacts.keys()):
             if tick in poses:
                 newest_pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
             if tick in contacts:
-                peak_n, contact_count = contacts[tick]
-            is_complete = tick in joint_states and tick in applied and tick in clocks
+                contact_peak_n, contact_count = contacts[tick]
+            is_complete = tick in joint_states and tick in applied_commands and tick in clocks
             if not is_complete:
                 continue
             joint_state = joint_states[tick]
             is_armed = bool(clocks[tick].arm_session)
             if is_armed and joint_state.has_joint_count(joint_count):
-                rows.append(_Row(tick, joint_state, applied[tick], newest_pose, peak_n, contact_count))
+                rows.append(
+                    _TickRow(tick, joint_state, applied_commands[tick], newest_pose, contact_peak_n, contact_count)
+                )
         return rows
 
     def make_custom_columns(self, robot: Description, time_s: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Return columns of the custom sensors: at each row the newest sample, and its age.
+        """Make columns of the custom sensors, with the newest sample and its age in each row.
 
-        Samples that cannot be decoded are counted in `refused`.
+        Samples that cannot be decoded are counted.
 
         Args:
-            robot: The robot that has the sensors.
-            time_s: (n,) robot time of each row.
+            robot: Description of the robot, with its custom sensors.
+            time_s: (n,) robot time of each row, in s.
 
         Returns:
             Columns (n,) by name. A sensor `left` that measures `bend_rad` has the columns `bend_rad.left` and
@@ -273,46 +286,46 @@ class RecordingContents:
         columns: dict[str, NDArray[np.float64]] = {}
         for key, message_type in find_custom_messages(robot).items():
             sensor = key.rpartition("/")[2]
-            samples = self._custom_samples(key, message_type)
+            samples = self._decode_custom_samples(key, message_type)
             ticks = np.array(sorted(samples), dtype=np.int64)
             sampled_s = ticks * (robot.period_ns * 1e-9)
-            newest = _find_newest(sampled_s, time_s)
-            in_order = [samples[tick] for tick in ticks.tolist()]
+            newest_index = _find_newest_sample_indices(sampled_s, time_s)
+            samples_in_order = [samples[tick] for tick in ticks.tolist()]
 
-            # The dictionary keeps the order in which the samples name their numbers.
-            number_names: dict[str, Any] = {}
+            # A dictionary keeps the order in which the names first appear, which a set would not.
+            value_names: dict[str, Any] = {}
             for _, numbers in samples.values():
-                number_names |= dict.fromkeys(numbers)
-            for name in number_names or message_type.units:
+                value_names |= dict.fromkeys(numbers)
+            for name in value_names or message_type.units:
                 quantity, dot, part = name.partition(".")
-                values = [numbers.get(name, np.nan) for _, numbers in in_order]
-                columns[f"{quantity}.{sensor}{dot}{part}"] = _values_at(values, newest)
+                values = [numbers.get(name, np.nan) for _, numbers in samples_in_order]
+                columns[f"{quantity}.{sensor}{dot}{part}"] = _take_values(values, newest_index)
 
-            timestamps_s = [timestamp_ns * 1e-9 for timestamp_ns, _ in in_order]
-            columns[f"age_s.{sensor}"] = time_s - _values_at(timestamps_s, newest)
+            timestamps_s = [timestamp_ns * 1e-9 for timestamp_ns, _ in samples_in_order]
+            columns[f"age_s.{sensor}"] = time_s - _take_values(timestamps_s, newest_index)
         return columns
 
-    def _custom_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
-        """Return the samples of a custom sensor: tick -> timestamp in ns, and numbers by name."""
+    def _decode_custom_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
+        """Decode the samples of a custom sensor: timestamp in ns and values by name, for each tick."""
         decoder = Decoder(kind.message)
         samples: dict[int, tuple[int, dict[str, float]]] = {}
         for recorded in self.custom.get(key, ()):
             try:
                 sample = decoder.decode(recorded.payload, recorded.encoding)
             except WireError as error:
-                self.refused[f"{key}: {error}"[:200]] += 1
+                self.undecodable_counts[f"{key}: {error}"[:200]] += 1
                 continue
-            samples[sample.tick] = (sample.timestamp_ns, kind.numbers(sample))
+            samples[sample.tick] = (sample.timestamp_ns, kind.extract_numeric_values(sample))
         return samples
 
     def make_host_record(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
-        """Return the host's statistics of the run, as far as the recording shows them.
+        """Reconstruct the statistics of the host from the recording.
 
         Args:
-            columns: Columns of the run by name, with a row for each tick, as in the black box.
+            columns: Columns of the run by name, as of `make_tick_columns`.
 
         Raises:
-            ConfigError: The recording holds no status of the host.
+            ConfigError: The recording contains no status of the host.
         """
         status = self.status
         if status is None:
@@ -349,7 +362,7 @@ class RecordingContents:
 
 
 @dataclass(frozen=True)
-class _Row:
+class _TickRow:
     """One tick of a run. Pose and contacts are as of their newest sample."""
 
     tick: int
@@ -361,100 +374,102 @@ class _Row:
 
 
 def make_telemetry_columns(states: Sequence[ControlState], time_s: Floats) -> dict[str, Floats]:
-    """Return columns of the numbers that a controller defined: at each row the newest one, such as `gain.controller`.
-
-    NaN: the newest message does not have the number, or none came yet.
+    """Make columns of the values that a controller defined, with the newest value in each row.
 
     Args:
-        states: The controller's messages, in time order.
-        time_s: (n,) robot time of each row.
+        states: Messages of the controller, in time order.
+        time_s: (n,) robot time of each row, in s.
+
+    Returns:
+        Columns (n,) by name, such as `gain.controller`. A value is NaN if the newest message does not have it, or
+        before the first message.
     """
     sent_s = np.array([state.timestamp_ns * 1e-9 for state in states])
-    newest = _find_newest(sent_s, time_s)
+    newest_index = _find_newest_sample_indices(sent_s, time_s)
     names = dict.fromkeys(name for state in states for name in state.custom)
     return {
-        f"{name}.{CONTROLLER}": _values_at([state.custom.get(name, np.nan) for state in states], newest)
+        f"{name}.{CONTROLLER_SUFFIX}": _take_values([state.custom.get(name, np.nan) for state in states], newest_index)
         for name in names
     }
 
 
-def _find_newest(sampled_s: NDArray[np.floating[Any]], time_s: Floats) -> NDArray[np.int64]:
-    """Return the index of the newest sample at each time, (n,); -1 before the first one.
+def _find_newest_sample_indices(sampled_s: NDArray[np.floating[Any]], time_s: Floats) -> NDArray[np.int64]:
+    """Find the index of the newest sample at each time, (n,); -1 before the first sample.
 
     Args:
-        sampled_s: Times of the samples, in order.
-        time_s: (n,) times of the rows.
+        sampled_s: Times of the samples in s, in ascending order.
+        time_s: (n,) times of the rows, in s.
     """
-    return np.searchsorted(sampled_s, time_s + SAME_TIME_S, side="right") - 1
+    return np.searchsorted(sampled_s, time_s + TIME_TOLERANCE_S, side="right") - 1
 
 
-def _values_at(values: list[float], index: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the value of each index, (n,); NaN for a negative index."""
-    picked = np.full(len(index), np.nan)
+def _take_values(values: list[float], index: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Take the value at each index, (n,); NaN for a negative index."""
+    taken = np.full(len(index), np.nan)
     known = index >= 0
-    picked[known] = np.array(values, dtype=float)[index[known]]
-    return picked
+    taken[known] = np.array(values, dtype=float)[index[known]]
+    return taken
 
 
 def read_recording(
-    path: Path, selected_keys: Collection[str] = ALL, on_message: Callable[[RecordedMessage], None] | None = None
+    path: Path, selected_keys: Collection[str] = RUN_KEYS, on_message: Callable[[RecordedMessage], None] | None = None
 ) -> RecordingContents:
-    """Read the messages of a recording, and find out what is missing in it.
+    """Read the messages of a recording, and determine what is missing in it.
 
     Args:
-        path: The recording, an MCAP file.
-        selected_keys: The keys whose messages are decoded and returned.
-        on_message: Called with every message, at any key, so that a caller need not read the file a second time.
+        path: Path of the recording, an MCAP file.
+        selected_keys: Keys whose messages are decoded and returned.
+        on_message: Called with every message of any key, so that a caller does not have to read the file again.
 
     Returns:
         The messages, and what is missing in the file. Applied setpoints are counted even if their key is not selected.
 
     Raises:
-        ConfigError: The file is no recording.
+        ConfigError: The file is not a recording.
     """
     from snakesim_operator.recording.reader import RecordingReader  # needs the extra `record`
 
     contents = RecordingContents(path)
     reader = RecordingReader(path)
-    keys_to_read = None  # all
+    keys_to_read = None  # None reads all keys, for `on_message`
     if on_message is None:
         keys_to_read = {*selected_keys, keys.APPLIED}
     for recorded in reader.read_messages(keys_to_read):
         if recorded.key == keys.APPLIED:
-            contents.ticks += 1
-            contents.last_tick_ns = recorded.time_ns
+            contents.applied_tick_count += 1
+            contents.last_applied_time_ns = recorded.robot_time_ns
         if on_message is not None:
             on_message(recorded)
         if recorded.key in selected_keys or keys.find_row_key(recorded.key) in selected_keys:
-            contents.add(recorded)
+            contents.add_message(recorded)
 
-    contents.missing += describe_undecodable(contents.refused)
+    contents.missing += describe_undecodable_messages(contents.undecodable_counts)
     contents.missing += [f"recording: {sentence}" for sentence in reader.missing]
-    contents.finished = reader.finished
-    contents.ticks_lost = _count_lost_ticks(reader)
+    contents.is_finished = reader.is_complete
+    contents.lost_tick_count = _count_lost_ticks(reader)
     contents.replay_of = str(reader.metadata.get("replay_of", ""))[:500]
-    if reader.losses.misplaced:
+    if reader.losses.misplaced_count:
         for messages in contents.streams.values():
             messages.sort(key=lambda message: message.timestamp_ns or 0)
     return contents
 
 
 def _count_lost_ticks(reader: "RecordingReader") -> int | None:
-    """Return how many ticks the file itself reports as lost, or None if it cannot report that."""
+    """Return the number of ticks that the file itself reports as lost, or None if it cannot report that."""
     losses = reader.losses
-    chosen_keys = reader.metadata.get("keys")  # of a recording that was to have these alone
-    leaves_ticks_out = isinstance(chosen_keys, list) and keys.APPLIED not in chosen_keys
-    if not reader.finished or losses.damage_count or leaves_ticks_out:
+    recorded_keys = reader.metadata.get("keys")  # only if the recorder was restricted to some keys
+    excludes_ticks = isinstance(recorded_keys, list) and keys.APPLIED not in recorded_keys
+    if not reader.is_complete or losses.damage_count or excludes_ticks:
         return None
-    return losses.lost_by_key[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
+    return losses.lost_by_key[keys.APPLIED] + losses.dropped_count_by_key.get(keys.APPLIED, 0)
 
 
-def _is_stored(before: Any, message: Any) -> bool:
-    """Return whether a message is stored: worlds are thinned, and a path is stored once."""
+def _should_store(last_stored: Any, message: Any) -> bool:
+    """Return whether a message is stored: world models up to MAX_WORLDS_PER_S, and each path once."""
     match message:
         case World():
-            return message.timestamp_ns >= before.timestamp_ns + round(1e9 / MAX_WORLDS_PER_S)
+            return message.timestamp_ns >= last_stored.timestamp_ns + round(1e9 / MAX_WORLDS_PER_S)
         case Trajectory():
-            return message.path_id != before.path_id
+            return message.path_id != last_stored.path_id
         case _:
             return True

@@ -1,22 +1,22 @@
-"""How a run ended: `complete`, or a sentence."""
+"""Describes how a run ended: `complete`, or a sentence."""
 
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.run_log.host_record import HostRecord
 
 COMPLETE = "complete"
-AT_GOAL = "snakesim run, at the goal"  # the requester that finishes a run which lasts until its goal
-UNKNOWN = "unknown: "  # how a sentence begins that explains why the ending is not known
+GOAL_REQUESTER = "snakesim run, at the goal"  # requester in the request that finishes a run at its goal
+UNKNOWN_PREFIX = "unknown: "  # prefix of a sentence that explains why the ending is unknown
 
 
 def describe_early_end(host: HostRecord, config: RunConfig) -> str:
-    """Return how a run ended that was not complete, by the host's statistics; empty if it was complete."""
+    """Describe by the statistics of the host why a run was not complete. Returns an empty text if it was complete."""
     progress = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
     match host.ended:
         case "complete":
             return ""
         case "running":
             return f"the record ends {progress}, and may lack the last second"
-        case "finished" if config.mission.until_goal and host.ended_why.endswith(AT_GOAL):
+        case "finished" if config.mission.until_goal and host.ended_why.endswith(GOAL_REQUESTER):
             return ""
         case "stopped" | "finished":
             return f"the host was {host.ended} {host.ended_why} {progress}"
@@ -25,13 +25,16 @@ def describe_early_end(host: HostRecord, config: RunConfig) -> str:
 
 
 def describe_recorded_end(host: HostRecord, config: RunConfig, recorded_s: float, *, finished: bool) -> str:
-    """Return COMPLETE, or how a run ended, as far as a recording alone shows it.
+    """Describe how a run ended, as far as a recording alone shows it.
 
     Args:
-        host: The host's statistics, as the recording shows them.
-        config: The configuration of the run.
+        host: Statistics of the host, as the recording shows them.
+        config: Configuration of the run.
         recorded_s: Robot time from the first recorded tick to the end of the last, in s.
-        finished: Whether the recording has an end.
+        finished: Whether the recording was closed, and not cut off.
+
+    Returns:
+        COMPLETE, or a sentence.
     """
     for fault in host.faults:
         if fault.reach == "robot":
@@ -41,7 +44,7 @@ def describe_recorded_end(host: HostRecord, config: RunConfig, recorded_s: float
     if recorded_s > config.duration_s - half_tick_s:
         return COMPLETE
     if not finished:
-        return f"{UNKNOWN}the recording breaks off {progress}"
+        return f"{UNKNOWN_PREFIX}the recording breaks off {progress}"
     if host.lifecycle == "armed":
-        return f"{UNKNOWN}the recording was ended {progress}, with the robot armed"
+        return f"{UNKNOWN_PREFIX}the recording was ended {progress}, with the robot armed"
     return f"{host.lifecycle} ({host.reason}) {progress}"

@@ -1,4 +1,4 @@
-"""The log of a run as arrays: a row for each tick, and what guidance, navigation and control published."""
+"""Loads the record of a run as arrays: a row for each tick, and what guidance, navigation and control published."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.kinematics import find_nodes_w
-from snakesim_hal.model.placement import Placed
+from snakesim_hal.model.kinematics import compute_body_points_w
+from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
 from snakesim_hal.model.scene import make_route
@@ -20,25 +20,25 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
 from snakesim_operator.results.contact_log import ContactCollector, ContactLog
-from snakesim_operator.results.missing_data import describe_unwritten, replace_invalid_numbers
+from snakesim_operator.results.missing_data import describe_unwritten_data, replace_invalid_numbers
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_reader import MessageHandler, RunReader, open_run
 
-DAMAGED = (*UNDECODABLE, OSError, MemoryError)
+READ_ERRORS = (*UNDECODABLE, OSError, MemoryError)
 
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """The log of one run. Every array has one row a tick, since the first arming."""
+    """The record of one run. Every array has one row for each tick since the first arming."""
 
     # What was run.
-    folder: Path  # the run's folder, or the recording
+    path: Path  # the run's folder, or the recording
     config: RunConfig
     description: Description
     host: HostRecord
 
     # What the services published.
-    control: list[ControlState]  # in time order, a few a second and at every change
+    control_states: list[ControlState]  # in time order, a few a second and at every change
     worlds: list[World]  # in time order, a few a second
     trajectories: list[Trajectory]  # in time order, one for each path
 
@@ -56,18 +56,24 @@ class RunRecord:
     contact_count: Floats  # (n,) obstacles touched
 
     # More of the recording.
-    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # tick of a cycle of navigation -> its work
-    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # (n,) columns of custom sensors and telemetry
-    contact_log: ContactLog = field(default_factory=lambda: ContactCollector().make_log())  # of the recording
-    replay_of: str = ""  # the recording whose sensors its services read; empty: a run
+    searched_nodes_by_tick: dict[int, int] = field(default_factory=dict[int, int])  # by tick of a cycle of navigation
+    custom_columns: dict[str, Floats] = field(
+        default_factory=dict[str, Floats]
+    )  # (n,) columns of custom sensors and telemetry
+    contact_log: ContactLog = field(
+        default_factory=lambda: ContactCollector().make_log()
+    )  # contact forces in the recording
+    replay_of: str = ""  # recording whose sensors the services read; empty if the run is no replay
 
     # How much of the run is known.
     ending: str = COMPLETE  # COMPLETE, or a sentence on how the run ended
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
-    unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
+    recorder_losses: list[str] = field(
+        default_factory=list[str]
+    )  # those of them about data that never reached the recorder
 
     # Files.
-    config_path: Path | None = None  # None: there is no such file
+    config_path: Path | None = None  # None if there is no such file
     recording_path: Path | None = None
 
     @staticmethod
@@ -76,18 +82,18 @@ class RunRecord:
 
         Args:
             path: The folder of the run, or the recording.
-            host: The host's statistics, if known from elsewhere; None: read them from `path`.
+            host: Statistics of the host, if they are known already; None to read them from `path`.
             on_message: Called with every message of the recording while it is read.
 
         Raises:
-            ConfigError: The path is neither the folder of a run nor a recording, or the record is damaged.
+            ConfigError: The path is neither a folder of a run nor a recording, or the record is damaged.
         """
         reader = open_run(path, host, on_message)
         try:
             return RunRecord.read(reader)
         except ConfigError:
             raise
-        except DAMAGED as error:
+        except READ_ERRORS as error:
             reason = f"{type(error).__name__}: {error}"[:300]
             raise ConfigError(
                 f"{path}: the record of this run is damaged ({reason}); run it again", code="recording/not-readable"
@@ -98,7 +104,7 @@ class RunRecord:
         """Read the record of a run, replace invalid numbers by NaN, and collect what is missing.
 
         Args:
-            reader: Reads the folder of a run, or a recording.
+            reader: Reader of the folder of a run, or of a recording.
 
         Raises:
             ConfigError: A part of the record cannot be read.
@@ -106,7 +112,9 @@ class RunRecord:
         config = reader.read_config()
         description = reader.read_description()
         has_pose_sensor = config.robot.sensors.pose is not None
-        columns, invalid_sentences = replace_invalid_numbers(reader.read_ticks(), description, has_pose=has_pose_sensor)
+        columns, invalid_descriptions = replace_invalid_numbers(
+            reader.read_ticks(), description, has_pose=has_pose_sensor
+        )
         outputs = reader.read_outputs(columns["time_s"])
 
         # Ticks that the host counted but that are not in the columns are lost, even if no loss was reported.
@@ -117,66 +125,75 @@ class RunRecord:
 
         del columns["tick"]  # the other columns are fields of the record, by the same names
         return RunRecord(
-            folder=reader.path,
+            path=reader.path,
             config=config,
             description=description,
             host=host,
-            control=outputs.control,
+            control_states=outputs.control,
             worlds=outputs.worlds,
             trajectories=outputs.trajectories,
             **columns,
-            searched_nodes=outputs.searched_nodes,
-            custom=outputs.custom,
+            searched_nodes_by_tick=outputs.searched_nodes,
+            custom_columns=outputs.custom,
             contact_log=outputs.contact_log,
             replay_of=outputs.replay_of,
             ending=reader.describe_ending(),
-            missing=[*invalid_sentences, *describe_unwritten(host), *outputs.missing],
-            unreached=outputs.unreached,
+            missing=[*invalid_descriptions, *describe_unwritten_data(host), *outputs.missing],
+            recorder_losses=outputs.unreached,
             config_path=reader.config_path,
             recording_path=reader.recording_path,
         )
 
     @cached_property
     def route(self) -> Route | None:
-        """The route through the scene; None if it has none."""
+        """Route through the scene; None if the scene has no route."""
         return make_route(self.config.scene)
 
     @cached_property
-    def placed(self) -> list[Placed]:
-        """The obstacles, each at its place in the scene."""
+    def placed_obstacles(self) -> list[PlacedObstacle]:
+        """Obstacles of the scene with their positions."""
         return place_obstacles(self.config)
 
     @cached_property
-    def feels_contacts(self) -> bool:
-        """Whether the robot had contact sensors; its file may list some that its drives do not have."""
+    def has_contact_sensors(self) -> bool:
+        """Whether the robot had contact sensors. The robot file may list sensors that the drives do not have."""
         return any(sensor.key == keys.CONTACTS for sensor in self.description.sensors)
 
     @cached_property
     def ticks(self) -> NDArray[np.int64]:
-        """The tick of each row, (n,)."""
+        """Tick of each row, (n,)."""
         return np.rint(self.time_s * 1e9 / self.description.period_ns).astype(np.int64)
 
     @cached_property
-    def stretches(self) -> list[NDArray[np.int64]]:
-        """The row numbers between the record's gaps: within a stretch every tick follows the one before."""
+    def contiguous_rows(self) -> list[NDArray[np.int64]]:
+        """Row indices of each part of the record without a gap: within a part the ticks are consecutive."""
         rows = np.arange(len(self.ticks))
         if not len(rows):
             return []
-        after_a_gap = np.flatnonzero(np.diff(self.ticks) > 1) + 1
-        return np.split(rows, after_a_gap)
+        first_rows_after_gaps = np.flatnonzero(np.diff(self.ticks) > 1) + 1
+        return np.split(rows, first_rows_after_gaps)
 
-    def row_at(self, time_s: float) -> int:
-        """Return the row whose time is nearest."""
+    def find_nearest_row(self, time_s: float) -> int:
+        """Return the index of the row whose robot time, in s, is nearest."""
         return int(np.argmin(np.abs(self.time_s - time_s)))
 
     @cached_property
-    def posed(self) -> NDArray[np.bool_]:
-        """A mask of the rows in which the pose and all angles are known, (n,)."""
+    def has_pose(self) -> NDArray[np.bool_]:
+        """Mask of the rows in which the pose and all joint angles are known, (n,)."""
         signals = (self.position_w_m, self.orientation_wxyz, self.angle_rad)
         return np.logical_and.reduce([np.isfinite(signal).all(axis=1) for signal in signals])
 
-    def nodes_w(self, row: int) -> Floats | None:
-        """Return tail end, joints and head end in the world, (joints + 2, 3), or None if the pose is unknown."""
-        if len(self.time_s) == 0 or not self.posed[row]:
+    def find_body_points_w(self, row: int) -> Floats | None:
+        """Compute the positions of tail end, joints and head end at one tick.
+
+        Args:
+            row: Index of the tick in the record.
+
+        Returns:
+            (joints + 2, 3) positions in the world, in m, or None if the pose is unknown.
+        """
+        if len(self.time_s) == 0 or not self.has_pose[row]:
             return None
-        return find_nodes_w(self.description, self.position_w_m[row], self.orientation_wxyz[row], self.angle_rad[row])
+        return compute_body_points_w(
+            self.description, self.position_w_m[row], self.orientation_wxyz[row], self.angle_rad[row]
+        )

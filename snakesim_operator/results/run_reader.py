@@ -1,4 +1,4 @@
-"""One interface to the two stores of a run: the folder that `snakesim run` left, and a recording alone.
+"""Reads a run through one interface from either store: the folder that `snakesim run` left, or a recording alone.
 
 A robot's host writes the run log: its black box, which has a row for each tick, and its statistics. A recorder process
 writes the recording: all messages, those of guidance, navigation and control too. A run's folder has both. Where only
@@ -23,16 +23,16 @@ from snakesim_hal.run_log.black_box import Layout, compute_digest, read_black_bo
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Configuration, Description
-from snakesim_operator.recording.message import RECORDING, RecordedMessage
-from snakesim_operator.results.recording_contents import OUTPUTS, RecordingContents, RunOutputs, read_recording
+from snakesim_operator.recording.message import RECORDING_FILENAME, RecordedMessage
+from snakesim_operator.results.recording_contents import OUTPUT_KEYS, RecordingContents, RunOutputs, read_recording
 from snakesim_operator.results.run_ending import COMPLETE, describe_early_end, describe_recorded_end
 
-# Files in the folder of a run, beside those of the host.
-CONFIG = "config.json"
-SUMMARY = "summary.json"
-REPORT = "report.html"
+# Names of files in the folder of a run, besides those of the host.
+CONFIG_FILENAME = "config.json"
+SUMMARY_FILENAME = "summary.json"
+REPORT_FILENAME = "report.html"
 
-GIVE = "give the folder that `snakesim run` left, such as runs/demo, or a recording"
+PATH_HINT = "give the folder that `snakesim run` left, such as runs/demo, or a recording"
 UNRECORDED = "without a recording, what control, navigation and guidance reported is unknown"
 
 Columns = dict[str, NDArray[Any]]
@@ -40,15 +40,15 @@ MessageHandler = Callable[[RecordedMessage], None]
 
 
 class RunReader(Protocol):
-    """Reads one stored run. Callers need not know which store it is.
+    """Reads one stored run, from a folder or from a recording.
 
-    Every method may raise ConfigError for a damaged store, and OSError. A store is read once, also when a method is
-    called again.
+    Every method may raise ConfigError for a damaged store, and OSError. The store is read only once, even if a method
+    is called again.
     """
 
-    path: Path  # the folder, or the recording
-    config_path: Path | None  # the file with the configuration; None: there is no such file
-    recording_path: Path  # the recording; it may be missing in a folder
+    path: Path  # folder of the run, or the recording
+    config_path: Path | None  # file with the configuration; None if there is no such file
+    recording_path: Path  # the recording; a folder may have none
 
     def read_config(self) -> RunConfig:
         """Return the effective configuration of the run."""
@@ -63,7 +63,7 @@ class RunReader(Protocol):
         ...
 
     def read_ticks(self) -> Columns:
-        """Return the ticks since the first arming, one row each, in columns that are named as in the black box.
+        """Return the ticks since the first arming, one row each, in columns with the names of the black box.
 
         `tick`, `time_s` (robot time), `contact_peak_n` and `contact_count` are (n,). `angle_rad`, `velocity_rad_s`,
         `torque_nm`, `mode`, `target` and `torque_limit_nm` are (n, joints). `position_w_m` is (n, 3), and
@@ -85,38 +85,42 @@ class RunReader(Protocol):
 
 
 def open_run(path: Path, host: HostRecord | None = None, on_message: MessageHandler | None = None) -> RunReader:
-    """Return the reader of a run's folder, or of a recording.
+    """Open a stored run: return the reader for the folder of a run, or for a recording.
 
     Args:
-        path: The folder or the recording.
-        host: The host's statistics, if they are known from elsewhere; None: from the store.
+        path: Path of the run folder, or of the recording.
+        host: Statistics of the host, if they are known already; None to read them from the store.
         on_message: Called with every message of the recording while it is read.
 
     Raises:
-        ConfigError: The path is neither, or a file of the folder is missing.
+        ConfigError: The path is neither a run folder nor a recording, or a file of the folder is missing.
     """
     if path.is_file():
         return RecordingOnlyReader(path, host, on_message)
-    if not (path / BLACK_BOX).exists() and (path / RECORDING).is_file():
-        return RecordingOnlyReader(path / RECORDING, host, on_message)
+    if not (path / BLACK_BOX).exists() and (path / RECORDING_FILENAME).is_file():
+        return RecordingOnlyReader(path / RECORDING_FILENAME, host, on_message)
     if not path.exists():
-        raise ConfigError(f"{path}: no such folder; {GIVE}", code="recording/not-a-run")
-    needed = [CONFIG, BLACK_BOX, DESCRIPTION]
+        raise ConfigError(f"{path}: no such folder; {PATH_HINT}", code="recording/not-a-run")
+    required_files = [CONFIG_FILENAME, BLACK_BOX, DESCRIPTION]
     if host is None:
-        needed.append(HOST_RECORD)
-    for name in needed:
+        required_files.append(HOST_RECORD)
+    for name in required_files:
         if not (path / name).is_file():
             raise ConfigError(
-                f"{path} is not the folder of a run: {name} is missing; {GIVE}", code="recording/not-a-run"
+                f"{path} is not the folder of a run: {name} is missing; {PATH_HINT}", code="recording/not-a-run"
             )
     return RunFolderReader(path, host, on_message)
 
 
-def find_recording(path: Path) -> Path:
-    """Return the recording of a run's folder, or the file itself. Raises ConfigError if there is none."""
-    recording_path = path / RECORDING if path.is_dir() else path
+def find_recording_path(path: Path) -> Path:
+    """Return the path of the recording in a run folder, or the path itself if it is a recording.
+
+    Raises:
+        ConfigError: There is no recording.
+    """
+    recording_path = path / RECORDING_FILENAME if path.is_dir() else path
     if not recording_path.is_file():
-        raise ConfigError(f"{recording_path}: there is no such recording; {GIVE}", code="file/not-found")
+        raise ConfigError(f"{recording_path}: there is no such recording; {PATH_HINT}", code="file/not-found")
     return recording_path
 
 
@@ -125,8 +129,8 @@ class RunFolderReader(RunReader):
 
     def __init__(self, folder: Path, host: HostRecord | None, on_message: MessageHandler | None) -> None:
         self.path = folder
-        self.config_path = folder / CONFIG
-        self.recording_path = folder / RECORDING
+        self.config_path = folder / CONFIG_FILENAME
+        self.recording_path = folder / RECORDING_FILENAME
         self._known_host = host
         self._on_message = on_message
 
@@ -145,19 +149,19 @@ class RunFolderReader(RunReader):
     def read_outputs(self, time_s: Floats) -> RunOutputs:
         if not self.recording_path.is_file():
             return RunOutputs(missing=[UNRECORDED])
-        unreached = self._contents.describe_unreached(len(self._ticks["tick"]))
-        return self._contents.collect_outputs(self._description, time_s, unreached)
+        recorder_losses = self._contents.describe_unrecorded_ticks(len(self._ticks["tick"]))
+        return self._contents.collect_outputs(self._description, time_s, recorder_losses)
 
     def describe_ending(self) -> str:
         return describe_early_end(self._host, self._config) or COMPLETE
 
     @cached_property
     def _contents(self) -> RecordingContents:
-        return read_recording(self.recording_path, OUTPUTS, self._on_message)
+        return read_recording(self.recording_path, OUTPUT_KEYS, self._on_message)
 
     @cached_property
     def _config(self) -> RunConfig:
-        return read_config(self.path / CONFIG)
+        return read_config(self.path / CONFIG_FILENAME)
 
     @cached_property
     def _description(self) -> Description:
@@ -166,7 +170,7 @@ class RunFolderReader(RunReader):
     @cached_property
     def _ticks(self) -> Columns:
         layout, columns = read_black_box(self.path / BLACK_BOX)
-        if layout != Layout.for_robot(self._description):
+        if layout != Layout.make_for_robot(self._description):
             raise ConfigError(
                 f"{self.path / BLACK_BOX} is of another robot than {DESCRIPTION} beside it",
                 code="recording/not-comparable",
@@ -181,8 +185,8 @@ class RunFolderReader(RunReader):
         if host.ended != "running":
             return host
         # The host was killed: its last statistics are older than its last ticks.
-        ticks = len(self._ticks["tick"])
-        return msgspec.structs.replace(host, ticks=ticks, command_digest=compute_digest(self._ticks))
+        tick_count = len(self._ticks["tick"])
+        return msgspec.structs.replace(host, ticks=tick_count, command_digest=compute_digest(self._ticks))
 
 
 class RecordingOnlyReader(RunReader):
@@ -212,10 +216,10 @@ class RecordingOnlyReader(RunReader):
 
     def describe_ending(self) -> str:
         time_s = self._ticks["time_s"]
-        recorded_s = 0.0
+        recorded_duration_s = 0.0
         if len(time_s):
-            recorded_s = float(time_s[-1] - time_s[0]) + 1 / self._config.rate_hz
-        return describe_recorded_end(self._host, self._config, recorded_s, finished=self._contents.finished)
+            recorded_duration_s = float(time_s[-1] - time_s[0]) + 1 / self._config.rate_hz
+        return describe_recorded_end(self._host, self._config, recorded_duration_s, finished=self._contents.is_finished)
 
     @cached_property
     def _contents(self) -> RecordingContents:
@@ -226,9 +230,9 @@ class RecordingOnlyReader(RunReader):
         description = self._contents.description
         config = self._contents.config
         if description is None or config is None:
-            why = "; ".join(self._contents.missing) or "was it recorded beside a HAL host?"
+            reason = "; ".join(self._contents.missing) or "was it recorded beside a HAL host?"
             raise ConfigError(
-                f"{self.path}: holds no hal/description and hal/config; {why}", code="recording/missing-data"
+                f"{self.path}: holds no hal/description and hal/config; {reason}", code="recording/missing-data"
             )
         return description, config
 
@@ -249,7 +253,7 @@ class RecordingOnlyReader(RunReader):
 
     @cached_property
     def _ticks(self) -> Columns:
-        return self._contents.make_columns(self._description)
+        return self._contents.make_tick_columns(self._description)
 
     @cached_property
     def _host(self) -> HostRecord:

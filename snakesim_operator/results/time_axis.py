@@ -1,4 +1,4 @@
-"""The time axis of a run: seconds from its first tick; and what control reported on it."""
+"""Maps robot time and reports of control to the time axis of a run: seconds since its first tick."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,58 +7,58 @@ from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.results.run_log import RunRecord
 
 
+def get_time_origin_s(record: RunRecord) -> float:
+    """Return the robot time of the first tick in s, at which the time axis of the run begins."""
+    if len(record.time_s):
+        return float(record.time_s[0])
+    if record.control_states:
+        return record.control_states[0].timestamp_ns * 1e-9
+    return 0.0
+
+
+def get_run_end_s(record: RunRecord) -> float:
+    """Return the end of the last tick on the time axis, which is the duration of the run in s."""
+    if len(record.time_s):
+        return float(record.time_s[-1]) - get_time_origin_s(record) + record.config.period_ns * 1e-9
+    if record.control_states:
+        return record.control_states[-1].timestamp_ns * 1e-9 - get_time_origin_s(record)
+    return 0.0
+
+
 @dataclass(frozen=True)
 class Interval:
-    """Something that held for a while."""
+    """An interval of time with a label, such as a state."""
 
     start_s: float
     end_s: float
-    what: str
+    label: str
 
 
-def zero_s(record: RunRecord) -> float:
-    """Return the robot's time at the first tick, where every time axis begins."""
-    if len(record.time_s):
-        return float(record.time_s[0])
-    if record.control:
-        return record.control[0].timestamp_ns * 1e-9
-    return 0.0
+def get_report_time_s(record: RunRecord, state: ControlState) -> float:
+    """Return the time at which control reported a state, on the time axis, clipped to the run."""
+    return min(max(state.timestamp_ns * 1e-9 - get_time_origin_s(record), 0.0), get_run_end_s(record))
 
 
-def end_s(record: RunRecord) -> float:
-    """Return the end of the last tick, on the time axis."""
-    if len(record.time_s):
-        return float(record.time_s[-1]) - zero_s(record) + record.config.period_ns * 1e-9
-    if record.control:
-        return record.control[-1].timestamp_ns * 1e-9 - zero_s(record)
-    return 0.0
+def list_report_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
+    """Return start, end and state of each report of control on the time axis: a state holds until the next report."""
+    starts = [get_report_time_s(record, state) for state in record.control_states]
+    ends = [*starts, get_run_end_s(record)][1:]
+    return list(zip(starts, ends, record.control_states, strict=True))
 
 
-def reported_at_s(record: RunRecord, state: ControlState) -> float:
-    """Return the time at which a state was reported, on the time axis and within the run."""
-    return min(max(state.timestamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
-
-
-def reported_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
-    """Return (since, until, state) on the time axis: each state holds until the next is reported."""
-    starts = [reported_at_s(record, state) for state in record.control]
-    ends = [*starts, end_s(record)][1:]
-    return list(zip(starts, ends, record.control, strict=True))
-
-
-def merge_reports(record: RunRecord, values: Sequence[str | None]) -> list[Interval]:
-    """Merge adjacent equal values into intervals.
+def merge_equal_reports(record: RunRecord, values: Sequence[str | None]) -> list[Interval]:
+    """Merge adjacent reports of control with equal values into intervals.
 
     Args:
-        record: What was recorded of the run.
-        values: One value for each state that control reported; None: no interval.
+        record: The recorded run.
+        values: A label for each state that control reported; None if the report belongs to no interval.
     """
-    bands: list[Interval] = []
-    for (since, until, _), what in zip(reported_spans(record), values, strict=True):
-        if what is None or until <= since:
+    intervals: list[Interval] = []
+    for (start_s, end_s, _), label in zip(list_report_spans(record), values, strict=True):
+        if label is None or end_s <= start_s:
             continue
-        if bands and bands[-1].what == what and bands[-1].end_s >= since:
-            bands[-1] = Interval(bands[-1].start_s, until, what)
+        if intervals and intervals[-1].label == label and intervals[-1].end_s >= start_s:
+            intervals[-1] = Interval(intervals[-1].start_s, end_s, label)
         else:
-            bands.append(Interval(since, until, what))
-    return bands
+            intervals.append(Interval(start_s, end_s, label))
+    return intervals

@@ -7,6 +7,7 @@ are an error, and an answer is accepted once the robot's host publishes the new 
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.base.process import get_user_name
@@ -16,24 +17,31 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, make_arm_request
-from snakesim_operator.base.targets import CONNECT_S, RobotSelection, only_robot
+from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
-ANSWER_S = 5.0
-DESCRIPTION_S = 3.0
-RETRY_S = 0.5  # between two attempts to arm
-SHOWN_S = 1.5  # until the host's status must show what it answered
-DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
+ANSWER_TIMEOUT_S = 5.0
+DESCRIPTION_TIMEOUT_S = 3.0
+RETRY_PERIOD_S = 0.5  # between two attempts to arm
+STATUS_TIMEOUT_S = 1.5  # until the host's status must show what it answered
+DONE_TEXT_BY_ACTION = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
+
+
+class Verification(NamedTuple):
+    """Whether the answers to a request come from the robot's host."""
+
+    problem: str | None  # why the answers are not confirmed; None if they are
+    status: Status | None  # newest status of the robot's host; None if there is none
 
 
 class NotReadyError(RefusedError):
     """The robot cannot be armed now, for a reason that can pass without an operator: a service is still starting."""
 
 
-def arm(
+def arm_robot(
     robot: str,
     backend: str,
-    where: RobotSelection,
+    selection: RobotSelection,
     print_text: PrintLine = print_line,
     *,
     unchecked: bool = False,
@@ -44,7 +52,7 @@ def arm(
     Args:
         robot: Expected name of the robot.
         backend: Expected backend of the robot.
-        where: Selects the robot's network.
+        selection: Selects the robot's network.
         print_text: Prints a line for the operator.
         unchecked: Whether to arm the robot even if its joints were not checked.
         wait_s: Time in which to try again while no robot answers, or while it is not ready. Other refusals end the
@@ -59,37 +67,39 @@ def arm(
         NotConnectedError: No robot answers, at the end of the wait.
     """
     deadline_s = time.monotonic() + wait_s
-    reported = ""
+    last_reported_problem = ""
     while True:
         try:
-            return _arm_once(robot, backend, where, print_text, unchecked=unchecked)
+            return _arm_once(robot, backend, selection, print_text, unchecked=unchecked)
         except (NotReadyError, NotConnectedError) as error:
             if time.monotonic() >= deadline_s:
                 raise
-            if str(error) != reported:
-                reported = str(error)
-                print_text(f"waiting: {reported}")
-        time.sleep(RETRY_S)
+            if str(error) != last_reported_problem:
+                last_reported_problem = str(error)
+                print_text(f"waiting: {last_reported_problem}")
+        time.sleep(RETRY_PERIOD_S)
 
 
-def _arm_once(robot: str, backend: str, where: RobotSelection, print_text: PrintLine, *, unchecked: bool) -> int:
+def _arm_once(robot: str, backend: str, selection: RobotSelection, print_text: PrintLine, *, unchecked: bool) -> int:
     """Send one request to arm a robot, if its name and its backend are those that the user typed.
 
     Args:
         robot: Name of the robot, as the user typed it.
         backend: Name of the backend, as the user typed it.
-        where: Selects the robot.
-        print_text: Prints a line.
-        unchecked: Whether to arm although the joints were not checked.
+        selection: Selects the robot's network.
+        print_text: Prints a line for the operator.
+        unchecked: Whether to arm the robot even if its joints were not checked.
 
     Returns:
-        The exit code: 0 if the robot is armed.
+        0, the exit code of the command.
 
     Raises:
+        NotReadyError: The robot is not ready yet.
         RefusedError: The robot or the backend has another name, or the host refuses.
+        NotConnectedError: No robot answers.
     """
-    link = only_robot(where, f"robot arm {robot} {backend}")
-    with open_session(link, CONNECT_S) as session:
+    link = find_single_robot(selection, f"robot arm {robot} {backend}")
+    with open_session(link, CONNECT_TIMEOUT_S) as session:
         description = _read_description(session, link)
         mismatches: list[str] = []
         if description.robot != robot:
@@ -106,29 +116,43 @@ def _arm_once(robot: str, backend: str, where: RobotSelection, print_text: Print
         return request_from_host(session, keys.LIFECYCLE, request, "armed", link, print_text)
 
 
-def disarm(where: RobotSelection, print_text: PrintLine = print_line) -> int:
-    """Make the joints passive; later commands do not move them. Returns the exit code."""
-    request = LifecycleRequest(action="disarm", requester=get_user_name())
-    return _request_from_robot(only_robot(where, "robot disarm"), keys.LIFECYCLE, request, "disarmed", print_text)
-
-
-def reset(where: RobotSelection, print_text: PrintLine = print_line) -> int:
-    """Reset a fault or an emergency stop of a robot, which is disarmed afterwards.
-
-    If no robot runs, an emergency stop stored by the last run is removed.
+def disarm_robot(selection: RobotSelection, print_text: PrintLine = print_line) -> int:
+    """Disarm a robot: its joints become passive, and later commands do not move them.
 
     Args:
-        where: Selects the robot.
-        print_text: Prints a line.
+        selection: Selects the robot.
+        print_text: Prints a line for the operator.
 
     Returns:
-        The exit code.
+        0, the exit code of the command.
+    """
+    request = LifecycleRequest(action="disarm", requester=get_user_name())
+    return _request_from_robot(
+        find_single_robot(selection, "robot disarm"), keys.LIFECYCLE, request, "disarmed", print_text
+    )
+
+
+def reset_robot(selection: RobotSelection, print_text: PrintLine = print_line) -> int:
+    """Reset a fault or an emergency stop of a robot, which is disarmed afterwards.
+
+    If no robot runs, an emergency stop that the last run on this computer has stored is removed instead.
+
+    Args:
+        selection: Selects the robot.
+        print_text: Prints a line for the operator.
+
+    Returns:
+        0, the exit code of the command.
+
+    Raises:
+        NotConnectedError: No robot answers, and no emergency stop is stored.
+        RefusedError: The host refuses, or its status does not confirm the reset.
     """
     try:
-        link = only_robot(where, "robot reset")
+        link = find_single_robot(selection, "robot reset")
     except NotConnectedError:
-        latched_stops = [path for path in find_latched_stops() if where.namespace in (None, path.parent.name)]
-        if not latched_stops or where.endpoint is not None:
+        latched_stops = [path for path in find_latched_stops() if selection.namespace in (None, path.parent.name)]
+        if not latched_stops or selection.endpoint is not None:
             raise
         for path in latched_stops:
             print_text(
@@ -141,31 +165,41 @@ def reset(where: RobotSelection, print_text: PrintLine = print_line) -> int:
     )
 
 
-def simulator(order: SimulatorOrder, where: RobotSelection, print_text: PrintLine = print_line) -> int:
-    """Pause, step, speed up, slow down or reset a simulator. A robot that moves real hardware refuses.
+def control_simulator(order: SimulatorOrder, selection: RobotSelection, print_text: PrintLine = print_line) -> int:
+    """Pause, resume, step or reset a simulator, or change its speed. A robot that moves real hardware refuses.
 
-    Returns the exit code.
+    Args:
+        order: Action for the simulator, with its value.
+        selection: Selects the robot.
+        print_text: Prints a line for the operator.
+
+    Returns:
+        0, the exit code of the command.
     """
     request = SimulatorRequest(
         action=order.action, requester=order.requester or get_user_name(), ticks=order.ticks, speed=order.speed
     )
     return _request_from_robot(
-        only_robot(where, f"sim {order}"), keys.SIMULATOR, request, DONE[order.action], print_text
+        find_single_robot(selection, f"sim {order}"),
+        keys.SIMULATOR,
+        request,
+        DONE_TEXT_BY_ACTION[order.action],
+        print_text,
     )
 
 
 def _request_from_robot(
-    link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done: str, print_text: PrintLine
+    link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done_text: str, print_text: PrintLine
 ) -> int:
-    with open_session(link, CONNECT_S) as session:
-        return request_from_host(session, key, request, done, link, print_text)
+    with open_session(link, CONNECT_TIMEOUT_S) as session:
+        return request_from_host(session, key, request, done_text, link, print_text)
 
 
 def request_from_host(
     session: Session,
     key: str,
     request: LifecycleRequest | SimulatorRequest,
-    done: str,
+    done_text: str,
     link: Link,
     print_text: PrintLine,
 ) -> int:
@@ -175,7 +209,7 @@ def request_from_host(
         session: Session on the robot's network.
         key: Key at which the host answers.
         request: The request.
-        done: What is done if the host accepts, in words, such as "armed".
+        done_text: What is done if the host accepts, in words, such as "armed".
         link: How the session reaches the robot, for messages.
         print_text: Prints a line for the operator.
 
@@ -186,83 +220,110 @@ def request_from_host(
         NotConnectedError: No host answers.
         RefusedError: The host refuses, or the status does not confirm the answer.
     """
-    statuses = session.latched_reader(keys.STATUS, Status)
-    answers = [answer for _, answer in session.request_all(key, request, ANSWER_S)]
-    doubt, status = judge(answers, statuses)
+    status_reader = session.declare_latched_reader(keys.STATUS, Status)
+    answers = [answer for _, answer in session.send_request_to_all(key, request, ANSWER_TIMEOUT_S)]
+    verification = verify_answers(answers, status_reader)
     name = link.namespace
     if not answers:
         raise NotConnectedError(
             f"{name}: NO ANSWER on {link.endpoint}: its host hangs, or your role may not do this; if the "
             "robot moves, `snakesim estop`"
         )
-    if doubt is not None:
+    if verification.problem is not None:
+        status = verification.status
         status_text = "unknown" if status is None else f"{status.lifecycle} - {status.reason}"
         raise RefusedError(
-            f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {status_text}", code="robot/not-confirmed"
+            f"{name}: NOT CONFIRMED that it is {done_text}: {verification.problem}. Its status: {status_text}",
+            code="robot/not-confirmed",
         )
     answer = answers[0]
     if not answer.ok:
-        refused = NotReadyError if answer.refusal == "not_ready" else RefusedError
-        raise refused(f"{name}: not {done}: {answer.reason}")
-    print_text(f"{name}: {done}: {answer.reason}")
+        error_type = NotReadyError if answer.refusal == "not_ready" else RefusedError
+        raise error_type(f"{name}: not {done_text}: {answer.reason}")
+    print_text(f"{name}: {done_text}: {answer.reason}")
     return 0
 
 
 def request_while_driving(
-    session: Session, request: LifecycleRequest, done: str, link: Link, turn: Callable[[], object]
+    session: Session, request: LifecycleRequest, done_text: str, link: Link, send_commands: Callable[[], object]
 ) -> None:
-    """Query the host, as `request_from_host`, and call `turn` meanwhile: an armed robot needs commands all the time."""
+    """Send a request to the robot's host, and keep commanding the robot until the host has answered.
+
+    An armed robot that gets no commands loses its lease, so the request is sent by another thread meanwhile.
+
+    Args:
+        session: Session on the robot's network.
+        request: The request to the host.
+        done_text: What is done if the host accepts, in words, such as "armed".
+        link: How the session reaches the robot, for messages.
+        send_commands: Sends commands for a short time, and returns; called until the host has answered.
+
+    Raises:
+        NotConnectedError: No host answers.
+        RefusedError: The host refuses, or the status does not confirm the answer.
+    """
     with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(request_from_host, session, keys.LIFECYCLE, request, done, link, lambda _line: None)
+        answer = pool.submit(request_from_host, session, keys.LIFECYCLE, request, done_text, link, lambda _line: None)
         while not answer.done():
-            turn()
+            send_commands()
         answer.result()
 
 
-def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:
+def verify_answers(answers: Sequence[Answer], status_reader: Reader[Status]) -> Verification:
     """Check whether the robot's status confirms the answer of its host.
 
-    An unauthorized process may answer in the host's name, or the host may answer and then hang.
+    An unauthorized process may answer in the host's name, or the host may answer and then hang. This waits up to
+    STATUS_TIMEOUT_S for a status that confirms the answer.
 
     Args:
-        answers: All answers to one request.
-        statuses: Reads the status that the robot's host publishes.
+        answers: All answers to one request. Without an answer, there is nothing to confirm: that is a problem, too.
+        status_reader: Reads the status that the robot's host publishes.
 
     Returns:
-        Why the answers are not confirmed, or None if one host answered and its status confirms it; and the newest
+        The problem, which is None if exactly one host answered and its status confirms the answer, and the newest
         status.
     """
     if len(answers) > 1:
-        newest_status = _wait_for_status(statuses, None)
-        return f"{len(answers)} answered in its name; at least one is an impostor", newest_status
+        status = _wait_for_status(status_reader, None)
+        return Verification(f"{len(answers)} answered in its name; at least one is an impostor", status)
     answered_lifecycle = answers[0].lifecycle if answers else None
-    status = _wait_for_status(statuses, answered_lifecycle)
-    hosts = {answer.host for answer in answers}
+    status = _wait_for_status(status_reader, answered_lifecycle)
+    host_ids = {answer.host for answer in answers}
     if status is not None:
-        hosts.add(status.host)
-    if len(hosts) > 1:
-        return "the answer is not from the host that publishes its status; one of them is an impostor", status
+        host_ids.add(status.host)
+    if len(host_ids) > 1:
+        problem = "the answer is not from the host that publishes its status; one of them is an impostor"
+        return Verification(problem, status)
     if status is None or status.lifecycle != answered_lifecycle:
-        return "its status does not show it; the host may hang, and the answer be from an impostor", status
-    return None, status
+        problem = "its status does not show it; the host may hang, and the answer be from an impostor"
+        return Verification(problem, status)
+    return Verification(None, status)
 
 
-def _wait_for_status(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
-    """Return the newest status, as soon as it shows a lifecycle state, or after SHOWN_S. None: any state counts."""
-    shown: Status | None = None
-    deadline = time.monotonic() + SHOWN_S
-    while time.monotonic() < deadline:
-        new_statuses = statuses.drain()
+def _wait_for_status(status_reader: Reader[Status], expected_lifecycle: str | None) -> Status | None:
+    """Wait up to STATUS_TIMEOUT_S for a status with the expected lifecycle state.
+
+    Args:
+        status_reader: Reads the status that the robot's host publishes.
+        expected_lifecycle: The expected state. If None, any status ends the wait.
+
+    Returns:
+        The newest status, which may have another state; None if there was no status.
+    """
+    newest_status: Status | None = None
+    deadline_s = time.monotonic() + STATUS_TIMEOUT_S
+    while time.monotonic() < deadline_s:
+        new_statuses = status_reader.drain()
         if new_statuses:
-            shown = new_statuses[-1]
-        if shown is not None and lifecycle in (None, shown.lifecycle):
+            newest_status = new_statuses[-1]
+        if newest_status is not None and expected_lifecycle in (None, newest_status.lifecycle):
             break
         time.sleep(0.01)
-    return shown
+    return newest_status
 
 
 def _read_description(session: Session, link: Link) -> Description:
-    """Read the description that the host of a robot publishes, and check that there is only one host.
+    """Wait for the description that the host of a robot publishes, and check that there is only one host.
 
     Args:
         session: Session on the robot's network.
@@ -272,10 +333,10 @@ def _read_description(session: Session, link: Link) -> Description:
         NotConnectedError: No host publishes a description.
         RefusedError: Several hosts publish one.
     """
-    reader = session.latched_reader(keys.DESCRIPTION, Description)
-    deadline = time.monotonic() + DESCRIPTION_S
+    reader = session.declare_latched_reader(keys.DESCRIPTION, Description)
+    deadline_s = time.monotonic() + DESCRIPTION_TIMEOUT_S
     descriptions: list[Description] = []
-    while not descriptions and time.monotonic() < deadline:
+    while not descriptions and time.monotonic() < deadline_s:
         time.sleep(0.05)
         descriptions = reader.drain()
     if not descriptions:
@@ -284,9 +345,9 @@ def _read_description(session: Session, link: Link) -> Description:
             code="network/no-robot",
         )
     if len({description.host for description in descriptions}) > 1:
-        count = len(descriptions)
+        host_count = len(descriptions)
         raise RefusedError(
-            f"{link.namespace}: {count} hosts describe it; at least one is an impostor. Not armed",
+            f"{link.namespace}: {host_count} hosts describe it; at least one is an impostor. Not armed",
             code="robot/several-hosts",
         )
     return descriptions[-1]

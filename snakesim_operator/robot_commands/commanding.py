@@ -5,12 +5,12 @@ import contextlib
 import os
 from pathlib import Path
 
-from snakesim_hal.programs.arguments import add_duration, add_json, add_network, add_unchecked
+from snakesim_hal.programs.arguments import add_duration, add_json, add_network_arguments, add_unchecked
 from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.robot_commands.simulator_commands import SIMULATOR_COMMANDS
 
-URGENT = -10  # niceness of an emergency stop
+ESTOP_NICENESS = -10  # niceness of an emergency stop
 
 
 def _add_arm(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="how long to try again while no robot answers, or while it is not ready (default: 0)",
     )
-    add_network(parser)
+    add_network_arguments(parser)
 
 
 def _add_teleop(parser: argparse.ArgumentParser) -> None:
@@ -39,23 +39,23 @@ def _add_teleop(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-speed", type=float, default=0.3, metavar="M/S", help="speed at full deflection (default: 0.3)"
     )
-    add_network(parser)
+    add_network_arguments(parser)
 
 
 def _add_param_list(parser: argparse.ArgumentParser) -> None:
-    add_network(parser)
+    add_network_arguments(parser)
     add_json(parser)
 
 
 def _add_param_get(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", help="such as control.speed_kp_s")
-    add_network(parser)
+    add_network_arguments(parser)
     add_json(parser)
 
 
 def _add_param_set(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.speed_kp_s=0.3")
-    add_network(parser)
+    add_network_arguments(parser)
 
 
 def _add_fault_list(parser: argparse.ArgumentParser) -> None:
@@ -68,13 +68,13 @@ def _add_fault_inject(parser: argparse.ArgumentParser) -> None:
     add_duration(parser, "seconds of robot time until it ends (default: until --end)")
     parser.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
     parser.add_argument("--end", action="store_true", help="end it")
-    add_network(parser)
+    add_network_arguments(parser)
 
 
-def _arm(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.command import arm
+def _arm_robot(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.command import arm_robot
 
-    return arm(
+    return arm_robot(
         arguments.robot,
         arguments.backend,
         select_robots(arguments),
@@ -83,34 +83,34 @@ def _arm(arguments: argparse.Namespace) -> int:
     )
 
 
-def _disarm(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.command import disarm
+def _disarm_robot(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.command import disarm_robot
 
-    return disarm(select_robots(arguments))
-
-
-def _reset(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.command import reset
-
-    return reset(select_robots(arguments))
+    return disarm_robot(select_robots(arguments))
 
 
-def _estop(arguments: argparse.Namespace) -> int:
+def _reset_robot(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.command import reset_robot
+
+    return reset_robot(select_robots(arguments))
+
+
+def _stop_robots(arguments: argparse.Namespace) -> int:
     before = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, min(before, URGENT))
-    from snakesim_operator.robot_commands.stop import estop
+        os.setpriority(os.PRIO_PROCESS, 0, min(before, ESTOP_NICENESS))
+    from snakesim_operator.robot_commands.stop import stop_robots
 
     try:
-        return estop(select_robots(arguments))
+        return stop_robots(select_robots(arguments))
     finally:
         os.setpriority(os.PRIO_PROCESS, 0, before)  # a program may call the command, and go on
 
 
-def _teleop(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.teleop.command import teleop
+def _teleoperate_robot(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.teleop.command import teleoperate_robot
 
-    return teleop(select_robots(arguments), arguments.max_speed, arguments.joystick)
+    return teleoperate_robot(select_robots(arguments), arguments.max_speed, arguments.joystick)
 
 
 def _list_faults(arguments: argparse.Namespace) -> int:
@@ -126,19 +126,19 @@ def _inject_fault(arguments: argparse.Namespace) -> int:
     return inject_fault(order, select_robots(arguments))
 
 
-def _param_list(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.parameters import list_parameters
+def _print_parameters(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.parameters import print_parameters
 
-    return list_parameters(select_robots(arguments), as_json=arguments.json)
-
-
-def _param_get(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robot_commands.parameters import get_parameter
-
-    return get_parameter(arguments.name, select_robots(arguments), as_json=arguments.json)
+    return print_parameters(select_robots(arguments), as_json=arguments.json)
 
 
-def _param_set(arguments: argparse.Namespace) -> int:
+def _print_parameter(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robot_commands.parameters import print_parameter
+
+    return print_parameter(arguments.name, select_robots(arguments), as_json=arguments.json)
+
+
+def _set_parameters(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.parameters import set_parameters
 
     return set_parameters(arguments.values, select_robots(arguments))
@@ -150,15 +150,15 @@ COMMANDS: Commands = (
         heading="daily work",
         help="Drive a robot by keys or with a joystick. Letting go stops it.",
         add=_add_teleop,
-        run=_teleop,
+        run=_teleoperate_robot,
         examples=("teleop", "teleop --joystick --max-speed 0.2"),
     ),
     Command(
         name="estop",
         heading="daily work",
         help="Stop a robot now, or all on the network without --namespace.",
-        add=add_network,
-        run=_estop,
+        add=add_network_arguments,
+        run=_stop_robots,
         details="The stop stays latched, also over a restart of the host, until `snakesim robot reset`.",
         examples=("estop", "estop --namespace planar13"),
     ),
@@ -171,7 +171,7 @@ COMMANDS: Commands = (
         name="robot arm",
         help="Allow a robot to move. Names robot and backend, to avoid mix-ups.",
         add=_add_arm,
-        run=_arm,
+        run=_arm_robot,
         details=(
             "`--wait` is for scripts. A refusal that does not pass by itself, such as a fault or other settings, ends "
             "the wait at once. Exit code: 0 armed, 1 refused or not ready in time, 2 wrong input."
@@ -181,15 +181,15 @@ COMMANDS: Commands = (
     Command(
         name="robot disarm",
         help="Make a robot's joints passive.",
-        add=add_network,
-        run=_disarm,
+        add=add_network_arguments,
+        run=_disarm_robot,
         examples=("robot disarm", "robot disarm --namespace planar13"),
     ),
     Command(
         name="robot reset",
         help="Reset a fault or an emergency stop. The robot is disarmed then.",
-        add=add_network,
-        run=_reset,
+        add=add_network_arguments,
+        run=_reset_robot,
         examples=("robot reset", "robot reset --namespace planar13"),
     ),
     Noun(name="param", heading="robot", help="List, get and set parameters of the running controller."),
@@ -197,21 +197,21 @@ COMMANDS: Commands = (
         name="param list",
         help="List all parameters of the controller: value, unit, range and description.",
         add=_add_param_list,
-        run=_param_list,
+        run=_print_parameters,
         examples=("param list", "param list --namespace planar13 --json"),
     ),
     Command(
         name="param get",
         help="Print the value of one parameter.",
         add=_add_param_get,
-        run=_param_get,
+        run=_print_parameter,
         examples=("param get control.speed_kp_s", "param get control.speed_kp_s --json"),
     ),
     Command(
         name="param set",
         help="Change parameters, all or none. The controller continues with them, and they are recorded.",
         add=_add_param_set,
-        run=_param_set,
+        run=_set_parameters,
         examples=("param set control.speed_kp_s=0.3", "param set control.speed_kp_s=0.3 --namespace planar13"),
     ),
     Noun(name="fault", heading="robot", help="Inject faults into a run that allows it."),

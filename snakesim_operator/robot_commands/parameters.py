@@ -23,23 +23,23 @@ from snakesim_hal.base.errors import (
 )
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.model.scenario import parse_set
+from snakesim_hal.model.scenario import parse_set_option
 from snakesim_hal.network.session import Session, open_session
 from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, ControlState, ParametersRequest
 from snakesim_operator.base.robot_selection import RobotSelection
-from snakesim_operator.base.targets import CONNECT_S, only_robot
-from snakesim_operator.robot_commands.command import ANSWER_S, SHOWN_S
+from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, find_single_robot
+from snakesim_operator.robot_commands.command import ANSWER_TIMEOUT_S, STATUS_TIMEOUT_S
 
 PREFIX = "control."
 MAX_PARAMETERS = 100
 MAX_NAME_CHARACTERS = 40
 MAX_DESCRIPTION_CHARACTERS = 200
-PUBLISHED_S = 3.0  # a controller publishes its parameters within this time
-GONE_S = 1.0  # no parameters for so long after a change mean that the controller has ended
-GOES_ON_S = 0.3  # real time until the next report of a controller that continues; robot time may be paused
-LOOK_S = 0.01
+PUBLICATION_TIMEOUT_S = 3.0  # a controller publishes its parameters within this time
+MAX_SILENCE_S = 1.0  # no parameters for so long after a change mean that the controller has ended
+REPORT_TIMEOUT_S = 0.3  # real time until the next report of a controller that continues; robot time may be paused
+POLL_PERIOD_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Parameter:
     excludes_minimum: bool = False  # True: `minimum` itself is not allowed
 
     @property
-    def range(self) -> str:
+    def range_text(self) -> str:
         """The values that are allowed, in words."""
         if self.choices:
             return " or ".join(self.choices)
@@ -83,8 +83,15 @@ def format_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def read_parameters(in_force: ControlParameters) -> list[Parameter]:
-    """Return the parameters in force; none if their schema cannot be read."""
+def parse_parameters(in_force: ControlParameters) -> list[Parameter]:
+    """Parse the published parameters of a controller.
+
+    Args:
+        in_force: The message with values and JSON Schema of the parameters in force.
+
+    Returns:
+        At most MAX_PARAMETERS parameters; empty if values or schema cannot be read.
+    """
     try:
         schema = json.loads(in_force.schema)
         values = msgspec.json.decode(in_force.parameters, type=dict[str, Any])
@@ -93,7 +100,7 @@ def read_parameters(in_force: ControlParameters) -> list[Parameter]:
         for name, value in values.items():
             description = _resolve_reference(schema, properties.get(name, {}))
             if len(parameters) < MAX_PARAMETERS:
-                parameters.append(_read_parameter(name, description, value))
+                parameters.append(_parse_parameter(name, description, value))
         return parameters
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, msgspec.DecodeError):
         return []
@@ -107,8 +114,14 @@ def _resolve_reference(schema: dict[str, Any], part: dict[str, Any]) -> dict[str
     return schema["$defs"][reference.rpartition("/")[2]]
 
 
-def _read_parameter(name: str, schema: dict[str, Any], value: Any) -> Parameter:
-    """Return a parameter, with texts shortened, because they come from the network."""
+def _parse_parameter(name: str, schema: dict[str, Any], value: Any) -> Parameter:
+    """Return one parameter with its unit and range. Texts are shortened, because they come from the network.
+
+    Args:
+        name: Name of the parameter.
+        schema: JSON Schema of the parameter.
+        value: Value in force.
+    """
     choices = schema.get("enum")
     return Parameter(
         name[:MAX_NAME_CHARACTERS],
@@ -116,14 +129,14 @@ def _read_parameter(name: str, schema: dict[str, Any], value: Any) -> Parameter:
         unit=str(schema.get("unit", ""))[:MAX_NAME_CHARACTERS],
         description=str(schema.get("description", ""))[:MAX_DESCRIPTION_CHARACTERS],
         choices=tuple(str(choice) for choice in choices) if isinstance(choices, list) else (),
-        minimum=_find_number(schema, "minimum", "exclusiveMinimum"),
-        maximum=_find_number(schema, "maximum", "exclusiveMaximum"),
+        minimum=_find_finite_number(schema, "minimum", "exclusiveMinimum"),
+        maximum=_find_finite_number(schema, "maximum", "exclusiveMaximum"),
         excludes_minimum="exclusiveMinimum" in schema,
     )
 
 
-def _find_number(schema: dict[str, Any], *names: str) -> float | None:
-    """Return the first of these entries that is a finite number; None without one."""
+def _find_finite_number(schema: dict[str, Any], *names: str) -> float | None:
+    """Return the first of the named entries of a schema that is a finite number; None if none is."""
     for name in names:
         entry = schema.get(name)
         if isinstance(entry, int | float) and math.isfinite(float(entry)):
@@ -131,11 +144,11 @@ def _find_number(schema: dict[str, Any], *names: str) -> float | None:
     return None
 
 
-def find_changed_parameters(before: ControlParameters, now: ControlParameters) -> list[tuple[Parameter, Parameter]]:
+def find_changed_parameters(before: ControlParameters, after: ControlParameters) -> list[tuple[Parameter, Parameter]]:
     """Return the parameters whose values differ, each as it was before and as it is now."""
-    old_parameters = {parameter.name: parameter for parameter in read_parameters(before)}
+    old_parameters = {parameter.name: parameter for parameter in parse_parameters(before)}
     pairs: list[tuple[Parameter, Parameter]] = []
-    for new in read_parameters(now):
+    for new in parse_parameters(after):
         old = old_parameters.get(new.name)
         if old is not None and old.value != new.value:
             pairs.append((old, new))
@@ -144,11 +157,11 @@ def find_changed_parameters(before: ControlParameters, now: ControlParameters) -
 
 def read_parameters_in_force(session: Session) -> ControlParameters:
     """Return the parameters of the running controller. Raises NotConnectedError when no controller publishes any."""
-    in_force = session.latest(keys.PARAMETERS_IN_FORCE, ControlParameters, PUBLISHED_S)
+    in_force = session.wait_for_latched(keys.PARAMETERS_IN_FORCE, ControlParameters, PUBLICATION_TIMEOUT_S)
     if in_force is None:
         raise NotConnectedError(
-            f"no controller publishes its parameters within {PUBLISHED_S:g} s: control does not run here, or is "
-            "a client of another kind"
+            f"no controller publishes its parameters within {PUBLICATION_TIMEOUT_S:g} s: control does not run here, "
+            "or is a client of another kind"
         )
     return in_force
 
@@ -159,70 +172,78 @@ def change_parameters(
     """Change parameters of the running controller, all of them or none.
 
     Args:
-        session: A session on the robot's network.
-        changes: Values by name, such as `control.speed_kp_s`.
-        requester: The name of the requester.
+        session: Session on the robot's network.
+        changes: New values by name, such as `control.speed_kp_s`.
+        requester: Name of the user who requests the change.
 
     Returns:
         The parameters in force before and after the change.
 
     Raises:
-        ConfigError: There is no such parameter.
-        RefusedError: Control refuses a value, with its reason; or does not report the new values.
+        ConfigError: There is no parameter with one of the names.
+        RefusedError: Control refuses a value, or does not publish the new values in time.
         ControllerError: The controller cannot continue with the new values, so control has ended.
         NotConnectedError: No controller publishes its parameters.
     """
     before = read_parameters_in_force(session)
     values = msgspec.json.decode(before.parameters, type=dict[str, Any])
     for name, value in changes.items():
-        values[known_name(name, before)] = value
+        values[find_field_name(name, before)] = value
     parameters = msgspec.json.encode(values).decode()
     request = ParametersRequest(requester=requester, controller=before.controller, parameters=parameters)
-    states = session.reader(keys.CONTROL_STATE, ControlState)
+    state_reader = session.declare_reader(keys.CONTROL_STATE, ControlState)
     try:
-        answer = session.request(keys.PARAMETERS, request, ANSWER_S)
-        if not answer.ok:
-            raise RefusedError(answer.reason)
-        now = _wait_for_change(session, before)
-        _check_controller_continues(states, now, changes)
+        response = session.send_request(keys.PARAMETERS, request, ANSWER_TIMEOUT_S)
+        if not response.ok:
+            raise RefusedError(response.reason)
+        after = _wait_for_change(session, before)
+        _wait_until_controller_continues(state_reader, after, changes)
     finally:
-        session.stop_reading(states)
-    if now is None:
+        session.close_reader(state_reader)
+    if after is None:
         raise RefusedError(
-            f"NOT CONFIRMED: {answer.reason}; but no controller publishes them", code="robot/not-confirmed"
+            f"NOT CONFIRMED: {response.reason}; but no controller publishes them", code="robot/not-confirmed"
         )
-    return before, now
+    return before, after
 
 
 def _wait_for_change(session: Session, before: ControlParameters) -> ControlParameters | None:
-    """Return the parameters in force after a change; None when none are published in time."""
-    deadline = time.monotonic() + SHOWN_S
-    while time.monotonic() < deadline:
-        now = session.latest(keys.PARAMETERS_IN_FORCE, ControlParameters, GONE_S)
-        if now is None or now.changes > before.changes:
-            return now
+    """Wait for the parameters in force after a change.
+
+    Args:
+        session: Session on the robot's network.
+        before: The parameters in force before the change.
+
+    Returns:
+        The changed parameters; None if they are not published within STATUS_TIMEOUT_S.
+    """
+    deadline_s = time.monotonic() + STATUS_TIMEOUT_S
+    while time.monotonic() < deadline_s:
+        in_force = session.wait_for_latched(keys.PARAMETERS_IN_FORCE, ControlParameters, MAX_SILENCE_S)
+        if in_force is None or in_force.changes > before.changes:
+            return in_force
     return None
 
 
-def _check_controller_continues(
-    states: Reader[ControlState], now: ControlParameters | None, changes: Mapping[str, Any]
+def _wait_until_controller_continues(
+    state_reader: Reader[ControlState], after: ControlParameters | None, changes: Mapping[str, Any]
 ) -> None:
-    """Wait until the controller has run with changed parameters, or until GOES_ON_S have passed.
+    """Wait until the controller has run with changed parameters, but at most REPORT_TIMEOUT_S.
 
     While the robot is armed, control reports its state 20 times a second. While it is not armed, control reports
     nothing, and whether the controller can continue is not known before the robot is armed.
 
     Args:
-        states: Reads control's reports since the changes were requested.
-        now: The parameters in force after the change; None: control publishes none any more.
+        state_reader: Reads the reports of control since the changes were requested.
+        after: The parameters in force after the change. None if control publishes none any more.
         changes: The changed values by name.
 
     Raises:
         ControllerError: The controller cannot continue with these values, so control has ended.
     """
-    deadline_s = time.monotonic() + GOES_ON_S
+    deadline_s = time.monotonic() + REPORT_TIMEOUT_S
     while time.monotonic() < deadline_s:
-        reports = states.drain()
+        reports = state_reader.drain()
         for report in reports:
             if report.failed:
                 values_text = ", ".join(f"{name}={format_value(value)}" for name, value in changes.items())
@@ -230,36 +251,47 @@ def _check_controller_continues(
                     f"{values_text}: set, and then control has ended: {report.reason}. The robot stops. Start control "
                     "again with another value"
                 )
-        if now is not None and any(report.tick > now.tick for report in reports):
+        if after is not None and any(report.tick > after.tick for report in reports):
             return
-        time.sleep(LOOK_S)
+        time.sleep(POLL_PERIOD_S)
 
 
-def known_name(name: str, in_force: ControlParameters) -> str:
-    """Return the field that `control.NAME` refers to. Raises ConfigError if there is no such parameter."""
-    known = [PREFIX + parameter.name for parameter in read_parameters(in_force)]
-    if name not in known:
+def find_field_name(name: str, in_force: ControlParameters) -> str:
+    """Return the name of a parameter without the prefix `control.`.
+
+    Args:
+        name: Name of the parameter with the prefix.
+        in_force: The parameters in force.
+
+    Raises:
+        ConfigError: The controller has no parameter with this name.
+    """
+    known_names = [PREFIX + parameter.name for parameter in parse_parameters(in_force)]
+    if name not in known_names:
         raise ConfigError(
-            f"controller {in_force.controller} has no parameter {shorten(name)!r}; {suggest_word(name, known)}it has "
-            f"{', '.join(known) or 'none'}",
+            f"controller {in_force.controller} has no parameter {shorten(name)!r}; "
+            f"{suggest_word(name, known_names)}it has {', '.join(known_names) or 'none'}",
             code="controller/unknown-parameter",
         )
     return name.removeprefix(PREFIX)
 
 
-def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
+def print_parameters(selection: RobotSelection, *, as_json: bool) -> int:
     """Print all parameters of the running controller, for `snakesim param list`.
 
     Args:
-        where: Selects the robot.
-        as_json: Print one JSON object instead of a table.
+        selection: Selects the robot.
+        as_json: Whether to print one JSON object instead of a table.
 
     Returns:
         0, the exit code of the command.
+
+    Raises:
+        NotConnectedError: No controller publishes its parameters.
     """
-    with open_session(only_robot(where, "param list"), CONNECT_S) as session:
+    with open_session(find_single_robot(selection, "param list"), CONNECT_TIMEOUT_S) as session:
         in_force = read_parameters_in_force(session)
-    parameters = read_parameters(in_force)
+    parameters = parse_parameters(in_force)
     if as_json:
         content = [{**asdict(parameter), "name": PREFIX + parameter.name} for parameter in parameters]
         print_json({"controller": in_force.controller, "set_by": in_force.requester, "parameters": content})
@@ -270,7 +302,7 @@ def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
         origin = f"set by {in_force.requester} at {in_force.timestamp_ns * 1e-9:g} s"
     print_line(f"controller {in_force.controller}, {len(parameters)} parameters, {origin}")
     # Three aligned columns, then the description.
-    rows = [(PREFIX + parameter.name, parameter.value_with_unit, parameter.range) for parameter in parameters]
+    rows = [(PREFIX + parameter.name, parameter.value_with_unit, parameter.range_text) for parameter in parameters]
     column_widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
     for row, parameter in zip(rows, parameters, strict=True):
         cells = [cell.ljust(width) for cell, width in zip(row, column_widths, strict=True)]
@@ -279,12 +311,25 @@ def list_parameters(where: RobotSelection, *, as_json: bool) -> int:
     return 0
 
 
-def get_parameter(name: str, where: RobotSelection, *, as_json: bool) -> int:
-    """Print one value alone, for `snakesim param get`. Returns the exit code."""
-    with open_session(only_robot(where, "param get"), CONNECT_S) as session:
+def print_parameter(name: str, selection: RobotSelection, *, as_json: bool) -> int:
+    """Print the value of one parameter, for `snakesim param get`.
+
+    Args:
+        name: Name of the parameter, such as `control.speed_kp_s`.
+        selection: Selects the robot.
+        as_json: Whether to print one JSON object instead of the value alone.
+
+    Returns:
+        0, the exit code of the command.
+
+    Raises:
+        ConfigError: There is no such parameter.
+        NotConnectedError: No controller publishes its parameters.
+    """
+    with open_session(find_single_robot(selection, "param get"), CONNECT_TIMEOUT_S) as session:
         in_force = read_parameters_in_force(session)
-    field = known_name(name, in_force)
-    value = next(parameter.value for parameter in read_parameters(in_force) if parameter.name == field)
+    field = find_field_name(name, in_force)
+    value = next(parameter.value for parameter in parse_parameters(in_force) if parameter.name == field)
     if as_json:
         print_json({name: value})
     else:
@@ -292,26 +337,30 @@ def get_parameter(name: str, where: RobotSelection, *, as_json: bool) -> int:
     return 0
 
 
-def set_parameters(texts: list[str], where: RobotSelection) -> int:
+def set_parameters(assignments: list[str], selection: RobotSelection) -> int:
     """Change parameters for `snakesim param set`, and print what has changed.
 
     Args:
-        texts: assignments, such as `control.speed_kp_s=0.3`.
-        where: selects the robot.
+        assignments: Assignments of new values, such as `control.speed_kp_s=0.3`.
+        selection: Selects the robot.
+
+    Returns:
+        0, the exit code of the command.
 
     Raises:
-        ConfigError: a text or a name is wrong.
-        RefusedError: control refuses a value.
-        ControllerError: the controller has ended because of the change.
+        ConfigError: An assignment cannot be parsed, or there is no parameter with its name.
+        RefusedError: Control refuses a value.
+        ControllerError: The controller has ended because of the change.
+        NotConnectedError: No controller publishes its parameters.
     """
-    overrides = [parse_set(text) for text in texts]
+    overrides = [parse_set_option(text) for text in assignments]
     changes = {override.key: override.value for override in overrides}
-    with open_session(only_robot(where, "param set"), CONNECT_S) as session:
-        before, now = change_parameters(session, changes, get_user_name())
-    changed = find_changed_parameters(before, now)
-    for old, new in changed:
+    with open_session(find_single_robot(selection, "param set"), CONNECT_TIMEOUT_S) as session:
+        before, after = change_parameters(session, changes, get_user_name())
+    changed_parameters = find_changed_parameters(before, after)
+    for old, new in changed_parameters:
         change = f"{format_value(old.value)} -> {new.value_with_unit}"
-        print_line(f"{PREFIX}{new.name}: {change}, by {now.requester}, tick {now.tick}")
-    if not changed:
-        print_line(f"controller {now.controller} has these values already")
+        print_line(f"{PREFIX}{new.name}: {change}, by {after.requester}, tick {after.tick}")
+    if not changed_parameters:
+        print_line(f"controller {after.controller} has these values already")
     return 0

@@ -6,12 +6,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class SimulatorOrder:
-    """A request to the simulator."""
+    """A request of an operator to the simulator."""
 
     action: Any  # pause, resume, step, speed or reset
-    ticks: int = 1
-    speed: float = 1.0
-    requester: str | None = None  # None: this user
+    ticks: int = 1  # number of ticks to advance, for `step`
+    speed: float = 1.0  # robot time over wall time, for `speed`
+    requester: str | None = None  # if None, the user of this process
 
     def __str__(self) -> str:
         match self.action:

@@ -13,31 +13,31 @@ from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.endpoint import is_exposed
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.process_entries import HOST, find_differences
+from snakesim_hal.network.process_entries import HOST, describe_differences
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Description, Process, Status
-from snakesim_operator.base.targets import CONNECT_S, RobotSelection, flags_of, namespace_of
+from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, get_namespace, make_robot_flags
 from snakesim_operator.results import last_run
 
-STATUS_WAIT_S = 1.0  # for the messages of a network
-ONE_ATTEMPT_S = 0.0  # as a time to connect: Zenoh tries once, and reports a refused connection at once
+MESSAGE_WAIT_S = 1.0  # for the messages of a network
+SINGLE_ATTEMPT_TIMEOUT_S = 0.0  # as a time to connect: Zenoh tries once, and reports a refused connection at once
 
 
 @dataclass(frozen=True)
-class _Robot:
-    """What a robot on the network has published."""
+class _RobotState:
+    """The newest messages of one robot on the network, as `snakesim status` prints them."""
 
     link: Link
-    statuses: list[Status]  # the newest of each of its hosts
-    processes: list[Process]  # that live
-    description: Description | None  # of the host with the last of these statuses; None: none arrived
+    statuses: list[Status]  # newest status of each host with the robot's name; more than one means an impostor
+    processes: list[Process]  # running processes of the robot
+    description: Description | None  # from the host with the last of these statuses; None if none arrived
 
     @property
     def status(self) -> Status:
-        """The status that is shown."""
+        """The status that is printed."""
         return self.statuses[-1]
 
     @property
@@ -46,52 +46,54 @@ class _Robot:
         return len({status.host for status in self.statuses}) > 1
 
 
-def show_status(where: RobotSelection, *, as_json: bool = False) -> int:
+def print_status(selection: RobotSelection, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot, and name robots of this computer that do not answer.
 
     Args:
-        where: Selects the robots.
-        as_json: Print one JSON object instead of text.
+        selection: Selects the robots.
+        as_json: Whether to print one JSON object instead of text.
 
     Returns:
-        0 if there is a robot, all robots answer and none has a fault; otherwise 1.
+        The exit code: 0 if there is a robot, all robots answer and none has a fault; otherwise 1.
     """
-    local_robots = where.local()
+    local_robots = selection.list_local_robots()
     local_endpoints = {robot.endpoint for robot in local_robots}
-    robots: list[_Robot] = []
-    for link in where.networks():
+    robots: list[_RobotState] = []
+    for link in selection.list_networks():
         with contextlib.suppress(NotConnectedError):
-            robots += _find_robots(link, _choose_connect_time(link, local_endpoints))
-    reachable = {(robot.link.endpoint, robot.link.namespace) for robot in robots}
-    silent = [robot for robot in where.local() if (robot.endpoint, robot.namespace) not in reachable]
+            robots += _find_robots(link, _choose_connect_timeout_s(link, local_endpoints))
+    reachable_addresses = {(robot.link.endpoint, robot.link.namespace) for robot in robots}
+    silent_robots = [
+        robot for robot in selection.list_local_robots() if (robot.endpoint, robot.namespace) not in reachable_addresses
+    ]
     has_fault = any(robot.status.lifecycle not in ("armed", "disarmed") for robot in robots)
-    is_all_right = bool(robots) and not has_fault and not silent
+    is_all_right = bool(robots) and not has_fault and not silent_robots
     exit_code = 0 if is_all_right else 1
     if as_json:
-        print_json({"robots": [_as_json(robot) for robot in robots], "silent": silent})
+        print_json({"robots": [_convert_to_json(robot) for robot in robots], "silent": silent_robots})
         return exit_code
-    for robot in silent:
+    for robot in silent_robots:
         print_line(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
-    if not robots and not silent:
-        _print_no_robot(where)
+    if not robots and not silent_robots:
+        _print_no_robot(selection)
     for robot in robots:
         _print_robot(robot)
     return exit_code
 
 
-def _print_no_robot(where: RobotSelection) -> None:
+def _print_no_robot(selection: RobotSelection) -> None:
     """Print how the last run on this computer ended, and how to start another."""
     last = last_run.read_last_run()
     ending = f"; the last run on this computer ended so: {last.ended} ({last.folder})" if last is not None else ""
-    print_line(f"no robot answers on {', '.join(where.endpoints())}{ending}")
+    print_line(f"no robot answers on {', '.join(selection.list_endpoints())}{ending}")
     print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenario list`")
 
 
-def _print_robot(robot: _Robot) -> None:
-    lines = [*_describe_robot(robot), *processes_in_words(robot.processes)]
+def _print_robot(robot: _RobotState) -> None:
+    lines = [*_describe_robot(robot), *describe_processes(robot.processes)]
     if robot.is_impostor:
         lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
-    lines += _next_commands(robot.link, robot.status)
+    lines += _suggest_next_commands(robot.link, robot.status)
     for line in lines:
         print_line(line)
 
@@ -111,65 +113,77 @@ class _NetworkMessages:
         self.processes: dict[str, list[Process]] = {}  # by robot
 
     def read(self, session: Session) -> None:
-        """Subscribe, and collect messages for STATUS_WAIT_S."""
+        """Subscribe to status, descriptions and processes, and collect these messages for MESSAGE_WAIT_S."""
         arrivals: Mailbox[Arrival] = Mailbox()
         prefix = "" if self._link.namespace is not None else "**/"
         for key in self._decoders:
             session.on_latched_arrival(f"{prefix}{key}", arrivals.put)
-        live = set(session.present(f"{prefix}{keys.PROCESS_ALL}"))
-        deadline = time.monotonic() + STATUS_WAIT_S
-        while (left_s := deadline - time.monotonic()) > 0:
+        live_process_keys = set(session.list_tokens(f"{prefix}{keys.PROCESS_ALL}"))
+        deadline_s = time.monotonic() + MESSAGE_WAIT_S
+        while (remaining_s := deadline_s - time.monotonic()) > 0:
             try:
-                arrival = arrivals.get(timeout=left_s)
+                arrival = arrivals.get(timeout=remaining_s)
             except Empty:
                 break
             with contextlib.suppress(WireError):
-                self._add(arrival, live)
+                self._decode_and_store(arrival, live_process_keys)
 
-    def _add(self, arrival: Arrival, live: set[str]) -> None:
+    def _decode_and_store(self, arrival: Arrival, live_process_keys: set[str]) -> None:
         """Decode a message and keep it. live: keys of the processes that run. Raises WireError."""
         decoder = self._decoders[keys.PROCESS_ALL]
         for key in (keys.STATUS, keys.DESCRIPTION):
             if arrival.key.endswith(key):
                 decoder = self._decoders[key]
         message = decoder.decode(arrival.payload, arrival.encoding)
-        name = self._link.namespace or namespace_of(arrival.key)
+        name = self._link.namespace or get_namespace(arrival.key)
         match message:
             case Status():
                 self.statuses.setdefault(name, {})[message.host] = message
             case Description():
                 self.descriptions[name, message.host] = message
             case Process():
-                if arrival.key in live:
+                if arrival.key in live_process_keys:
                     self.processes.setdefault(name, []).append(message)
 
 
-def _choose_connect_time(link: Link, running_here: Collection[str]) -> float:
-    """Return how long to try to connect to a network, in s.
+def _choose_connect_timeout_s(link: Link, local_endpoints: Collection[str]) -> float:
+    """Return the time in s for which to try to connect to a network.
 
-    On loopback Zenoh reports at once whether a process listens, so one attempt is enough. It is repeated where a run of
-    this computer is about to listen, and where packets may be lost on the way.
+    On loopback Zenoh reports at once whether a process listens, so one attempt is enough. Attempts are repeated where
+    a run on this computer is about to listen, and where packets may be lost on the way.
+
+    Args:
+        link: How to reach the network.
+        local_endpoints: Endpoints of the robots that run on this computer.
     """
-    if link.session is None and link.endpoint not in running_here and not is_exposed(link.endpoint):
-        return ONE_ATTEMPT_S
-    return CONNECT_S
+    if link.session is None and link.endpoint not in local_endpoints and not is_exposed(link.endpoint):
+        return SINGLE_ATTEMPT_TIMEOUT_S
+    return CONNECT_TIMEOUT_S
 
 
-def _find_robots(link: Link, connect_s: float) -> list[_Robot]:
-    """Return the robots on a network, sorted by name. Raises NotConnectedError."""
+def _find_robots(link: Link, connect_timeout_s: float) -> list[_RobotState]:
+    """Return the robots on a network with their newest messages, sorted by name.
+
+    Args:
+        link: How to reach the network.
+        connect_timeout_s: Time for which to try to connect.
+
+    Raises:
+        NotConnectedError: The network cannot be reached.
+    """
     messages = _NetworkMessages(link)
-    with open_session(link, connect_s) as session:
+    with open_session(link, connect_timeout_s) as session:
         messages.read(session)
-    robots: list[_Robot] = []
+    robots: list[_RobotState] = []
     for name, status_by_host in sorted(messages.statuses.items()):
         statuses = list(status_by_host.values())
         description = messages.descriptions.get((name, statuses[-1].host))
         processes = messages.processes.get(name, [])
-        robots.append(_Robot(replace(link, namespace=name), statuses, processes, description))
+        robots.append(_RobotState(replace(link, namespace=name), statuses, processes, description))
     return robots
 
 
-def _as_json(robot: _Robot) -> dict[str, Any]:
+def _convert_to_json(robot: _RobotState) -> dict[str, Any]:
     return {
         "namespace": robot.link.namespace,
         "endpoint": robot.link.endpoint,
@@ -180,7 +194,7 @@ def _as_json(robot: _Robot) -> dict[str, Any]:
     }
 
 
-def processes_in_words(processes: Sequence[Process]) -> list[str]:
+def describe_processes(processes: Sequence[Process]) -> list[str]:
     """Return lines for each process: machine, version, uptime, and how its configuration differs from the host's."""
     host = next((entry for entry in processes if entry.name == HOST), None)
     lines: list[str] = []
@@ -193,11 +207,11 @@ def processes_in_words(processes: Sequence[Process]) -> list[str]:
             f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {uptime}"
         )
         if host is not None:
-            lines += [f"    DIFFERS: {difference}" for difference in find_differences(entry, host)]
+            lines += [f"    DIFFERS: {difference}" for difference in describe_differences(entry, host)]
     return lines
 
 
-def _describe_robot(robot: _Robot) -> list[str]:
+def _describe_robot(robot: _RobotState) -> list[str]:
     link = robot.link
     status = robot.status
     return [
@@ -220,7 +234,14 @@ def _format_counts(counts: dict[str, int]) -> str:
 
 
 def _describe_limits(status: Status) -> list[str]:
-    """Return what keeps the robot from its full performance; empty if there is nothing."""
+    """Return lines about restrictions of the robot: pause, speed, derating, isolated joints, injected faults and so on.
+
+    Args:
+        status: Newest status of the robot.
+
+    Returns:
+        One line for each restriction; empty if there is none.
+    """
     lines: list[str] = []
     if status.paused_by is not None:
         lines.append(f"  PAUSED by {status.paused_by}; `snakesim sim resume` or `step` continues")
@@ -241,12 +262,12 @@ def _describe_limits(status: Status) -> list[str]:
 
 def _describe_faults(status: Status) -> list[str]:
     """Return a line for each kind of fault, with its first tick and its count."""
-    ticks: dict[tuple[str, str, str], list[int]] = {}
+    ticks_by_fault: dict[tuple[str, str, str], list[int]] = {}
     for fault in status.faults:
         joint_text = f" at {fault.joint}" if fault.joint else ""
-        ticks.setdefault((fault.what, joint_text, fault.cause), []).append(fault.tick)
+        ticks_by_fault.setdefault((fault.what, joint_text, fault.cause), []).append(fault.tick)
     lines: list[str] = []
-    for (what, joint_text, cause), fault_ticks in ticks.items():
+    for (what, joint_text, cause), fault_ticks in ticks_by_fault.items():
         repetitions = f" and {len(fault_ticks) - 1} times more" if len(fault_ticks) > 1 else ""
         lines.append(f"  fault {what}{joint_text} at tick {fault_ticks[0]}{repetitions}: {cause}")
     if status.faults_left_out:
@@ -254,14 +275,14 @@ def _describe_faults(status: Status) -> list[str]:
     return lines
 
 
-def _next_commands(link: Link, status: Status) -> list[str]:
+def _suggest_next_commands(link: Link, status: Status) -> list[str]:
     """Return lines with the commands that the operator may type next, which depend on the state of the robot.
 
     Args:
-        link: How to reach the robot; the commands get the same options.
-        status: The newest status of the robot.
+        link: How to reach the robot. The suggested commands get the same options.
+        status: Newest status of the robot.
     """
-    flags = flags_of(link, status.robot)
+    flags = make_robot_flags(link, status.robot)
     reset = f"`snakesim robot reset{flags}`"
     arm = f"`snakesim robot arm {status.robot} {status.backend}{flags}`"
     if status.lifecycle in ("fault", "estop"):
@@ -277,7 +298,7 @@ def _next_commands(link: Link, status: Status) -> list[str]:
         ]
     if status.ready_to_arm:
         return [f"  next: {arm}"]
-    starts = [f"`snakesim start service {name} SCENARIO{flags}`" for name in status.waiting_for]
-    if starts:
-        return [f"  next: {', '.join(starts)}"]
+    start_commands = [f"`snakesim start service {name} SCENARIO{flags}`" for name in status.waiting_for]
+    if start_commands:
+        return [f"  next: {', '.join(start_commands)}"]
     return ["  next: `snakesim status` again: what prevents arming is named above"]

@@ -6,95 +6,126 @@ import time
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.stop_port import stop_address
+from snakesim_hal.network.stop_port import find_stop_address
 from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, EstopRequest, Status
-from snakesim_operator.base.targets import CONNECT_S, namespace_of, robots_on
-from snakesim_operator.robot_commands.command import judge
+from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, find_namespaces, get_namespace
+from snakesim_operator.robot_commands.command import verify_answers
 from snakesim_operator.robot_commands.stop_result import StopResult
 
-ASK_S = 1.0  # for the answers to one query
+QUERY_TIMEOUT_S = 1.0  # for the answers to one query
 
 
-def ask_network(link: Link, limit_s: float) -> list[StopResult]:
-    """Query all hosts on a network, repeatedly while the network cannot be reached.
+def request_stop_on_network(link: Link, timeout_s: float) -> list[StopResult]:
+    """Connect to a network, and stop its robots by queries to their hosts.
+
+    Connecting is repeated while a program listens at the endpoint but accepts no session.
 
     Args:
-        link: how to connect; with a namespace only that robot's host is queried.
-        limit_s: time to connect, and then for the answers.
+        link: How to connect. With a namespace, only the host of that robot is queried.
+        timeout_s: Time to connect, and then again for the answers.
+
+    Returns:
+        One result for each robot; empty if the network cannot be reached.
     """
-    deadline = time.monotonic() + limit_s
+    deadline = time.monotonic() + timeout_s
     while True:
         try:
-            with open_session(link, CONNECT_S) as session:
-                return ask_session(session, link, limit_s)
+            with open_session(link, CONNECT_TIMEOUT_S) as session:
+                return request_stop_over_session(session, link, timeout_s)
         except NotConnectedError:
-            if time.monotonic() > deadline or not _endpoint_listens(link):
+            if time.monotonic() > deadline or not _has_listener(link):
                 return []
 
 
-def _endpoint_listens(link: Link) -> bool:
+def _has_listener(link: Link) -> bool:
     """Return whether a program listens at the endpoint, even if it accepts no session."""
-    host, port = stop_address(link.endpoint, listens=True)
+    host, port = find_stop_address(link.endpoint, listens=True)
     try:
-        with socket.create_connection((host, port), timeout=ASK_S):
+        with socket.create_connection((host, port), timeout=QUERY_TIMEOUT_S):
             return bool(port)
     except OSError:
         return False
 
 
-def ask_session(session: Session, link: Link, limit_s: float) -> list[StopResult]:
-    """Query all hosts over an open session, and check their answers by their status.
+def request_stop_over_session(session: Session, link: Link, timeout_s: float) -> list[StopResult]:
+    """Stop robots by queries to their hosts, and check the answers against the status that the hosts publish.
 
-    The subscriptions stay until the session is closed.
+    The status subscriptions stay until the session is closed.
+
+    Args:
+        session: Session on the network of the robots.
+        link: How the session reaches the robots. With a namespace, only the host of that robot is queried.
+        timeout_s: Time in which the query is repeated until a host answers.
+
+    Returns:
+        One result for each robot that is known or that has answered.
     """
-    names = [link.namespace] if link.namespace is not None else robots_on(session)
-    statuses = {name: _read_status(session, link, name) for name in names}
-    answers = _query_hosts(session, link, limit_s, repeat=bool(names))
+    robot_names = [link.namespace] if link.namespace is not None else find_namespaces(session)
+    status_reader_by_robot = {name: _subscribe_to_status(session, link, name) for name in robot_names}
+    answers_by_robot = _request_stop_from_hosts(session, link, timeout_s, should_repeat=bool(robot_names))
     results: list[StopResult] = []
-    for name in dict.fromkeys([*names, *answers]):
-        if name not in answers:
-            text = f"NO ANSWER for {limit_s:g} s: use its own emergency stop"
-            results.append(StopResult(name, link.endpoint, stopped=False, text=text))
+    for name in dict.fromkeys([*robot_names, *answers_by_robot]):
+        if name not in answers_by_robot:
+            text = f"NO ANSWER for {timeout_s:g} s: use its own emergency stop"
+            results.append(StopResult(name, link.endpoint, is_stopped=False, text=text))
             continue
-        status = statuses.get(name) or _read_status(session, link, name)
-        results.append(_check_answers(name, link, answers[name], status))
+        status_reader = status_reader_by_robot.get(name) or _subscribe_to_status(session, link, name)
+        results.append(_make_verified_result(name, link, answers_by_robot[name], status_reader))
     return results
 
 
-def _query_hosts(session: Session, link: Link, limit_s: float, *, repeat: bool) -> dict[str, list[Answer]]:
-    """Send the query until a host answers. Returns the answers by name of the robot.
+def _request_stop_from_hosts(
+    session: Session, link: Link, timeout_s: float, *, should_repeat: bool
+) -> dict[str, list[Answer]]:
+    """Send the stop query to the hosts until at least one answers.
 
-    repeat: whether to query more than once; without any known robot once is enough.
+    Args:
+        session: Session on the network of the robots.
+        link: How the session reaches the robots. With a namespace, only the host of that robot is queried.
+        timeout_s: Time in which the query is repeated.
+        should_repeat: Whether to query more than once. Without any known robot, once is enough.
+
+    Returns:
+        The answers by name of the robot.
     """
     key = keys.ESTOP if link.namespace is not None else f"**/{keys.ESTOP}"
-    answers: dict[str, list[Answer]] = {}
-    deadline = time.monotonic() + limit_s
-    while not answers and time.monotonic() < deadline:
-        for answer_key, answer in session.request_all(key, EstopRequest(requester=get_user_name()), ASK_S):
-            name = link.namespace or namespace_of(answer_key)
-            answers.setdefault(name, []).append(answer)
-        if not repeat:
+    answers_by_robot: dict[str, list[Answer]] = {}
+    deadline = time.monotonic() + timeout_s
+    while not answers_by_robot and time.monotonic() < deadline:
+        for answer_key, answer in session.send_request_to_all(
+            key, EstopRequest(requester=get_user_name()), QUERY_TIMEOUT_S
+        ):
+            name = link.namespace or get_namespace(answer_key)
+            answers_by_robot.setdefault(name, []).append(answer)
+        if not should_repeat:
             break
-    return answers
+    return answers_by_robot
 
 
-def _check_answers(name: str, link: Link, answers: list[Answer], statuses: Reader[Status]) -> StopResult:
-    """Return the result for one robot: stopped only if all answers accept the stop, and its status shows it."""
-    doubt, _ = judge(answers, statuses)
+def _make_verified_result(name: str, link: Link, answers: list[Answer], status_reader: Reader[Status]) -> StopResult:
+    """Return the result for one robot, which is stopped only if its status confirms the answer and no host refused.
+
+    Args:
+        name: Name of the robot.
+        link: How the robot was reached.
+        answers: All answers of hosts with this name.
+        status_reader: Reads the status that the robot's host publishes.
+    """
+    doubt = verify_answers(answers, status_reader).problem
     refusal = next((answer.reason for answer in answers if not answer.ok), None)
     problem = doubt or refusal
     return StopResult(
         name,
         link.endpoint,
-        stopped=problem is None,
+        is_stopped=problem is None,
         text=problem or answers[0].reason,
-        in_doubt=doubt is not None,
+        is_doubtful=doubt is not None,
     )
 
 
-def _read_status(session: Session, link: Link, name: str) -> Reader[Status]:
-    """Subscribe to a robot's status."""
+def _subscribe_to_status(session: Session, link: Link, name: str) -> Reader[Status]:
+    """Subscribe to the status of one robot, and return the reader."""
     key = keys.STATUS if link.namespace is not None else f"{name}/{keys.STATUS}"
-    return session.latched_reader(key, Status)
+    return session.declare_latched_reader(key, Status)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class StopResult:
-    """The result of an emergency stop for one robot."""
+    """The result of an emergency stop for one robot, as one stop port or the network has reported it."""
 
     name: str
     endpoint: str
-    stopped: bool
+    is_stopped: bool
     text: str
-    in_doubt: bool = False  # an impostor may answer in its name
+    is_doubtful: bool = False  # an impostor may answer in its name

@@ -7,28 +7,28 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import tune_garbage_collector
 from snakesim_hal.base.terminal import tolerate_failed_output
 from snakesim_hal.programs.arguments import (
-    add_host,
+    add_host_arguments,
     add_insecure,
-    add_network,
+    add_network_arguments,
     add_out,
-    add_scenario,
-    add_service,
+    add_scenario_arguments,
+    add_service_arguments,
     add_unchecked,
     check_network,
-    load_scenario,
+    load_scenario_from_arguments,
     read_session_option,
 )
 from snakesim_hal.programs.commands import Command, Commands, Noun
-from snakesim_operator.recording.message import RAW_ONLY
+from snakesim_operator.recording.message import RAW_ONLY_HELP
 
 if TYPE_CHECKING:
     from snakesim_hal.base.step_limit import SharedStepTimes
     from snakesim_hal.model.scenario import RunConfig
 
 
-def _add_run(parser: argparse.ArgumentParser) -> None:
+def _add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim run`, which runs a scenario with all of its processes."""
-    add_scenario(parser)
+    add_scenario_arguments(parser)
     parser.add_argument(
         "--fault",
         action="append",
@@ -48,7 +48,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--until-goal", action="store_true", help="end when the mission's goal is reached")
     parser.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
-    parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
+    parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY_HELP)
     parser.add_argument(
         "--console",
         action=argparse.BooleanOptionalAction,
@@ -56,22 +56,22 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="show the run in the browser, and print the address",
     )
     add_out(parser, "folder for the run's record (default: runs/NAME-TIME)")
-    add_network(parser, "")
+    add_network_arguments(parser, "")
     add_insecure(parser)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run_scenario(arguments: argparse.Namespace) -> int:
     """Run `snakesim run`, in processes or in this one, and return its exit code."""
     check_network(arguments)
     if arguments.in_process:
-        from snakesim_operator.run.guarded_process import run_guarded  # before anything large is loaded
+        from snakesim_operator.run.guarded_process import run_in_guarded_child  # before anything large is loaded
 
-        return run_guarded(
-            lambda step_times: _run_in_process(arguments, step_times), owns_process=arguments.owns_process
+        return run_in_guarded_child(
+            lambda step_times: _run_scenario_in_process(arguments, step_times), owns_process=arguments.owns_process
         )
-    config = _config_of(arguments)
+    config = _load_checked_config(arguments)
 
-    from snakesim_operator.run.run import RunRequest, run
+    from snakesim_operator.run.run import RunRequest, run_in_processes
 
     request = RunRequest(
         config,
@@ -89,11 +89,11 @@ def _run(arguments: argparse.Namespace) -> int:
         console=arguments.console,
     )
     with tolerate_failed_output():
-        return run(request)
+        return run_in_processes(request)
 
 
-def _run_in_process(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
-    config = _config_of(arguments)
+def _run_scenario_in_process(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
+    config = _load_checked_config(arguments)
     for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
             raise ConfigError(
@@ -111,21 +111,23 @@ def _run_in_process(arguments: argparse.Namespace, step_times: "SharedStepTimes 
         )
 
 
-def _config_of(arguments: argparse.Namespace) -> "RunConfig":
-    from snakesim_hal.programs.preflight import check_plugins
+def _load_checked_config(arguments: argparse.Namespace) -> "RunConfig":
+    from snakesim_hal.programs.preflight import validate_and_complete_config
 
-    loaded = load_scenario(arguments)
-    return check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
+    loaded = load_scenario_from_arguments(arguments)
+    return validate_and_complete_config(
+        loaded.config, loaded.table
+    )  # here, because only the table knows which flag set what
 
 
-def _host(arguments: argparse.Namespace) -> int:
+def _start_host(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.host import run_host
 
     with tolerate_failed_output():
         return run_host(arguments)
 
 
-def _service(arguments: argparse.Namespace) -> int:
+def _start_service(arguments: argparse.Namespace) -> int:
     from snakesim_hal.programs import service_program as serve
 
     return serve.run(arguments)
@@ -136,8 +138,8 @@ COMMANDS: Commands = (
         name="run",
         heading="daily work",
         help="Run a scenario: backend, guidance, navigation and control.",
-        add=_add_run,
-        run=_run,
+        add=_add_run_options,
+        run=_run_scenario,
         details="Exit code 0: complete, armed for all of the requested time. 1: a fault, or ended before that. 2: "
         "wrong input, nothing was started. 3: complete, but the record has gaps. 130: interrupted. 1 and 130 take "
         "precedence.",
@@ -150,8 +152,8 @@ COMMANDS: Commands = (
     Command(
         name="start host",
         help="Start the HAL host of a robot, which moves the drives or the simulator.",
-        add=add_host,
-        run=_host,
+        add=add_host_arguments,
+        run=_start_host,
         details="It runs until Ctrl-C, and boots disarmed: `snakesim robot arm` arms it. Faults do not end it. Exit "
         "code: 0 ended with --end-after-duration and without a fault, 1 ended otherwise, 2 wrong input.",
         examples=("start host triplet", "start host triplet --backend can --router tcp/10.0.0.1:7447 --out runs/host"),
@@ -159,8 +161,8 @@ COMMANDS: Commands = (
     Command(
         name="start service",
         help="Start one service of a robot: guidance, navigation, control, or another one of the scenario.",
-        add=add_service,
-        run=_service,
+        add=add_service_arguments,
+        run=_start_service,
         details="It waits for the network and for the robot's host, and joins the next host after a restart.",
         examples=("start service control triplet", "start service guidance triplet --router tcp/10.0.0.1:7447"),
     ),

@@ -11,58 +11,63 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from snakesim_hal.base import arithmetic
-from snakesim_hal.base.process import child_environment, python_command
-from snakesim_hal.base.workers import start_worker
+from snakesim_hal.base.process import make_child_environment, make_python_command
+from snakesim_hal.base.workers import start_restarting_thread
 
-STOP_LIMIT_S = 5.0  # a child that has not ended by then is killed
-LINES_SHOWN = 15  # of the output of a child that failed
+STOP_TIMEOUT_S = 5.0  # a child that has not ended by then is killed
+MAX_LINES_SHOWN = 15  # of the output of a child that failed
 OUTPUT_TAIL_BYTES = 16384  # held in memory, more than LINES_SHOWN usually take
 PIPE_BYTES = 2**20  # holds a child's output while this process is frozen
 READ_BYTES = 65536
 
 
 class ProcessOutput:
-    """Reads the output of a process from a pipe at once, so that the process never waits for a disk."""
+    """Reads the output of a process from a pipe immediately, so that the process never waits for a disk."""
 
-    def __init__(self, pipe: int, keep: Callable[[bytes], object]) -> None:
-        """Start to read `pipe`, a file descriptor. `keep` gets each piece of output, in another thread."""
+    def __init__(self, pipe: int, on_output: Callable[[bytes], object]) -> None:
+        """Start to read a pipe in another thread.
+
+        Args:
+            pipe: File descriptor of the read end.
+            on_output: Called with each piece of output, in the other thread.
+        """
         self._pipe = pipe
-        self._keep = keep
+        self._on_output = on_output
         self._tail = b""
-        self._thread = start_worker("words", self._read_pipe)
+        self._thread = start_restarting_thread("words", self._read_pipe)
 
     def last_lines(self) -> list[str]:
         """Return the last lines of stdout and stderr, once the process has ended."""
         self._thread.join(1.0)
         text = self._tail.decode(errors="replace").strip()
-        return text.splitlines()[-LINES_SHOWN:]
+        return text.splitlines()[-MAX_LINES_SHOWN:]
 
     def _read_pipe(self) -> None:
         with contextlib.suppress(OSError):  # the kernel may not allow a larger pipe than the default
             fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         while output := os.read(self._pipe, READ_BYTES):
             self._tail = (self._tail + output)[-OUTPUT_TAIL_BYTES:]
-            self._keep(output)
+            self._on_output(output)
         os.close(self._pipe)
 
 
 @dataclass
 class Child:
-    """One process, and its output."""
+    """A child process and its output."""
 
     name: str
     process: subprocess.Popen[bytes]
     output: ProcessOutput
-    end_requested: bool = False  # by this process, while the child ran
+    is_end_requested: bool = False  # by this process, while the child ran
     was_killed: bool = False  # by this process, because it did not end within STOP_LIMIT_S
 
     def describe_end(self) -> str | None:
-        """Return the exit of the process as text, with its last error message; None while it runs."""
+        """Describe how the process ended, with its last error message; None while it runs."""
         code = self.process.poll()
         if code is None:
             return None
         if self.was_killed:
-            return f"{self.name} was killed: it had not ended {STOP_LIMIT_S:g} s after the request to end"
+            return f"{self.name} was killed: it had not ended {STOP_TIMEOUT_S:g} s after the request to end"
         if code < 0:
             return f"{self.name} was ended by {signal.Signals(-code).name}"
         text = f"{self.name} ended with exit code {code}"
@@ -76,10 +81,10 @@ class Child:
 def start_child(
     name: str,
     arguments: Sequence[str],
-    keep: Callable[[bytes], object],
+    on_output: Callable[[bytes], object],
     *,
-    inherits: Sequence[int] = (),
-    more: Mapping[str, str] = MappingProxyType({}),
+    pass_fds: Sequence[int] = (),
+    extra_env: Mapping[str, str] = MappingProxyType({}),
 ) -> Child:
     """Start a Python module as a child that dies with this process.
 
@@ -87,25 +92,27 @@ def start_child(
     order. A SIGINT that arrives while the child's interpreter starts waits until the child has a handler.
 
     Args:
-        name: of the child, for messages.
-        arguments: the module's name and its command line.
-        keep: gets the child's output, in another thread.
-        inherits: file descriptors that stay open in the child.
-        more: environment variables.
+        name: Name of the child in messages.
+        arguments: Name of the module, followed by its command-line arguments.
+        on_output: Called with each piece of output of the child, in another thread.
+        pass_fds: File descriptors that stay open in the child.
+        extra_env: Environment variables of the child, in addition to those of this process.
     """
-    reproducible = {"PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
-    environment = child_environment(arithmetic.common_environment(), arithmetic.ONE_THREAD, reproducible, more)
+    deterministic_env = {"PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
+    environment = make_child_environment(
+        arithmetic.make_common_arithmetic_env(), arithmetic.SINGLE_THREAD_ENV, deterministic_env, extra_env
+    )
     read_end, write_end = os.pipe()
     old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits the blocked signal
     try:
         process = subprocess.Popen(
-            python_command("-m", *arguments, "--parent", str(os.getpid())),
+            make_python_command("-m", *arguments, "--parent", str(os.getpid())),
             stdin=subprocess.DEVNULL,
             stdout=write_end,
             stderr=subprocess.STDOUT,
             env=environment,
             start_new_session=True,
-            pass_fds=inherits,
+            pass_fds=pass_fds,
         )
     except OSError:
         os.close(read_end)
@@ -113,25 +120,25 @@ def start_child(
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
         os.close(write_end)
-    return Child(name, process, ProcessOutput(read_end, keep))
+    return Child(name, process, ProcessOutput(read_end, on_output))
 
 
-def request_end(child: Child) -> None:
-    """Send SIGTERM to a child that runs, and SIGCONT, because a frozen child would not receive it otherwise.
+def request_child_end(child: Child) -> None:
+    """Request the end of a running child: send SIGTERM, and SIGCONT so that a frozen child receives it.
 
-    A child that still starts has no handler, and ends at once. It has nothing that could be lost.
+    A child that is still starting has no signal handler and ends immediately. It has no data that could be lost.
     """
     if child.process.poll() is None:
-        child.end_requested = True
+        child.is_end_requested = True
         child.process.send_signal(signal.SIGTERM)
         child.process.send_signal(signal.SIGCONT)
 
 
-def stop_all(children: Sequence[Child]) -> None:
-    """Terminate every child, wait, then kill. Returns when all have ended."""
+def stop_children(children: Sequence[Child]) -> None:
+    """Request the end of every child, wait for STOP_TIMEOUT_S, kill those that still run, and wait for these."""
     for child in children:
-        request_end(child)
-    deadline = time.monotonic() + STOP_LIMIT_S
+        request_child_end(child)
+    deadline = time.monotonic() + STOP_TIMEOUT_S
     for child in children:
         try:
             child.process.wait(max(deadline - time.monotonic(), 0.05))
@@ -139,4 +146,4 @@ def stop_all(children: Sequence[Child]) -> None:
             child.was_killed = True
             child.process.kill()
             with contextlib.suppress(subprocess.TimeoutExpired):  # a disk that hangs may block even a killed process
-                child.process.wait(STOP_LIMIT_S)
+                child.process.wait(STOP_TIMEOUT_S)

@@ -10,83 +10,87 @@ from snakesim_hal.base.arithmetic import format_digest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.host.latch import ESTOP
-from snakesim_hal.model.plugins import pip_install
+from snakesim_hal.model.plugins import make_pip_install_command
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import EMULATED, REAL, UNKNOWN
-from snakesim_hal.network.local_registry import robot_folder
+from snakesim_hal.network.local_registry import get_robot_state_folder
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.base import extras
 from snakesim_operator.results import last_run
-from snakesim_operator.results.missing_data import INCOMPLETE, describe_unwritten
+from snakesim_operator.results.missing_data import EXIT_INCOMPLETE, describe_unwritten_data
 from snakesim_operator.results.run_ending import COMPLETE, describe_early_end
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import REPORT, SUMMARY
-from snakesim_operator.results.summary import Restart, RunSummary, distance_m, estimates_of, summarise
-from snakesim_operator.run.ending import Ending
+from snakesim_operator.results.run_reader import REPORT_FILENAME, SUMMARY_FILENAME
+from snakesim_operator.results.summary import Restart, RunSummary, get_distance_m, get_estimates, summarize_run
+from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.run_files import RunFiles
 
-JOINTS_SHOWN = 8
+MAX_JOINTS_SHOWN = 8
 MAX_ENERGY_DEVIATION = 0.2  # of the energy per meter: a larger difference shows that the body traveled sideways
-DONE, FAILED, INTERRUPTED = 0, 1, 130
+EXIT_COMPLETE, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 130
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is known of a run beside its folder."""
+    """Results of a run that are not in its folder."""
 
-    host: HostRecord | None  # the host's own statistics, as far as they are known
-    robot: Description | None
+    host_record: HostRecord | None  # statistics of the host; None if they are unknown
+    description: Description | None
     restarts: Sequence[Restart] = ()
-    hosts: int = 1
-    lost: Sequence[str] = ()  # reasons for which the recording is incomplete
-    too_slow: Sequence[str] = ()  # services that could not keep up in real time; known of a run in one process
+    host_count: int = 1
+    recording_losses: Sequence[str] = ()  # reasons why the recording is incomplete
+    slow_services: Sequence[
+        str
+    ] = ()  # services that could not keep up in real time; only known for a run in one process
 
 
-def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcome, *, stay: bool = False) -> int:
-    """Write the results of a run and print them.
+def write_and_print_results(
+    config: RunConfig, files: RunFiles, ending: RunEnding, outcome: Outcome, *, stay: bool = False
+) -> int:
+    """Write the results of a run, print them, and close its files.
 
     Args:
-        config: configuration of the run.
-        files: the run's folder; closed by this function.
-        ending: the reasons for the end that are known so far.
-        outcome: what the host and the processes reported.
-        stay: whether faults that a person could reset are part of the run, not its end.
+        config: Configuration of the run.
+        files: Files of the run; closed by this function.
+        ending: Causes of the end that are known so far; further causes are added.
+        outcome: Results that the host and the processes reported.
+        stay: Whether faults that a person could reset are part of the run and do not end it.
 
     Returns:
-        The exit code: 0, or 1 on a fault or an early end, 3 when the record has gaps, 130 when interrupted.
+        The exit code: 1 on a fault or an early end, 3 if the record has gaps, 130 if interrupted, otherwise 0.
     """
-    host = outcome.host
+    host = outcome.host_record
     missing: list[str] = []
     verdict = ""
     if host is not None:
-        note_reasons(ending, host, config, stay=stay)
-        missing, verdict = _write_and_print(files, ending, outcome, host)
-    lost_by_files = files.close()
-    for loss in (*outcome.lost, lost_by_files):
+        add_end_causes(ending, host, config, stay=stay)
+        missing, verdict = _write_and_print_summary(files, ending, outcome, host)
+    loss_of_files = files.close()
+    for loss in (*outcome.recording_losses, loss_of_files):
         if loss and loss not in missing:
             missing.append(loss)
-    _print_end(files, ending, outcome, missing, verdict)
+    _print_run_end(files, ending, outcome, missing, verdict)
     last_run.save_last_run(str(files.folder or "no folder"), _describe_ending(ending))
-    return _exit_code(ending, host, missing)
+    return _choose_exit_code(ending, host, missing)
 
 
-def _exit_code(ending: Ending, host: HostRecord | None, missing: Sequence[str]) -> int:
-    if ending.interrupted:
-        return INTERRUPTED
+def _choose_exit_code(ending: RunEnding, host: HostRecord | None, missing: Sequence[str]) -> int:
+    if ending.is_interrupted:
+        return EXIT_INTERRUPTED
     if host is None or ending.reason is not None:
-        return FAILED
-    return INCOMPLETE if missing else DONE
+        return EXIT_FAILED
+    return EXIT_INCOMPLETE if missing else EXIT_COMPLETE
 
 
-def note_reasons(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool = False) -> None:
-    """Note why a run is not complete. It is complete only if it was armed for all of its time.
+def add_end_causes(ending: RunEnding, host: HostRecord, config: RunConfig, *, stay: bool = False) -> None:
+    """Add the causes for which a run is not complete. A run is complete if it was armed for all of its time.
 
     Args:
-        ending: gets the reasons.
-        host: statistics of the host.
-        config: configuration of the run.
-        stay: whether faults that a person could reset are part of the run, not its end.
+        ending: Receives the causes.
+        host: Statistics of the host.
+        config: Configuration of the run.
+        stay: Whether faults that a person could reset are part of the run and do not end it.
     """
     if not stay:
         for fault in host.faults:
@@ -97,23 +101,25 @@ def note_reasons(ending: Ending, host: HostRecord, config: RunConfig, *, stay: b
         ending.add_cause(early_end)
 
 
-def _describe_ending(ending: Ending) -> str:
-    if ending.interrupted:
+def _describe_ending(ending: RunEnding) -> str:
+    if ending.is_interrupted:
         return "interrupted"
     return ending.reason or COMPLETE
 
 
-def _write_and_print(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) -> tuple[list[str], str]:
+def _write_and_print_summary(
+    files: RunFiles, ending: RunEnding, outcome: Outcome, host: HostRecord
+) -> tuple[list[str], str]:
     """Write summary and report of a run, and print the summary.
 
     Args:
-        files: The files of the run; without a folder, nothing is written.
-        ending: Why and how the run ended.
-        outcome: What the processes reported.
-        host: What the host reported at its end.
+        files: Files of the run; without a folder, nothing is written.
+        ending: How and why the run ended.
+        outcome: Results that the host and the processes reported.
+        host: Statistics of the host at its end.
 
     Returns:
-        What the record is missing, and the verdict of the report; the verdict is empty without one.
+        Sentences about missing data, and the text of the verdict. The text is empty if no report was written.
     """
     if files.folder is None:
         _print_host(host)
@@ -123,80 +129,85 @@ def _write_and_print(files: RunFiles, ending: Ending, outcome: Outcome, host: Ho
         print_summary(summary)
     except ConfigError as error:
         _print_host(host)
-        return [*describe_unwritten(host), str(error)], ""
-    missing = [*describe_unwritten(record.host), *record.unreached]
+        return [*describe_unwritten_data(host), str(error)], ""
+    missing = [*describe_unwritten_data(record.host), *record.recorder_losses]
     if not extras.is_installed("record"):
         return missing, ""
-    from snakesim_operator.results.report.verdict import verdict
+    from snakesim_operator.results.report.verdict import make_verdict
 
-    return missing, verdict(record, summary).words
+    return missing, make_verdict(record, summary).text
 
 
 def write_results(
-    files: RunFiles, folder: Path, ending: Ending, outcome: Outcome, *, report: bool = True
+    files: RunFiles, folder: Path, ending: RunEnding, outcome: Outcome, *, report: bool = True
 ) -> tuple[RunRecord, RunSummary]:
-    """Write summary and report from the record on disk.
+    """Load the record of a run from disk, and write its summary and report.
 
     Args:
-        files: writes into the run's folder.
-        folder: the run's folder, from which the record is read.
-        ending: how the run ended.
-        outcome: what the host and the processes reported.
-        report: whether to write the report too, if its extra is installed.
+        files: Writer of the files in the folder.
+        folder: Folder of the run, from which the record is read.
+        ending: How and why the run ended.
+        outcome: Results that the host and the processes reported.
+        report: Whether to write the report, too, if its extra is installed.
+
+    Returns:
+        The record, and its summary.
 
     Raises:
-        ConfigError: the folder has no valid record.
+        ConfigError: The folder contains no valid record.
     """
-    files.settle()
-    record = RunRecord.load(folder, outcome.host)
-    summary = summarise(record, _describe_ending(ending), outcome.restarts, outcome.hosts)
-    if outcome.too_slow:
-        summary = msgspec.structs.replace(summary, too_slow=list(outcome.too_slow))
-    files.write_file(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
+    files.wait_until_written()
+    record = RunRecord.load(folder, outcome.host_record)
+    summary = summarize_run(record, _describe_ending(ending), outcome.restarts, outcome.host_count)
+    if outcome.slow_services:
+        summary = msgspec.structs.replace(summary, too_slow=list(outcome.slow_services))
+    files.write_file(SUMMARY_FILENAME, msgspec.json.format(msgspec.json.encode(summary), indent=2))
     if report and extras.is_installed("record"):
         # Templates take a while to import, and the start of a run does not wait for them.
-        from snakesim_operator.results.report import page
+        from snakesim_operator.results.report import render_report
 
-        files.write_file(REPORT, page(record, summary).encode())
+        files.write_file(REPORT_FILENAME, render_report(record, summary).encode())
     return record, summary
 
 
-def _print_end(files: RunFiles, ending: Ending, outcome: Outcome, missing: Sequence[str], verdict: str) -> None:
+def _print_run_end(files: RunFiles, ending: RunEnding, outcome: Outcome, missing: Sequence[str], verdict: str) -> None:
     if files.folder is not None:
         _print_paths(files.folder)
     if verdict:
         print_line(verdict)
-    if outcome.host is None:
+    if outcome.host_record is None:
         reason = ending.reason or "the host ended early"
         logs = f"; the logs of its processes are in {files.folder}" if files.folder is not None else ""
         print_line(f"the run left no record: {reason}{logs}")
-    elif ending.reason is not None and not ending.interrupted:
+    elif ending.reason is not None and not ending.is_interrupted:
         print_line(f"fault: {ending.reason}")
     if missing:
         print_line(f"record: incomplete: {'; '.join(missing)}")
-    if outcome.robot is not None:
-        _print_kept_stop(outcome.robot)
+    if outcome.description is not None:
+        _print_stored_emergency_stop(outcome.description)
 
 
 def _print_paths(folder: Path) -> None:
-    """Print where summary and report are, as far as they were written."""
-    for title, name in (("summary", SUMMARY), ("report", REPORT)):
+    """Print the paths of the summary and the report, if they were written."""
+    for title, name in (("summary", SUMMARY_FILENAME), ("report", REPORT_FILENAME)):
         path = folder / name
         if path.is_file():
             print_line(f"{title + ':':<9}{path}")
-    if (folder / SUMMARY).is_file() and not extras.is_installed("record"):
-        print_line(f"report:  not written; {pip_install('record')}, then `snakesim recording report {folder}`")
+    if (folder / SUMMARY_FILENAME).is_file() and not extras.is_installed("record"):
+        print_line(
+            f"report:  not written; {make_pip_install_command('record')}, then `snakesim recording report {folder}`"
+        )
 
 
-def _print_kept_stop(robot: Description) -> None:
-    """Print how to reset an emergency stop, if one is stored."""
-    stop = robot_folder(robot.robot, robot.backend, robot.hardware) / ESTOP
+def _print_stored_emergency_stop(robot: Description) -> None:
+    """Print how to reset a stored emergency stop of the robot, if there is one."""
+    stop = get_robot_state_folder(robot.robot, robot.backend, robot.hardware) / ESTOP
     if stop.is_file():
         print_line(f"{robot.robot} is still stopped, and begins so in every run: `snakesim robot reset` ends that")
 
 
 def _print_host(host: HostRecord) -> None:
-    """Print what is known without a record on disk."""
+    """Print the statistics of the host, if there is no record on disk."""
     _print_row("ticks", f"{host.ticks}, of which {host.armed_ticks} armed, in {host.wall_s:.2f} s")
     _print_row("command digest", host.command_digest[:16])
     for fault in host.faults:
@@ -208,21 +219,21 @@ def _print_row(name: str, value: str) -> None:
 
 
 def print_summary(summary: RunSummary) -> None:
-    """Print the numbers of a run, one line each."""
-    for name, value in (*_motion_rows(summary), *_state_rows(summary), *_failure_rows(summary)):
+    """Print the main metrics of a run, one per line."""
+    for name, value in (*_make_motion_rows(summary), *_make_state_rows(summary), *_make_failure_rows(summary)):
         _print_row(name, value)
     for missing in summary.missing:
         _print_row("not known", missing)
 
 
-def _motion_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return how far, how fast and with which forces the robot moved."""
-    distance = _format_number(distance_m(summary), "m", 3)
-    speed = _format_number(summary.real_time_factor, "x", 1)
+def _make_motion_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """Make the rows about the motion: distance, time, propulsion, torque, energy and forces."""
+    distance_text = _format_number(get_distance_m(summary), "m", 3)
+    speed_text = _format_number(summary.real_time_factor, "x", 1)
     rows = [
         _describe_hardware(summary),
-        ("moved" if summary.path_distance_m is None else "moved along the path", distance),
-        ("time", f"{summary.duration_s:.2f} s in {summary.wall_s:.2f} s ({speed})"),
+        ("moved" if summary.path_distance_m is None else "moved along the path", distance_text),
+        ("time", f"{summary.duration_s:.2f} s in {summary.wall_s:.2f} s ({speed_text})"),
     ]
     if summary.crossed_s:
         rows.append(("goal", f"{summary.goal_m:g} m, reached after {summary.crossed_s:.1f} s"))
@@ -239,8 +250,8 @@ def _motion_rows(summary: RunSummary) -> list[tuple[str, str]]:
     return rows
 
 
-def _state_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return the last state, the digest, and what control and navigation reported."""
+def _make_state_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """Make the rows about the last state, the command digest, slow services and estimates."""
     last_state = f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"
     rows = [("last state", last_state)]
     measured = (summary.last_state, summary.last_reason)
@@ -249,12 +260,12 @@ def _state_rows(summary: RunSummary) -> list[tuple[str, str]]:
         rows.append(("control reported", f"{summary.reported_state}: {summary.reported_reason}"))
     rows.append(("command digest", format_digest(summary.command_digest, summary.own_arithmetic)))
     rows += [("too slow", service) for service in summary.too_slow]
-    rows += [("estimated", text) for text in estimates_of(summary).in_words()]
+    rows += [("estimated", text) for text in get_estimates(summary).describe()]
     return rows
 
 
-def _failure_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return faults, isolated joints, restarts and jams; empty for a run without any."""
+def _make_failure_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """Make the rows about faults, isolated joints, restarts and jams; empty for a run without any."""
     rows: list[tuple[str, str]] = []
     if summary.faults:
         count = len(summary.faults) + summary.faults_left_out
@@ -279,7 +290,7 @@ def _format_time_fraction(fraction: float | None) -> str:
 
 
 def _describe_force_tracking(summary: RunSummary) -> str:
-    """Return how well measured forces follow the desired ones; empty when there was nothing to compare."""
+    """Describe how well measured forces follow the desired forces; empty if there was nothing to compare."""
     error = summary.desired_force_error
     without_contact = summary.empty_push_points
     correlation = summary.desired_force_correlation
@@ -290,9 +301,10 @@ def _describe_force_tracking(summary: RunSummary) -> str:
 
 
 def _describe_energy(summary: RunSummary) -> str:
-    """Return the energy per meter towards the goal.
+    """Describe the energy per meter towards the goal.
 
-    Without a goal it counts along the first heading, and along the displacement if that has another direction.
+    Without a goal, the energy per meter along the first heading is described, and that along the displacement if the
+    displacement has another direction.
     """
     along_j_per_m = summary.energy_j_per_m
     displaced_j_per_m = summary.displacement_energy_j_per_m
@@ -307,7 +319,7 @@ def _describe_energy(summary: RunSummary) -> str:
 
 
 def _describe_hardware(summary: RunSummary) -> tuple[str, str]:
-    """Return whether real motors moved, as the title and text of a row."""
+    """Make the row about whether real motors moved: its title and its text."""
     match summary.emulated:
         case True:
             return EMULATED, f"nothing real moved (backend {summary.backend})"
@@ -318,11 +330,11 @@ def _describe_hardware(summary: RunSummary) -> tuple[str, str]:
 
 
 def _describe_propulsion(summary: RunSummary) -> str:
-    """Return the propulsion joints in the order in which they took over."""
+    """Describe the propulsion joints in the order in which they took over."""
     joints = summary.propulsion_joints
     if joints is None:
         return "unknown"
-    if len(joints) <= JOINTS_SHOWN:
+    if len(joints) <= MAX_JOINTS_SHOWN:
         return " -> ".join(joints) or "no joint alone"
-    first_joints = " -> ".join(joints[:JOINTS_SHOWN])
+    first_joints = " -> ".join(joints[:MAX_JOINTS_SHOWN])
     return f"{first_joints} -> ... ({summary.hand_overs} hand-overs in all)"

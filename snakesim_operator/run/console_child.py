@@ -10,45 +10,47 @@ from snakesim_hal.network.session import Link
 from snakesim_operator.base import extras
 from snakesim_operator.base.console_port import open_console_ports
 from snakesim_operator.run import children
-from snakesim_operator.run.console_front import start_front
+from snakesim_operator.run.console_front import start_console_front
 from snakesim_operator.run.run_files import RunFiles
 
-CONSOLE = "snakesim_operator.features.console"
-LOG = "console.log"  # in the folder of the run
+CONSOLE_MODULE = "snakesim_operator.features.console"
+LOG_FILENAME = "console.log"  # in the folder of the run
 
 
-def check_console() -> None:
-    """Check that the console and the packages that it needs are installed. Raises ConfigError if they are not."""
-    if importlib.util.find_spec(CONSOLE) is None:
+def require_console() -> None:
+    """Raise ConfigError if the console or a package that it needs is not installed."""
+    if importlib.util.find_spec(CONSOLE_MODULE) is None:
         raise ConfigError(
             "--console: this installation is one without the console; leave it out", code="extra/not-installed"
         )
-    extras.require("console", "--console", "; or leave it out")
+    extras.require_extra("console", "--console", "; or leave it out")
 
 
 @contextlib.contextmanager
-def console_beside(common: Sequence[str], link: Link, files: RunFiles, report: Callable[[str], None]) -> Iterator[None]:
-    """Run the console for as long as the context lives.
+def run_console(
+    common_arguments: Sequence[str], link: Link, files: RunFiles, report: Callable[[str], None]
+) -> Iterator[None]:
+    """Run the console in two child processes while the context is active.
 
     Args:
-        common: arguments that every process of the run gets, such as its scenario and endpoint.
-        link: how the console reaches the robot.
-        files: get what the console prints.
-        report: gets the address of the page.
+        common_arguments: Command-line arguments of every process of the run, such as its scenario and endpoint.
+        link: Connection of the console to the robot.
+        files: Files of the run, which receive the output of the console.
+        report: Called with the address of the page, and with warnings.
     """
-    keep = partial(files.append, LOG)
+    on_output = partial(files.append, LOG_FILENAME)
     with open_console_ports(None) as ports:
-        front = start_front(ports, link, keep)
-        handle = ports.pages.fileno()
-        arguments = [CONSOLE, *common, "--listening", str(handle)]
-        pages = children.start_child("console", arguments, keep, inherits=[handle])
+        front = start_console_front(ports, link, on_output)
+        pages_fd = ports.pages.fileno()
+        arguments = [CONSOLE_MODULE, *common_arguments, "--listening", str(pages_fd)]
+        pages = children.start_child("console", arguments, on_output, pass_fds=[pages_fd])
         report(f"console: {ports.address}")
         # This process closes its copies: if the console ends, browsers then lose their connection at once.
         ports.close()
         try:
             yield
         finally:
-            children.stop_all([pages, front])
+            children.stop_children([pages, front])
             for child in (pages, front):
                 if child.was_killed:
                     report(f"warning: {child.describe_end()}")

@@ -6,25 +6,32 @@ from snakesim_hal.network.session import Link
 from snakesim_operator.base.console_port import TOKEN_VARIABLE, ConsolePorts
 from snakesim_operator.run import children
 
-FRONT = "snakesim_operator.features.console.front"
+FRONT_MODULE = "snakesim_operator.features.console.front"
 
 
-def start_front(ports: ConsolePorts, link: Link | None, keep: Callable[[bytes], object]) -> children.Child:
-    """Start the front server.
+def start_console_front(ports: ConsolePorts, link: Link | None, on_output: Callable[[bytes], object]) -> children.Child:
+    """Start the front server of a console as a child process.
 
     Args:
-        ports: Where it listens, and where it finds the page server.
-        link: How it reaches the robot that its stop is for; None for a recording.
-        keep: Gets what it prints, in another thread.
+        ports: Sockets of the console, and the path of the page server.
+        link: Connection to the robot that its stop button stops; None for a recording.
+        on_output: Called with each piece of output of the server, in another thread.
     """
-    handle = ports.browsers.fileno()
-    arguments = [FRONT, "--browsers", str(handle), "--pages", str(ports.pages_path), *_describe_robot(link)]
+    browsers_fd = ports.browsers.fileno()
+    arguments = [
+        FRONT_MODULE,
+        "--browsers",
+        str(browsers_fd),
+        "--pages",
+        str(ports.pages_path),
+        *_make_robot_arguments(link),
+    ]
     token = {TOKEN_VARIABLE: ports.token}
-    return children.start_child("console front", arguments, keep, inherits=[handle], more=token)
+    return children.start_child("console front", arguments, on_output, pass_fds=[browsers_fd], extra_env=token)
 
 
-def _describe_robot(link: Link | None) -> list[str]:
-    """Return the arguments by which the front server finds the robot."""
+def _make_robot_arguments(link: Link | None) -> list[str]:
+    """Return the command-line arguments by which the front server finds the robot."""
     if link is None:
         return ["--recording"]
     robot = [] if link.namespace is None else ["--namespace", link.namespace]

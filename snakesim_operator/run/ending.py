@@ -6,25 +6,30 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from types import FrameType
 
-from snakesim_hal.base.process import stop_signals
+from snakesim_hal.base.process import list_stop_signals
 
 
 @dataclass
-class Ending:
-    """How the run ended, as it becomes known."""
+class RunEnding:
+    """Collects how and why a run ends."""
 
     causes: list[str] = field(default_factory=list[str])
-    interrupted: bool = False
-    over: bool = False  # the robot has stopped: from here on a signal does not change how the run ended
+    is_interrupted: bool = False
+    is_over: bool = False  # the robot has stopped; later signals do not change how the run ended
     on_interrupt: Callable[[], None] = lambda: None  # called by the signal handler
 
     @property
     def reason(self) -> str | None:
-        """All causes, before their consequences; None when there are none."""
+        """All causes as one text; None if there is none."""
         return "; ".join(self.causes) or None
 
     def add_cause(self, cause: str, *, first: bool = False) -> None:
-        """Add a cause, once. first: the causes that were added before are consequences of it."""
+        """Add a cause, unless it was added before.
+
+        Args:
+            cause: A sentence.
+            first: Whether the causes that were added before are consequences of this one.
+        """
         if cause in self.causes:
             return
         if first:
@@ -34,21 +39,21 @@ class Ending:
 
 
 @contextlib.contextmanager
-def interruptible(ending: Ending) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and a closed terminal end the run in order, for as long as the context lives.
+def end_run_on_signals(ending: RunEnding) -> Iterator[None]:
+    """End the run in order on Ctrl-C, SIGTERM or a closed terminal, while the context is active.
 
     A signal that arrives while the record and the report of a finished run are written does not stop that. A second
     Ctrl-C or SIGTERM has its default effect. A second SIGHUP has none, because the kernel and the shell both send one.
     """
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
-        if not ending.over:
-            ending.interrupted = True
+        if not ending.is_over:
+            ending.is_interrupted = True
             ending.on_interrupt()
         next_handler = signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL
         signal.signal(number, next_handler)
 
-    old_handlers = {number: signal.signal(number, on_signal) for number in stop_signals()}
+    old_handlers = {number: signal.signal(number, on_signal) for number in list_stop_signals()}
     try:
         yield
     finally:

@@ -7,49 +7,57 @@ from collections.abc import Callable, Iterator
 from datetime import datetime
 from pathlib import Path
 
-from snakesim_hal.base.atomic_write import PARTIAL
+from snakesim_hal.base.atomic_write import PARTIAL_SUFFIX
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD
-from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.run_reader import CONFIG, REPORT, SUMMARY
+from snakesim_operator.recording.message import RECORDING_FILENAME
+from snakesim_operator.results.run_reader import CONFIG_FILENAME, REPORT_FILENAME, SUMMARY_FILENAME
 
 LOCK = "run.lock"  # holds the process id of the run that is writing here
 FILES_OF_OLDER_VERSIONS = ("telemetry.jsonl", "blackbox.npz")
-RUN_FILES = (CONFIG, HOST_RECORD, BLACK_BOX, RECORDING, SUMMARY, REPORT, *FILES_OF_OLDER_VERSIONS)
+RUN_FILES = (
+    CONFIG_FILENAME,
+    HOST_RECORD,
+    BLACK_BOX,
+    RECORDING_FILENAME,
+    SUMMARY_FILENAME,
+    REPORT_FILENAME,
+    *FILES_OF_OLDER_VERSIONS,
+)
 TIME_FORMAT = "%Y%m%d-%H%M%S"
-MAX_OPEN_ATTEMPTS = 10  # of a folder that others rename meanwhile
+MAX_OPEN_ATTEMPTS = 10  # attempts for a folder that other processes rename meanwhile
 
 
-def default_folder(name: str) -> Path:
+def choose_default_folder(name: str) -> Path:
     """Return the default folder of a run, runs/NAME-TIME, which does not exist yet."""
     out = Path("runs") / f"{name}-{datetime.now().strftime(TIME_FORMAT)}"
     return _find_free_path(out)
 
 
 @contextlib.contextmanager
-def locked_folder(out: Path, report: Callable[[str], None]) -> Iterator[Path]:
-    """Lock a folder for a run, for as long as the context lives. The kernel unlocks it after a SIGKILL.
+def lock_run_folder(out: Path, report: Callable[[str], None]) -> Iterator[Path]:
+    """Lock a folder for a run while the context is active. The kernel unlocks it after a SIGKILL.
 
-    An earlier run in the folder is renamed first.
+    A folder with an earlier run is renamed first, and created again.
 
     Args:
-        out: the folder; made if it does not exist.
-        report: gets a sentence if an earlier run was renamed.
+        out: Path of the folder; created if it does not exist.
+        report: Called with a sentence if an earlier run was renamed.
 
     Yields:
         The absolute path of the folder.
 
     Raises:
-        ConfigError: another run has locked the folder, or it is not usable.
-        OSError: the folder is not writable.
+        ConfigError: Another run has locked the folder, or it is not usable.
+        OSError: The folder is not writable.
     """
     out = out.resolve()
     with contextlib.ExitStack() as locks:
-        locks.enter_context(_lock(out))
+        locks.enter_context(_hold_lock_file(out))
         if any((out / name).exists() for name in RUN_FILES):
             renamed = _rename_earlier_run(out)
             report(f"{out} held an earlier run: moved to {renamed}")
-            locks.enter_context(_lock(out))
+            locks.enter_context(_hold_lock_file(out))
         try:
             yield out
         finally:
@@ -57,15 +65,15 @@ def locked_folder(out: Path, report: Callable[[str], None]) -> Iterator[Path]:
 
 
 def _remove_partial_files(out: Path) -> None:
-    """Remove what processes that were killed while writing have left."""
-    for partial in out.glob(f"*{PARTIAL}"):
+    """Remove the partial files of processes that were killed while writing."""
+    for partial in out.glob(f"*{PARTIAL_SUFFIX}"):
         with contextlib.suppress(OSError):
             partial.unlink()
 
 
 @contextlib.contextmanager
-def _lock(out: Path) -> Iterator[None]:
-    """Hold the lock file of a folder, which is removed at the end. Raises ConfigError when another run holds it."""
+def _hold_lock_file(out: Path) -> Iterator[None]:
+    """Hold the lock file of a folder while the context is active. Raises ConfigError if another run holds it."""
     path = out / LOCK
     lock_handle = None
     while lock_handle is None:
@@ -83,11 +91,14 @@ def _lock(out: Path) -> Iterator[None]:
 
 
 def _try_to_lock(out: Path) -> int | None:
-    """Lock the lock file of a folder once.
+    """Try once to lock the lock file of a folder.
 
     Returns:
-        The handle of the locked file. None if the file at that path is no longer the locked one, because the run that
-        had locked it has just ended or the folder was renamed: then the caller tries again.
+        The handle of the locked file, or None if the caller has to try again: the file at that path is no longer the
+        locked file, because the run that had locked it has just ended, or because the folder was renamed.
+
+    Raises:
+        ConfigError: Another run has locked the folder.
     """
     folder_handle = _open_folder(out)
     try:
@@ -115,7 +126,7 @@ def _try_to_lock(out: Path) -> int | None:
 
 
 def _open_folder(out: Path) -> int:
-    """Return a handle of the folder, which is made if it does not exist. Raises ConfigError."""
+    """Create a folder if it does not exist, and return a handle of it. Raises ConfigError if that fails."""
     attempts_left = MAX_OPEN_ATTEMPTS
     while True:
         attempts_left -= 1
@@ -144,9 +155,9 @@ def _rename_earlier_run(out: Path) -> Path:
         raise ConfigError(
             f"--out {out} holds an earlier run, and you are in it; choose another folder", code="file/already-exists"
         )
-    began_s = min((out / name).stat().st_mtime for name in RUN_FILES if (out / name).exists())
-    began = datetime.fromtimestamp(began_s).strftime(TIME_FORMAT)
-    renamed = _find_free_path(out.with_name(f"{out.name}.{began}"))
+    start_s = min((out / name).stat().st_mtime for name in RUN_FILES if (out / name).exists())
+    start_time = datetime.fromtimestamp(start_s).strftime(TIME_FORMAT)
+    renamed = _find_free_path(out.with_name(f"{out.name}.{start_time}"))
     try:
         out.rename(renamed)
     except OSError as error:
@@ -160,7 +171,7 @@ def _rename_earlier_run(out: Path) -> Path:
 
 
 def _find_free_path(path: Path) -> Path:
-    """Return the path, with a number appended if it exists."""
+    """Return the path, with a number appended if the path exists."""
     free_path = path
     number = 1
     while free_path.exists():

@@ -13,56 +13,56 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-from snakesim_hal.base.process import die_with_parent, limit_memory, stop_signals
+from snakesim_hal.base.process import limit_memory, list_stop_signals, set_parent_death_signal
 from snakesim_hal.base.step_limit import SharedStepTimes
 from snakesim_hal.base.terminal import print_stderr
 
 CHECK_PERIOD_S = 0.25
-INTERRUPT_LIMIT_S = 3.0  # for the present step, after Ctrl-C; Python code is interrupted long before
-OVERDUE_LIMIT_S = 5.0  # for a step that is due; Python code is interrupted long before
+INTERRUPT_TIMEOUT_S = 3.0  # for the current step, after Ctrl-C; Python code is interrupted long before
+OVERDUE_TIMEOUT_S = 5.0  # for a step that is due; Python code is interrupted long before
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130  # as shells report a program that Ctrl-C has ended
 RECORD_HINT = "What was recorded until then is in the run's folder; `snakesim recording report FOLDER` shows it"
 
 
-def run_guarded(act: Callable[[SharedStepTimes | None], int], *, owns_process: bool) -> int:
-    """Call a function in a child process, which this process can end whatever the function does.
+def run_in_guarded_child(function: Callable[[SharedStepTimes | None], int], *, owns_process: bool) -> int:
+    """Call a function in a child process, which this process can end even if the function hangs.
 
     Args:
-        act: the function; gets the step times by which it shows its progress, and returns an exit code.
-        owns_process: whether this process does nothing else. If it does, it must not be forked, and the function is
-            called in this process, without step times.
+        function: Function to call; it gets the shared step times that show its progress, and returns an exit code.
+        owns_process: Whether this process does nothing else. A process with other work must not be forked, so the
+            function is called in this process, without step times.
 
     Returns:
         The exit code of the command.
     """
     if not owns_process:
-        return act(None)
+        return function(None)
     sys.stdout.flush()
     sys.stderr.flush()
     step_times = SharedStepTimes()
-    command = os.getpid()
-    child = os.fork()
-    if child != 0:
-        return _Guard(child, step_times).wait()
+    parent_pid = os.getpid()
+    child_pid = os.fork()
+    if child_pid != 0:
+        return _ChildGuard(child_pid, step_times).wait_for_exit()
     os.setsid()  # Ctrl-C then reaches the command alone, which forwards it
-    die_with_parent(command)
+    set_parent_death_signal(parent_pid)
     limit_memory()
-    return act(step_times)
+    return function(step_times)
 
 
-class _Guard:
+class _ChildGuard:
     """Waits for the child in the process of the command, forwards signals to it, and kills it if it does not react."""
 
-    def __init__(self, child: int, step_times: SharedStepTimes) -> None:
-        self._child = child
+    def __init__(self, child_pid: int, step_times: SharedStepTimes) -> None:
+        self._child_pid = child_pid
         self._step_times = step_times
-        self._signalled_s: float | None = None
-        self._handle = os.pidfd_open(child)
-        for number in stop_signals():
+        self._signal_time_s: float | None = None
+        self._handle = os.pidfd_open(child_pid)
+        for number in list_stop_signals():
             signal.signal(number, self._forward_signal)
 
-    def wait(self) -> int:
+    def wait_for_exit(self) -> int:
         """Wait until the child has ended, and return the exit code of the command."""
         kill_reason = ""
         while not self._has_ended():
@@ -70,15 +70,15 @@ class _Guard:
                 continue
             kill_reason = self._find_kill_reason()
             if kill_reason:
-                os.kill(self._child, signal.SIGKILL)
-        _, wait_status = os.waitpid(self._child, 0)
+                os.kill(self._child_pid, signal.SIGKILL)
+        _, wait_status = os.waitpid(self._child_pid, 0)
         code = os.waitstatus_to_exitcode(wait_status)
         was_killed = code < 0  # minus the number of the signal that ended it
         if kill_reason:
             print_stderr(f"snakesim: {kill_reason}; its process was killed. {RECORD_HINT}")
         if not was_killed:
             return code
-        if self._signalled_s is not None:
+        if self._signal_time_s is not None:
             return EXIT_INTERRUPTED
         if not kill_reason:
             print_stderr(f"snakesim: {_describe_end(-code)}. {RECORD_HINT}")
@@ -91,24 +91,26 @@ class _Guard:
 
     def _forward_signal(self, number: int, _frame: FrameType | None) -> None:
         """Forward the first signal to the child; kill the child at another one."""
-        if self._signalled_s is None:
-            self._signalled_s = time.monotonic()
-            os.kill(self._child, number)
+        if self._signal_time_s is None:
+            self._signal_time_s = time.monotonic()
+            os.kill(self._child_pid, number)
         elif number != signal.SIGHUP:  # the kernel and the shell both send one
-            os.kill(self._child, signal.SIGKILL)
+            os.kill(self._child_pid, signal.SIGKILL)
 
     def _find_kill_reason(self) -> str:
-        """Return why the child is to be killed; empty while it makes progress."""
-        step_s = self._step_times.read_step_times()
-        if step_s is None:
+        """Return why the child has to be killed; empty while the child makes progress."""
+        step_times = self._step_times.read_step_times()
+        if step_times is None:
             return ""
-        began_s, due_s = step_s
+        start_s, due_s = step_times
         now_s = time.monotonic()
-        if now_s > due_s + OVERDUE_LIMIT_S:
-            return f"one step of the run took longer than {due_s - began_s:g} s, in compiled code"
-        signalled_s = self._signalled_s
-        if signalled_s is not None and began_s <= signalled_s < now_s - INTERRUPT_LIMIT_S:
-            return f"one step of the run had not returned {INTERRUPT_LIMIT_S:g} s after it received the signal to stop"
+        if now_s > due_s + OVERDUE_TIMEOUT_S:
+            return f"one step of the run took longer than {due_s - start_s:g} s, in compiled code"
+        signal_time_s = self._signal_time_s
+        if signal_time_s is not None and start_s <= signal_time_s < now_s - INTERRUPT_TIMEOUT_S:
+            return (
+                f"one step of the run had not returned {INTERRUPT_TIMEOUT_S:g} s after it received the signal to stop"
+            )
         return ""
 
 

@@ -7,34 +7,34 @@ from functools import partial
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import write_config
 from snakesim_hal.network.session import Link
-from snakesim_hal.programs.host_program import host
-from snakesim_hal.programs.preflight import check_backend
-from snakesim_hal.programs.service_program import process_options
-from snakesim_operator.results.run_reader import CONFIG
-from snakesim_operator.run.folder import locked_folder
+from snakesim_hal.programs.host_program import run_host_program
+from snakesim_hal.programs.preflight import validate_backend_config
+from snakesim_hal.programs.service_program import read_process_options
+from snakesim_operator.results.run_reader import CONFIG_FILENAME
+from snakesim_operator.run.folder import lock_run_folder
 
 
 def run_host(arguments: argparse.Namespace) -> int:
     """Run the HAL host of a robot in this process, until it ends by itself or is stopped.
 
     Args:
-        arguments: the parsed command line. If it names a folder with `--out`, the host writes its record there.
+        arguments: Parsed command line. With `--out`, the host writes its record into that folder.
 
     Returns:
-        0 if all ticks were done without a fault, 1 otherwise.
+        The exit code: 0 if all ticks were done without a fault, otherwise 1.
 
     Raises:
-        SnakesimError: the host cannot begin.
+        SnakesimError: The host cannot start.
     """
-    options = process_options(arguments, hosts=True)
+    options = read_process_options(arguments, hosts=True)
     link = options.link
-    config = check_backend(options.config, options.loaded.table)
-    with contextlib.ExitStack() as opened:
+    config = validate_backend_config(options.config, options.loaded.table)
+    with contextlib.ExitStack() as exit_stack:
         if arguments.out is not None:
-            arguments.out = opened.enter_context(locked_folder(arguments.out, print_line))
-            write_config(config, arguments.out / CONFIG)
+            arguments.out = exit_stack.enter_context(lock_run_folder(arguments.out, print_line))
+            write_config(config, arguments.out / CONFIG_FILENAME)
         print_line(f"{link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
-        return host(options, partial(_report_network, link))
+        return run_host_program(options, partial(_report_network, link))
 
 
 def _report_network(link: Link) -> None:

@@ -1,9 +1,9 @@
 """Runs without processes or a network: `snakesim run --in-process`, and `simulate` for programs.
 
-    from snakesim_hal.model.scenario import load, parse_set
+    from snakesim_hal.model.scenario import load_scenario, parse_set_option
     from snakesim_operator.run.in_process import simulate
 
-    result = simulate(load("triplet", [parse_set("seed=3"), parse_set("duration_s=5")]).config)
+    result = simulate(load_scenario("triplet", [parse_set_option("seed=3"), parse_set_option("duration_s=5")]).config)
     result.summary.path_distance_m, result.record.angle_rad
 
 The run takes as long as its computing. Several at a time go into processes of their own, such as a ProcessPoolExecutor.
@@ -25,39 +25,39 @@ from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError
 from snakesim_hal.base.step_limit import SharedStepTimes
 from snakesim_hal.base.terminal import print_line, print_stderr
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.model.plugins import anything_offered
+from snakesim_hal.model.plugins import has_registered_plugins
 from snakesim_hal.model.scenario import RunConfig, write_config
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
 from snakesim_hal.programs.host_program import create_host_record
-from snakesim_hal.programs.preflight import check_plugins
-from snakesim_hal.programs.single_process import InProcessRun, check
+from snakesim_hal.programs.preflight import validate_and_complete_config
+from snakesim_hal.programs.single_process import InProcessRun, validate_single_process_config
 from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.base import extras
-from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.metrics.advance import GoalWatch
-from snakesim_operator.results.recording_contents import SERVICE_STREAMS
+from snakesim_operator.recording.message import RECORDING_FILENAME
+from snakesim_operator.results.metrics.advance import GoalMonitor
+from snakesim_operator.results.recording_contents import SERVICE_OUTPUT_KEYS
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import CONFIG
+from snakesim_operator.results.run_reader import CONFIG_FILENAME
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.conclusion import Outcome, conclude, note_reasons, write_results
-from snakesim_operator.run.ending import Ending, interruptible
-from snakesim_operator.run.pinned_process import call_pinned
+from snakesim_operator.run.conclusion import Outcome, add_end_causes, write_and_print_results, write_results
+from snakesim_operator.run.ending import RunEnding, end_run_on_signals
+from snakesim_operator.run.pinned_process import call_in_pinned_process
 from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.run import check_recorder, opened_files
+from snakesim_operator.run.run import open_run_files, require_recorder
 from snakesim_operator.run.run_files import RunFiles
 
 if TYPE_CHECKING:
     from snakesim_operator.recording.writer import RecordingWriter
 
 LOG_FILE = "run.log"  # gets what the parts of the run print to stderr
-POLL_TICKS = 50  # between two looks at the progress, the goal and the recording
+TICKS_PER_POLL = 50  # between two looks at the progress, the goal and the recording
 
 
 class ChildTracebackError(Exception):
-    """Stands for an exception of a child process; its text is the traceback there."""
+    """Replaces an exception of a child process; its text is the traceback in the child."""
 
     def __str__(self) -> str:
         return f"\n{self.args[0]}"
@@ -65,14 +65,14 @@ class ChildTracebackError(Exception):
 
 @dataclass(frozen=True)
 class ControlFailure:
-    """Why control could not continue."""
+    """The reason why control could not continue."""
 
     message: str
-    cause: BaseException | None  # what the controller raised; None: its answer was not allowed
+    cause: BaseException | None  # exception of the controller; None if its command was invalid
 
     @staticmethod
     def from_error(error: SnakesimError | None) -> "ControlFailure | None":
-        """Return the failure that belongs to the error that ended control; None without an error."""
+        """Make the failure for the error that ended control; None without an error."""
         if error is None:
             return None
         if isinstance(error, ControllerError):
@@ -80,7 +80,7 @@ class ControlFailure:
         return ControlFailure(str(error), error)
 
     def __reduce__(self) -> Any:
-        """Pickle the traceback as text: frames stay in their process."""
+        """Pickle the traceback as text, because its frames cannot be pickled."""
         if self.cause is None:
             return ControlFailure, (self.message, None)
         text = "".join(traceback.format_exception(self.cause))
@@ -89,12 +89,12 @@ class ControlFailure:
 
 @dataclass(frozen=True)
 class Result:
-    """A run that is over; `summary.ended` is how it ended."""
+    """Results of a run that is over; `summary.ended` is how it ended."""
 
     record: RunRecord  # every tick, and what control and guidance reported
     summary: RunSummary
-    gave_up: bool = False  # the run was ended because the robot was stuck
-    control_failure: ControlFailure | None = None  # None: control went on to the end
+    has_stalled: bool = False  # the run was ended because the robot was stuck
+    control_failure: ControlFailure | None = None  # None if control continued until the end
 
 
 def simulate(
@@ -102,7 +102,7 @@ def simulate(
     out: Path | None = None,
     *,
     until_goal: bool = False,
-    give_up_s: float | None = None,
+    stall_timeout_s: float | None = None,
     turn_limit_s: float | None = None,
 ) -> Result:
     """Run a configuration in this process, and return what was recorded.
@@ -113,62 +113,62 @@ def simulate(
     may be its computer's own (`summary.own_arithmetic`).
 
     Args:
-        config: configuration of the run.
-        out: folder for the files of the run, with the report; None keeps no files.
-        until_goal: whether a run whose mission has a goal is complete soon after the goal is reached.
-        give_up_s: robot time without 3 cm of advance towards the goal after which the run ends; None: never.
-        turn_limit_s: wall time that a part of the run may take in one tick, 60 s by default, or `start_limit_s` if
+        config: Configuration of the run.
+        out: Path of the folder for the files of the run, with the report; None to keep no files.
+        until_goal: Whether the run is complete soon after the goal of its mission is reached.
+        stall_timeout_s: Robot time without 3 cm of advance to the goal that ends the run, in s; None for no timeout.
+        turn_limit_s: Wall time that a part of the run may take in one tick, 60 s by default, or `start_limit_s` if
             that is longer.
 
     Returns:
         The record and the summary, also for a run that ended early.
 
     Raises:
-        SnakesimError: the run cannot begin.
+        SnakesimError: The run cannot start.
     """
     if not isinstance(config, RunConfig):
         raise ConfigError(
             f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path",
             code="python/invalid-argument",
         )
-    if not is_pinned() and not anything_offered():  # a child would not have the plugins that this program offers
-        return call_pinned(
+    if not is_pinned() and not has_registered_plugins():  # a child would not have the plugins that this program offers
+        return call_in_pinned_process(
             simulate,
             config=config,
             out=out,
             until_goal=until_goal,
-            give_up_s=give_up_s,
+            stall_timeout_s=stall_timeout_s,
             turn_limit_s=turn_limit_s,
         )
-    extras.require("record", "`simulate`, whose results are read from a recording,")
-    config = check_plugins(config)
-    ending = Ending()
-    with contextlib.ExitStack() as opened:
+    extras.require_extra("record", "`simulate`, whose results are read from a recording,")
+    config = validate_and_complete_config(config)
+    ending = RunEnding()
+    with contextlib.ExitStack() as exit_stack:
         if out is None:
-            folder = Path(opened.enter_context(TemporaryDirectory(prefix="snakesim-")))
-            write_config(config, folder / CONFIG)
+            folder = Path(exit_stack.enter_context(TemporaryDirectory(prefix="snakesim-")))
+            write_config(config, folder / CONFIG_FILENAME)
             files = RunFiles(folder, print_stderr)
         else:
-            files, _ = opened.enter_context(opened_files(config, out))
+            files, _ = exit_stack.enter_context(open_run_files(config, out))
         if files.folder is None:
             raise ConfigError(f"{out} cannot be written to; choose another folder", code="file/not-writable")
-        opened.callback(files.close)
-        recorded_keys = (*SERVICE_STREAMS, keys.CONTACTS) if out is None else _all_keys()
-        run, outcome, gave_up = _run_to_end(
+        exit_stack.callback(files.close)
+        recorded_keys = (*SERVICE_OUTPUT_KEYS, keys.CONTACTS) if out is None else _list_all_keys()
+        run, outcome, has_stalled = _run_until_over(
             config,
             files,
             ending,
             None,
             recorded_keys,
             until_goal=until_goal,
-            give_up_s=give_up_s,
+            stall_timeout_s=stall_timeout_s,
             raw_only=out is None,
             turn_limit_s=turn_limit_s,
         )
-        note_reasons(ending, create_host_record(run.host), config)
+        add_end_causes(ending, create_host_record(run.host), config)
         record, summary = write_results(files, files.folder, ending, outcome, report=out is not None)
         # No local variable holds the failure: its traceback holds this function's frame.
-        return Result(record, summary, gave_up, ControlFailure.from_error(run.take_errors().get(CONTROL)))
+        return Result(record, summary, has_stalled, ControlFailure.from_error(run.pop_errors().get(CONTROL)))
 
 
 def run_in_process(
@@ -176,7 +176,7 @@ def run_in_process(
     out: Path | None,
     *,
     until_goal: bool = False,
-    give_up_s: float | None = None,
+    stall_timeout_s: float | None = None,
     record: bool = True,
     raw_only: bool = False,
     step_times: SharedStepTimes | None = None,
@@ -184,125 +184,133 @@ def run_in_process(
     """Run a configuration for `snakesim run --in-process`, with progress and results on the terminal.
 
     Args:
-        config: configuration of the run.
-        out: folder for the files of the run; None for the default one.
-        until_goal: as for `simulate`.
-        give_up_s: as for `simulate`.
-        record: whether to record all messages.
-        raw_only: whether the recording is without topics for viewers.
-        step_times: shows another process whether the run makes progress.
+        config: Configuration of the run.
+        out: Path of the folder for the files of the run; None for the default folder.
+        until_goal: Whether the run is complete soon after the goal of its mission is reached.
+        stall_timeout_s: Robot time without 3 cm of advance to the goal that ends the run, in s; None for no timeout.
+        record: Whether to record all messages.
+        raw_only: Whether the recording contains no topics for viewers.
+        step_times: Shared memory that shows another process whether the run makes progress; None for none.
 
     Returns:
-        The exit code, as of a run in processes.
+        The exit code, as of `snakesim run` without `--in-process`.
     """
-    check(config)
-    check_recorder(record=record)
-    ending = Ending()
-    with opened_files(config, out) as (files, _):
-        print_line(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
-        with interruptible(ending):
+    validate_single_process_config(config)
+    require_recorder(record=record)
+    ending = RunEnding()
+    with open_run_files(config, out) as (files, _):
+        print_line(
+            f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander_name}, in one process"
+        )
+        with end_run_on_signals(ending):
             with Progress(config) as progress:
-                _, outcome, _ = _run_to_end(
+                _, outcome, _ = _run_until_over(
                     config,
                     files,
                     ending,
                     progress,
-                    _all_keys() if record else [],
+                    _list_all_keys() if record else [],
                     until_goal=until_goal,
-                    give_up_s=give_up_s,
+                    stall_timeout_s=stall_timeout_s,
                     raw_only=raw_only,
                     step_times=step_times,
                 )
-            return conclude(config, files, ending, outcome)
+            return write_and_print_results(config, files, ending, outcome)
 
 
-def _all_keys() -> list[str]:
+def _list_all_keys() -> list[str]:
+    """List the keys of all messages of SnakeSIM."""
     return [row.key for row in keys.SPACE]
 
 
-def _run_to_end(
+def _run_until_over(
     config: RunConfig,
     files: RunFiles,
-    ending: Ending,
+    ending: RunEnding,
     progress: Progress | None,
     recorded_keys: Iterable[str],
     *,
     until_goal: bool,
-    give_up_s: float | None,
+    stall_timeout_s: float | None,
     raw_only: bool,
     step_times: SharedStepTimes | None = None,
     turn_limit_s: float | None = None,
 ) -> tuple[InProcessRun, Outcome, bool]:
-    """Run a configuration until it is over, with its record and its recording.
+    """Run a configuration until it is over, and write its record and its recording.
 
     Args:
-        config: configuration of the run.
-        files: writes into the run's folder.
-        ending: collects the reasons for which the run ends, and is set when it is interrupted.
-        progress: shows the run on the terminal; None shows nothing.
-        recorded_keys: may have wildcards; empty for no recording.
-        until_goal: as for `simulate`.
-        give_up_s: as for `simulate`.
-        raw_only: whether the recording is without topics for viewers.
-        step_times: shows another process whether the run makes progress.
-        turn_limit_s: as for `simulate`.
+        config: Configuration of the run.
+        files: Writer of the files of the run.
+        ending: Collects the causes of the end, and shows whether the run is interrupted.
+        progress: Progress line on the terminal; None to show nothing.
+        recorded_keys: Keys of the recorded messages, which may have wildcards; empty for no recording.
+        until_goal: Whether the run is complete soon after the goal of its mission is reached.
+        stall_timeout_s: Robot time without 3 cm of advance to the goal that ends the run, in s; None for no timeout.
+        raw_only: Whether the recording contains no topics for viewers.
+        step_times: Shared memory that shows another process whether the run makes progress; None for none.
+        turn_limit_s: Wall time that a part of the run may take in one tick, in s; None for the default.
 
     Returns:
-        The run, what is known of it, and whether it was ended because the robot was stuck.
+        The run, its outcome, and whether it was ended because the robot was stuck.
     """
     run = InProcessRun(config, step_times, turn_limit_s)
-    ending.on_interrupt = run.hurry
+    ending.on_interrupt = run.interrupt_after_grace_period
     with contextlib.redirect_stderr(_LogWriter(files)), run:
         host = run.host
-        session = run.network.session()
+        session = run.network.create_session()
         if progress is not None:
             print_line(describe_what_moves(host.description))
-        control_states = session.reader(keys.CONTROL_STATE, ControlState)
-        goal_watch = GoalWatch(config, host.description, give_up_s)
+        control_states = session.declare_reader(keys.CONTROL_STATE, ControlState)
+        goal_monitor = GoalMonitor(config, host.description, stall_timeout_s)
         ends_at_goal = until_goal or config.mission.until_goal
         with (
             HostRecordWriter(host.black_box, host.description, partial(create_host_record, host), files.folder),
-            _recording(session, files, recorded_keys, None if raw_only else config.robot.name) as recording,
+            _record_messages(session, files, recorded_keys, None if raw_only else config.robot.name) as recording,
         ):
-            for turn, _ in enumerate(run.iterate_ticks()):
-                if turn % POLL_TICKS == 0:
+            for tick_count, _ in enumerate(run.iterate_ticks()):
+                if tick_count % TICKS_PER_POLL == 0:
                     if recording is not None:
                         recording.flush_when_due()
                     if progress is not None and host.authority.arm_session:  # before the arming nothing changes
-                        progress.update(host.status(), control_states.newest(lambda _state: True), armed=True)
-                    if ends_at_goal and goal_watch.over(host.black_box):
-                        host.complete()
-                if ending.interrupted:
+                        progress.update(host.build_status(), control_states.pop_newest(lambda _state: True), armed=True)
+                    if ends_at_goal and goal_monitor.update_and_check_end(host.black_box):
+                        host.request_completion()
+                if ending.is_interrupted:
                     run.stop()
-    ending.over = True
-    for failure in run.failed:
+    ending.is_over = True
+    for failure in run.failed_services:
         ending.add_cause(failure)
-    lost = [recording.failure] if recording is not None and recording.failure else []
-    outcome = Outcome(create_host_record(run.host), run.host.description, lost=lost, too_slow=run.too_slow())
-    return run, outcome, goal_watch.gave_up
+    losses = [recording.failure] if recording is not None and recording.failure else []
+    outcome = Outcome(
+        create_host_record(run.host),
+        run.host.description,
+        recording_losses=losses,
+        slow_services=run.list_slow_services(),
+    )
+    return run, outcome, goal_monitor.has_stalled
 
 
 @contextlib.contextmanager
-def _recording(
-    session: Session, files: RunFiles, recorded_keys: Iterable[str], shown_as: str | None
+def _record_messages(
+    session: Session, files: RunFiles, recorded_keys: Iterable[str], viewer_name: str | None
 ) -> "Iterator[RecordingWriter | None]":
-    """Record the messages at these keys for as long as the context lives.
+    """Record the messages at some keys while the context is active.
 
     Args:
-        session: Session of the run's process.
-        files: The files of the run; without a folder, nothing is recorded.
-        recorded_keys: Keys of the messages; without keys, nothing is recorded.
-        shown_as: The robot's name in topics for viewers; None: record only the messages as on the wire.
+        session: Session on the network of the run.
+        files: Files of the run; without a folder, nothing is recorded.
+        recorded_keys: Keys of the messages, which may have wildcards; empty to record nothing.
+        viewer_name: Name of the robot in topics for viewers; None to record no such topics.
 
     Yields:
-        The recording; None when there are no keys, or when no file can be created.
+        The writer of the recording; None if there are no keys, or if the file cannot be created.
     """
     recording = None
     try:
         if files.folder is not None and recorded_keys:
             from snakesim_operator.recording.writer import RecordingWriter  # needs the extra `record`
 
-            recording = RecordingWriter(files.folder / RECORDING, shown_as)
+            recording = RecordingWriter(files.folder / RECORDING_FILENAME, viewer_name)
             for key in recorded_keys:
                 session.on_latched_arrival(key, recording.write_arrival)
     except OSError as error:

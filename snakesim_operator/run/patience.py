@@ -1,54 +1,59 @@
-"""How long a run waits for a robot that is on, with every service there, and yet cannot be armed."""
+"""Limits the time that a run waits for a robot whose services are all alive, but which cannot be armed."""
 
 from collections.abc import Collection
 
 from snakesim_hal.wire.messages import Status
 
-# No status for longer than this means that the host or this process is slow, so the robot did not use that time.
-MAX_STEP_S = 1.0
+# A longer pause between two statuses means that the host or this process is slow, so the excess does not count.
+MAX_STATUS_PERIOD_S = 1.0
 
 
 class StartupTimeout:
-    """Counts the time in which the robot could have become ready, and did not.
+    """Counts the time in which the robot could have become ready to arm, but did not.
 
-    This is robot time. Where robot time is paused, as in lockstep before the arming, it is the time in which the host
-    sends its status. The count starts again with each service that starts, so that a slow computer has the whole time
-    for each part.
+    Robot time is counted. While robot time is paused, as in lockstep before the arming, the time between statuses of
+    the host is counted instead. The count restarts with each service that starts, so that a slow computer has the whole
+    timeout for each of them.
     """
 
-    def __init__(self, services: Collection[str], limit_s: float) -> None:
-        """Begin to count. services: all that the robot needs; limit_s: the time allowed."""
-        self.limit_s = limit_s
+    def __init__(self, services: Collection[str], timeout_s: float) -> None:
+        """Start to count.
+
+        Args:
+            services: Names of all services that the robot needs.
+            timeout_s: Time after which waiting ends, in s.
+        """
+        self.timeout_s = timeout_s
         self._services = frozenset(services)
         self._last_status: Status | None = None
         self._last_arrival_s = 0.0
         self._waited_s = 0.0
 
-    def ends(self, status: Status | None, now_s: float) -> bool:
-        """Count the time that has passed up to a status, and return whether it exceeds the limit.
+    def update(self, status: Status | None, now_s: float) -> bool:
+        """Count the time that has passed up to a status, and return whether it exceeds the timeout.
 
         While ticks advance, robot time is counted. Otherwise wall time is counted, at most MAX_STEP_S for each status.
 
         Args:
-            status: The newest status of the host; None before the first.
-            now_s: Time of a monotonic clock in seconds.
+            status: Newest status of the host; None before the first one.
+            now_s: Time of a monotonic clock, in s.
         """
         previous = self._last_status
         if status is None or status is previous:
             return False
-        since_arrival_s = now_s - self._last_arrival_s
+        elapsed_s = now_s - self._last_arrival_s
         self._last_status = status
         self._last_arrival_s = now_s
-        if previous is None or self._starts_again(previous, status):
+        if previous is None or self._should_restart(previous, status):
             self._waited_s = 0.0
         elif status.tick > previous.tick:
             self._waited_s += (status.timestamp_ns - previous.timestamp_ns) * 1e-9
         else:
-            self._waited_s += min(since_arrival_s, MAX_STEP_S)
-        return self._waited_s > self.limit_s
+            self._waited_s += min(elapsed_s, MAX_STATUS_PERIOD_S)
+        return self._waited_s > self.timeout_s
 
-    def _starts_again(self, last: Status, status: Status) -> bool:
-        """Return whether the robot is ready, a service is missing, or something has changed since the last status."""
+    def _should_restart(self, last_status: Status, status: Status) -> bool:
+        """Return whether the count restarts: the robot is ready, a service is missing, or the services have changed."""
         if status.ready_to_arm or self._services.difference(status.alive):
             return True
-        return (status.alive, status.waiting_for) != (last.alive, last.waiting_for)
+        return (status.alive, status.waiting_for) != (last_status.alive, last_status.waiting_for)

@@ -15,36 +15,39 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from snakesim_hal.base import errors
-from snakesim_hal.base.arithmetic import common_environment
-from snakesim_hal.base.process import child_environment, die_with_parent, python_command
+from snakesim_hal.base.arithmetic import make_common_arithmetic_env
+from snakesim_hal.base.process import make_child_environment, make_python_command, set_parent_death_signal
 
 ResultT = TypeVar("ResultT")
-CALL_FILE = "call"  # holds the function and its arguments
-ANSWER_FILE = "answer"
+CALL_FILENAME = "call"  # holds the function and its arguments
+RESULT_FILENAME = "result"
 POLL_S = 1.0  # Python code runs again after so long, so that an exception can be raised in the caller's thread
 
 
-def call_pinned(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
-    """Call a function in a process of its own, and return its result.
+def call_in_pinned_process(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
+    """Call a function in a child process with pinned arithmetic, and return its result.
 
     Function, arguments and result travel as pickle files in a temporary folder.
 
     Args:
-        function: A function on the top level of a module.
-        **arguments: Its keyword arguments.
+        function: Function at the top level of a module.
+        **arguments: Keyword arguments of the function.
+
+    Returns:
+        The value that the function returned.
 
     Raises:
-        SnakesimError: The function raised this error there, or the process ended without a result.
+        SnakesimError: The function raised this error in the child, or the child ended without a result.
     """
-    # The child gets the folder for its temporary files, too, which then are removed even if Ctrl-C kills it.
+    # The folder is also TMPDIR of the child, so that its temporary files are removed even if Ctrl-C kills it.
     with TemporaryDirectory(prefix="snakesim-") as folder:
-        call_path = Path(folder) / CALL_FILE
-        answer_path = Path(folder) / ANSWER_FILE
+        call_path = Path(folder) / CALL_FILENAME
+        result_path = Path(folder) / RESULT_FILENAME
         call_path.write_bytes(pickle.dumps((function, arguments)))
         variables = {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}
         process = subprocess.Popen(
-            python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
-            env=child_environment(common_environment(), variables),
+            make_python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
+            env=make_child_environment(make_common_arithmetic_env(), variables),
             stdin=subprocess.DEVNULL,
         )
         try:
@@ -56,28 +59,34 @@ def call_pinned(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
             process.wait()
         if process.returncode:
             raise errors.SnakesimError(f"the process of the run ended with exit code {process.returncode}; see above")
-        answer = pickle.loads(answer_path.read_bytes())
-    if isinstance(answer, tuple):  # the error that the function raised
-        error_name, lines, code = answer
+        result = pickle.loads(result_path.read_bytes())
+    if isinstance(result, tuple):  # the function raised an error
+        error_name, lines, code = result
         error_type = getattr(errors, error_name, errors.SnakesimError)
         error = error_type(*lines)
         error.code = code
         raise error
-    return answer
+    return result
 
 
 def main() -> int:
-    """Run the child process. Its arguments are the folder and the parent's process id."""
+    """Run the child process: load the call, call the function, and store the result or the error.
+
+    The command line has two arguments: the temporary folder, and the process id of the parent.
+
+    Returns:
+        The exit code.
+    """
     folder = Path(sys.argv[1])
     parent_pid = int(sys.argv[2])
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches both processes; the parent reports it
-    die_with_parent(parent_pid)
-    function, arguments = pickle.loads((folder / CALL_FILE).read_bytes())
+    set_parent_death_signal(parent_pid)
+    function, arguments = pickle.loads((folder / CALL_FILENAME).read_bytes())
     try:
-        answer: Any = function(**arguments)
+        result: Any = function(**arguments)
     except errors.SnakesimError as error:
-        answer = type(error).__name__, error.lines, error.code
-    (folder / ANSWER_FILE).write_bytes(pickle.dumps(answer))
+        result = type(error).__name__, error.lines, error.code
+    (folder / RESULT_FILENAME).write_bytes(pickle.dumps(result))
     return 0
 
 

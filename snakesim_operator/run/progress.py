@@ -14,11 +14,11 @@ LINE_CHARACTERS = 118
 MIN_WALL_S = 0.3  # a speed over a shorter time is not meaningful
 
 
-class OneLine:
-    """A line that is rewritten in place on a terminal, and otherwise printed again."""
+class StatusLine:
+    """A status line that is rewritten in place on a terminal, and otherwise printed as a new line."""
 
     def __init__(self) -> None:
-        self.terminal = sys.stdout.isatty()
+        self.is_terminal = sys.stdout.isatty()
         self._shown_characters = 0
 
     def __enter__(self) -> Self:
@@ -29,15 +29,15 @@ class OneLine:
             print_line("")
 
     def show_text(self, text: str) -> None:
-        """Show a text now, in place of the one before."""
-        if self.terminal:
+        """Show a text now, on a terminal in place of the previous text."""
+        if self.is_terminal:
             self._shown_characters = overwrite_line(text, LINE_CHARACTERS, self._shown_characters)
         else:
             print_line(text)
 
 
-class Progress(OneLine):
-    """Shows the progress of a run."""
+class Progress(StatusLine):
+    """Shows the progress of a run as a status line."""
 
     def __init__(self, config: RunConfig) -> None:
         super().__init__()
@@ -46,17 +46,17 @@ class Progress(OneLine):
         self._rate_hz = config.rate_hz
 
         # The line.
-        self._next = 0.0  # monotonic time of the next update
-        self._last = ""  # the text shown last
+        self._next_update_s = 0.0  # monotonic time of the next update
+        self._last_text = ""  # the text shown last
 
         # The robot.
         self._origin: tuple[float, float] | None = None  # wall and robot time at arming, in s
         self._armed_s = 0.0  # armed robot time so far, which a run's duration counts
         self._last_status: Status | None = None
-        self._armed = False
+        self._was_armed = False
 
-    def start_over(self) -> None:
-        """Begin to count at 0 again, because a new host does so."""
+    def reset(self) -> None:
+        """Start to count at 0 again, because a new host does so."""
         self._origin = None
         self._last_status = None
         self._armed_s = 0.0
@@ -65,30 +65,31 @@ class Progress(OneLine):
         """Update the progress line, if an update is due.
 
         Args:
-            status: The newest status of the host; None while there is none.
-            control: The newest state that the controller published.
+            status: Newest status of the host; None while there is none.
+            control: Newest state that the controller published; None while there is none.
             armed: Whether the run has armed the robot.
         """
         now_s = time.monotonic()
         if status is None:
             return
         self._count_armed_time(status)
-        is_due = now_s >= self._next or armed != self._armed
+        is_due = now_s >= self._next_update_s or armed != self._was_armed
         if not is_due:
             return
         if armed and self._origin is None:
             self._origin = (now_s, status.tick / self._rate_hz)
         if armed and not self._armed_s:
             return  # armed since the last status: only the next status shows for how long
-        self._armed = armed
-        period_s = TERMINAL_PERIOD_S if self.terminal else PLAIN_PERIOD_S
-        self._next = now_s + period_s
+        self._was_armed = armed
+        period_s = TERMINAL_PERIOD_S if self.is_terminal else PLAIN_PERIOD_S
+        self._next_update_s = now_s + period_s
         text = self._describe_run(status, control, now_s) if armed else f"starting: {status.reason}"
-        if self.terminal or text != self._last:
+        if self.is_terminal or text != self._last_text:
             self.show_text(text)
-        self._last = text
+        self._last_text = text
 
     def _count_armed_time(self, status: Status) -> None:
+        """Add the robot time since the last status, if the robot was armed then."""
         last = self._last_status
         self._last_status = status
         if last is not None and last.lifecycle == "armed":

@@ -15,32 +15,32 @@ from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, SnakesimError
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.fault_kinds import ROUTER
-from snakesim_hal.model.fault_plan import parse_planned
+from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig, encode_config
-from snakesim_hal.network.endpoint import check_guarded
-from snakesim_hal.network.local_registry import LocalRobot, registered
+from snakesim_hal.network.endpoint import require_safe_listening_endpoint
+from snakesim_hal.network.local_registry import LocalRobot, register_robot
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
-from snakesim_hal.programs.preflight import check_plugins
+from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.base import extras
-from snakesim_operator.results.run_reader import CONFIG
-from snakesim_operator.run.console_child import check_console, console_beside
-from snakesim_operator.run.ending import Ending, interruptible
-from snakesim_operator.run.folder import default_folder, locked_folder
-from snakesim_operator.run.meeting import meeting_point, refuse_second_robot
-from snakesim_operator.run.monitor import AFTER_FAULT_S, RunMonitor
+from snakesim_operator.results.run_reader import CONFIG_FILENAME
+from snakesim_operator.run.console_child import require_console, run_console
+from snakesim_operator.run.ending import RunEnding, end_run_on_signals
+from snakesim_operator.run.folder import choose_default_folder, lock_run_folder
+from snakesim_operator.run.meeting import check_no_other_robot, reserve_endpoint
+from snakesim_operator.run.monitor import RUN_ON_AFTER_FAULT_S, RunMonitor
 from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.supervisor import HOST, Supervisor
 
-CONNECT_S = 0.5
+CONNECT_TIMEOUT_S = 0.5
 REPORT_PERIOD_S = 20.0  # between two lines on the terminal while the host has not opened its network
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A run, as the command line describes it."""
+    """A run as requested on the command line."""
 
     config: RunConfig
     out: Path | None = None
@@ -48,14 +48,14 @@ class RunRequest:
     # The network.
     endpoint: str | None = None
     router: str | None = None
-    session: SessionFile | None = None  # how to connect to a lab's router
+    session: SessionFile | None = None  # credentials for the router of a lab
     namespace: str | None = None
-    with_router: bool = False  # the run's parts meet at a router of its own
-    insecure: bool = False  # listen even where other machines can connect
+    with_router: bool = False  # start a router for the run
+    insecure: bool = False  # listen even on interfaces that other machines can reach
 
     # Arming and faults.
-    unchecked: bool = False  # arm also a robot whose joints have not been checked
-    stay: bool = False  # a fault does not end the run: processes are started again, a person resets and arms
+    unchecked: bool = False  # also arm a robot whose joints have not been checked
+    stay: bool = False  # a fault does not end the run: processes restart, and a person resets and arms
 
     # Output.
     record: bool = True  # every message, in recording.mcap
@@ -63,8 +63,8 @@ class RunRequest:
     console: bool = False  # show the run in the browser
 
     @property
-    def network_name(self) -> str:
-        """The robot's namespace."""
+    def robot_namespace(self) -> str:
+        """Namespace of the robot."""
         if self.namespace:
             return self.namespace
         if self.session and self.session.namespace:
@@ -72,122 +72,129 @@ class RunRequest:
         return self.config.robot.name
 
     @property
-    def lab(self) -> Link | None:
-        """How to reach the router that the run joins; None when its parts meet on this computer."""
+    def router_link(self) -> Link | None:
+        """Link to the router of a lab that the run joins; None if its processes connect on this computer."""
         if self.session is not None:
-            return Link.from_session_file(self.session, self.network_name)
+            return Link.from_session_file(self.session, self.robot_namespace)
         if self.router is not None:
-            return Link(self.router, self.network_name)
+            return Link(self.router, self.robot_namespace)
         return None
 
 
-def run(request: RunRequest) -> int:
+def run_in_processes(request: RunRequest) -> int:
     """Run a scenario in processes of its own, from the checks to the report.
 
     Returns:
-        The exit code: 0, or 1 on a fault or an early end, 3 when the record has gaps, 130 when interrupted.
+        The exit code: 1 on a fault or an early end, 3 if the record has gaps, 130 if interrupted, otherwise 0.
 
     Raises:
-        SnakesimError: a check failed; no process was started.
+        SnakesimError: A check failed, so no process was started.
     """
-    request = replace(request, config=check_plugins(request.config))
+    request = replace(request, config=validate_and_complete_config(request.config))
     _check_request(request)
-    link, stop_port = meeting_point(request.endpoint, request.lab, request.network_name)
-    ending = Ending()
-    with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
+    link, stop_port = reserve_endpoint(request.endpoint, request.router_link, request.robot_namespace)
+    ending = RunEnding()
+    with contextlib.closing(stop_port), open_run_files(request.config, request.out) as (files, config_file):
         supervisor = Supervisor(files, ending, print_line, stop_port, stay=request.stay)
         processes = _RunProcesses(request, supervisor, link, files, config_file)
-        robot = LocalRobot.describe(
+        robot = LocalRobot.from_connection(
             link, request.config.robot.name, request.config.backend, stop_port, str(config_file.absolute())
         )
-        with interruptible(ending):
-            with contextlib.ExitStack() as opened:
-                registry_failure = opened.enter_context(registered(robot))
+        with end_run_on_signals(ending):
+            with contextlib.ExitStack() as exit_stack:
+                registry_failure = exit_stack.enter_context(register_robot(robot))
                 if request.console:  # before the robot, because the operator waits for it
-                    opened.enter_context(console_beside(processes.common_arguments, link, files, print_line))
+                    exit_stack.enter_context(run_console(processes.common_arguments, link, files, print_line))
                 if registry_failure is not None:
                     print_line(registry_failure)
-                _run_processes(processes, ending)
-            return _conclude(request, supervisor, files, ending)
+                _run_until_over(processes, ending)
+            return _conclude_run(request, supervisor, files, ending)
 
 
 def _check_request(request: RunRequest) -> None:
-    """Raise SnakesimError when the run cannot be started as requested."""
+    """Raise SnakesimError if the run cannot be started as requested."""
     _check_router(request)
-    check_recorder(record=request.record)
+    require_recorder(record=request.record)
     if request.console:
-        check_console()
+        require_console()
     if request.endpoint is not None:
-        check_guarded(request.endpoint, "--endpoint", insecure=request.insecure)
-    refuse_second_robot(request.endpoint, request.lab)
+        require_safe_listening_endpoint(request.endpoint, "--endpoint", insecure=request.insecure)
+    check_no_other_robot(request.endpoint, request.router_link)
 
 
-def _conclude(request: RunRequest, supervisor: Supervisor, files: RunFiles, ending: Ending) -> int:
-    """Write and print the results. Returns the exit code."""
+def _conclude_run(request: RunRequest, supervisor: Supervisor, files: RunFiles, ending: RunEnding) -> int:
+    """Write and print the results of a run, close its files, and return the exit code."""
     # Imported only now, because the start of the robot does not need it.
-    from snakesim_operator.run.conclusion import Outcome, conclude
+    from snakesim_operator.run.conclusion import Outcome, write_and_print_results
 
     outcome = Outcome(
-        host=supervisor.host_record(),
-        robot=supervisor.robot(),
+        host_record=supervisor.read_host_record(),
+        description=supervisor.get_description(),
         restarts=supervisor.restarts,
-        hosts=supervisor.hosts,
-        lost=list(supervisor.lost.values()),
+        host_count=supervisor.host_count,
+        recording_losses=list(supervisor.losses_by_process.values()),
     )
-    return conclude(request.config, files, ending, outcome, stay=request.stay)
+    return write_and_print_results(request.config, files, ending, outcome, stay=request.stay)
 
 
 @contextlib.contextmanager
-def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles, Path]]:
-    """Lock the run's folder for as long as the context lives, and write the configuration into it.
+def open_run_files(config: RunConfig, output_folder: Path | None) -> Iterator[tuple[RunFiles, Path]]:
+    """Lock the folder of a run while the context is active, and write the configuration into it.
 
-    If the folder is not writable, the run continues without files. Its processes then read the configuration from
-    memory, because each of them needs a path.
+    If the folder cannot be created, locked or written because of the file system, the run continues without files. The
+    configuration is then in a memory file, because each process of the run needs a path to read it from.
 
     Args:
         config: Configuration of the run.
-        out: The folder; None for the default one.
+        output_folder: Path of the folder; None for the default folder.
 
     Yields:
-        The writer of the run's files, and the path of the configuration.
+        The writer of the files of the run, and the path of the configuration.
+
+    Raises:
+        ConfigError: Another run has locked the folder.
     """
-    out = out or default_folder(config.name)
+    if output_folder is None:
+        output_folder = choose_default_folder(config.name)
     content = encode_config(config)
-    with contextlib.ExitStack() as resources:
+    with contextlib.ExitStack() as exit_stack:
         try:
-            folder = resources.enter_context(locked_folder(out, print_line))
-            write_atomically(folder / CONFIG, content)
+            folder = exit_stack.enter_context(lock_run_folder(output_folder, print_line))
+            write_atomically(folder / CONFIG_FILENAME, content)
         except OSError as error:
-            resources.close()
-            print_line(f"warning: --out {out}: {error.strerror}; the run continues, but nothing of it is recorded")
+            exit_stack.close()
+            print_line(
+                f"warning: --out {output_folder}: {error.strerror}; the run continues, but nothing of it is recorded"
+            )
             memory_file = os.memfd_create("snakesim-config")
-            resources.callback(os.close, memory_file)
+            exit_stack.callback(os.close, memory_file)
             os.write(memory_file, content)
-            yield RunFiles(None, _warn), Path(f"/proc/{os.getpid()}/fd/{memory_file}")
+            yield RunFiles(None, _print_file_warning), Path(f"/proc/{os.getpid()}/fd/{memory_file}")
         else:
-            yield RunFiles(folder, _warn), folder / CONFIG
+            yield RunFiles(folder, _print_file_warning), folder / CONFIG_FILENAME
 
 
-def check_recorder(*, record: bool) -> None:
-    """Raise ConfigError when a recording is requested that cannot be written: a run cannot be recorded afterwards."""
+def require_recorder(*, record: bool) -> None:
+    """Raise ConfigError if a recording is requested, but the packages for it are not installed."""
     if record:
-        extras.require("record", "a recording of the run", "; or run with --no-record")
+        extras.require_extra("record", "a recording of the run", "; or run with --no-record")
 
 
-def _warn(failure: str) -> None:
+def _print_file_warning(failure: str) -> None:
+    """Print that a file of the run cannot be written."""
     print_line(f"warning: {failure}; the run continues, and its record may be incomplete")
 
 
 def _check_router(request: RunRequest) -> None:
-    """Raise ConfigError when the run has two routers, or a fault that needs a router of its own and no such router."""
+    """Raise ConfigError if the run has two routers, or a fault on its router but no router of its own."""
     if request.with_router:
-        if request.lab is not None:
+        if request.router_link is not None:
             raise ConfigError(
                 "--with-router starts a router of the run's own, --router and --session join another: give one of them",
                 code="command/conflicting-options",
             )
         return
-    router_faults = [injection for injection in parse_planned(request.config) if injection.target == ROUTER]
+    router_faults = [injection for injection in parse_planned_faults(request.config) if injection.target == ROUTER]
     if router_faults:
         raise ConfigError(
             f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router",
@@ -205,7 +212,7 @@ class _RunProcesses:
         self.supervisor = supervisor
         self.link = link
         self._files = files
-        self._scenario = [str(config_file), "--namespace", request.network_name]
+        self._scenario = [str(config_file), "--namespace", request.robot_namespace]
         if link.session:
             self._network = ["--session", str(link.session.path)]
         else:
@@ -214,7 +221,7 @@ class _RunProcesses:
 
     @property
     def common_arguments(self) -> list[str]:
-        """Arguments that name the scenario and the network."""
+        """Command-line arguments that name the scenario and the network."""
         return [*self._scenario, *self._network]
 
     def start(self) -> None:
@@ -232,7 +239,7 @@ class _RunProcesses:
 
     def _start_host(self) -> None:
         arguments = ["snakesim_hal.programs.host_program", *self._scenario, *self._listening]
-        arguments += ["--end-after-duration", "--memory", self.supervisor.memory]
+        arguments += ["--end-after-duration", "--memory", self.supervisor.host_record_path]
         if self.request.router is not None or self.request.with_router:
             arguments += ["--router", self.link.endpoint]
         else:
@@ -240,13 +247,13 @@ class _RunProcesses:
         if self._files.folder:
             arguments += ["--out", str(self._files.folder)]
         if not self.request.stay:
-            arguments += ["--end-after-fault", str(AFTER_FAULT_S)]
+            arguments += ["--end-after-fault", str(RUN_ON_AFTER_FAULT_S)]
         self.supervisor.start(HOST, arguments)
 
     def _start_services(self) -> None:
         """Start each service that is the run's own, except those that run inside the host."""
         config = self.request.config
-        for name, service in config.own_services.items():
+        for name, service in config.internal_services.items():
             if name in config.in_host_services:
                 continue
             arguments = ["snakesim_hal.programs.service_program", name, *self.common_arguments]
@@ -259,13 +266,13 @@ class _RunProcesses:
         self.supervisor.start(RECORDER, arguments, vital=False)
 
 
-def _run_processes(processes: _RunProcesses, ending: Ending) -> None:
+def _run_until_over(processes: _RunProcesses, ending: RunEnding) -> None:
     """Start the processes of a run, monitor them until the run is over, and end all of them."""
     request = processes.request
     supervisor = processes.supervisor
     try:
         processes.start()
-        with _session_of_run(processes.link, supervisor, ending) as session:
+        with _open_run_session(processes.link, supervisor, ending) as session:
             _print_start(request.config, processes.link)
             monitor = RunMonitor(
                 request.config, session, supervisor, ending, print_line, stay=request.stay, unchecked=request.unchecked
@@ -274,25 +281,27 @@ def _run_processes(processes: _RunProcesses, ending: Ending) -> None:
     except SnakesimError as error:
         ending.add_cause(str(error))
     finally:
-        ending.over = True
-        supervisor.end()
+        ending.is_over = True
+        supervisor.end_all_processes()
 
 
 def _print_start(config: RunConfig, link: Link) -> None:
-    print_line(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.clock_mode}")
+    print_line(
+        f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander_name}, {config.clock_mode}"
+    )
     print_line(f"network: {link.endpoint}, namespace {link.namespace}")
-    if not config.has_own_control:
+    if not config.has_internal_control:
         print_line("no control service of its own: a client that takes the lease commands and arms the robot")
 
 
 @contextlib.contextmanager
-def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
-    """Connect to the run's network, and try again until the host has opened it.
+def _open_run_session(link: Link, supervisor: Supervisor, ending: RunEnding) -> Iterator[Session]:
+    """Connect to the network of the run, and retry until the host has opened it.
 
     Args:
-        link: How to reach the network.
-        supervisor: Reports whether a process of the run has ended.
-        ending: Reports whether the operator has interrupted the run.
+        link: Link to the network of the run.
+        supervisor: Supervisor of the processes; if one of them ends, connecting is given up.
+        ending: Shows whether the operator has interrupted the run.
 
     Yields:
         The session, which is closed when the context ends.
@@ -305,14 +314,14 @@ def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Itera
     with contextlib.ExitStack() as stack:
         while True:
             try:
-                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
+                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_TIMEOUT_S))
                 break
             except NotConnectedError:
                 ended_process = supervisor.describe_first_end()
                 if ended_process is not None:
                     raise NotConnectedError(ended_process, code="run/failed") from None
                 now_s = time.monotonic()
-                if now_s > start_s + SERVICE_START_LIMIT_S or ending.interrupted:
+                if now_s > start_s + SERVICE_START_LIMIT_S or ending.is_interrupted:
                     raise
                 if now_s > last_report_s + REPORT_PERIOD_S:
                     print_line(f"starting: the host has not opened its network yet, after {now_s - start_s:.0f} s")

@@ -1,6 +1,6 @@
 """Writes the supervisor's files into the run's folder, in a separate thread: a robot never waits for a disk.
 
-Failed writes stay in bounded memory and retried; lost data is reported.
+Failed writes stay in bounded memory and are retried. Lost data is reported.
 """
 
 import contextlib
@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Literal
 
 from snakesim_hal.base.atomic_write import write_atomically
-from snakesim_hal.base.workers import start_worker
+from snakesim_hal.base.workers import start_restarting_thread
 
-MEMORY_BYTES = 8 * 2**20
-FILE_BYTES = 64 * 2**20  # of a log: a part that floods does not fill the disk
-TOGETHER_BYTES = 2**16  # pending appends are merged up to this size
-RETRY_S = 0.5
-LIMIT_S = 5.0  # for a disk that hangs
+MAX_PENDING_BYTES = 8 * 2**20
+MAX_LOG_BYTES = 64 * 2**20  # of one log, so that a process with endless output does not fill the disk
+MAX_MERGED_BYTES = 2**16  # pending appends are merged up to this size
+RETRY_PERIOD_S = 0.5
+DISK_TIMEOUT_S = 5.0  # for a disk that hangs
 
 
 @dataclass
@@ -33,14 +33,19 @@ class _Task:
     def can_merge(self, other: "_Task") -> bool:
         """Return whether the content of another task can be added to this one."""
         appends_to_same_file = self.kind == other.kind == "append" and self.name == other.name
-        return appends_to_same_file and len(self.content) < TOGETHER_BYTES
+        return appends_to_same_file and len(self.content) < MAX_MERGED_BYTES
 
 
 class RunFiles:
-    """The files of one run. Tasks are carried out soon, in order; only `settle` and `close` wait."""
+    """Writes the files of one run in a thread, in order. Only `wait_until_written` and `close` wait for the disk."""
 
     def __init__(self, folder: Path | None, warn: Callable[[str], None]) -> None:
-        """folder: None for no files. warn: called once, from another thread, when something cannot be written."""
+        """Start the thread that writes the files.
+
+        Args:
+            folder: Folder of the run; None to write no files.
+            warn: Called once, from another thread, if a file cannot be written.
+        """
         self.folder = folder
         self._warn = warn
         self._failure = ""  # of the last attempt
@@ -52,23 +57,23 @@ class RunFiles:
         self._handles: dict[str, int] = {}
         self._closing = False
         self._changed = threading.Condition()
-        self._thread = start_worker("files", self._write_files, on_error=self._drop_task)
+        self._thread = start_restarting_thread("files", self._write_files, on_error=self._drop_task)
 
     def append(self, name: str, content: bytes) -> None:
-        """Append to a file. The content is lost if the file, or the data that waits for the disk, is too large."""
+        """Append to a file. The content is dropped if the file or the pending data is too large."""
         appended_bytes = self._appended.get(name, 0) + len(content)
-        if appended_bytes > FILE_BYTES:
-            self._lost = self._lost or f"{name} is longer than {FILE_BYTES >> 20} MiB: the rest of it is lost"
+        if appended_bytes > MAX_LOG_BYTES:
+            self._lost = self._lost or f"{name} is longer than {MAX_LOG_BYTES >> 20} MiB: the rest of it is lost"
             return
         self._appended[name] = appended_bytes
         self._add_task(_Task("append", name, content))
 
     def write_file(self, name: str, content: bytes) -> None:
-        """Write a whole file."""
+        """Write a whole file atomically, in place of an earlier one."""
         self._add_task(_Task("put", name, content))
 
     def rename(self, name: str, to: str) -> None:
-        """Rename an appended file; later appends begin a new one."""
+        """Rename a file that was appended to; later appends start a new file."""
         self._appended.pop(name, None)
         self._add_task(_Task("rename", name, to.encode()))
 
@@ -78,26 +83,30 @@ class RunFiles:
             self._warned = True
             self._warn(failure)
 
-    def settle(self) -> None:
-        """Wait until everything is written, or the disk is found to be full or to hang."""
+    def wait_until_written(self) -> None:
+        """Wait until everything is written, until writing fails, or for DISK_TIMEOUT_S."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._tasks or self._failure, LIMIT_S)
+            self._changed.wait_for(lambda: not self._tasks or self._failure, DISK_TIMEOUT_S)
 
     def close(self) -> str:
-        """Retry everything pending once more. Returns why data is lost, or an empty text."""
+        """Retry all pending writes once, and stop the thread.
+
+        Returns:
+            Why data was lost; empty if no data was lost.
+        """
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join(LIMIT_S)
+        self._thread.join(DISK_TIMEOUT_S)
         if self._thread.is_alive():
-            return f"{self.folder}: the disk has not answered for {LIMIT_S:g} s"
+            return f"{self.folder}: the disk has not answered for {DISK_TIMEOUT_S:g} s"
         return self._lost
 
     def _add_task(self, task: _Task) -> None:
         with self._changed:
             if self.folder is None:
                 return
-            if self._waiting_bytes + len(task.content) > MEMORY_BYTES:
+            if self._waiting_bytes + len(task.content) > MAX_PENDING_BYTES:
                 self._lost = self._failure or f"{self.folder}: the disk is too slow for the run's output"
                 return
             if len(self._tasks) > 1 and self._tasks[-1].can_merge(task):  # the first one may be in progress
@@ -110,7 +119,7 @@ class RunFiles:
     def _write_files(self) -> None:
         """Carry out the write tasks in order, until the files are closed and no task is left. Runs in a thread.
 
-        A task that fails is tried again after RETRY_S. Once the files are being closed, it is given up instead.
+        A failed task is retried after RETRY_PERIOD_S. Once the files are being closed, it is dropped instead.
         """
         while True:
             with self._changed:
@@ -119,12 +128,12 @@ class RunFiles:
                     break
                 task = self._tasks[0]
             bytes_before = len(task.content)
-            self._failure = self._attempt(task)  # without the lock, because writing may take long
+            self._failure = self._try_task(task)  # without the lock, because writing may take long
             if self._failure:
                 self.warn(self._failure)
             with self._changed:
-                is_finished = not self._failure or self._closing
-                if is_finished:
+                is_done = not self._failure or self._closing
+                if is_done:
                     self._tasks.popleft()
                     self._waiting_bytes -= bytes_before
                     self._lost = self._lost or self._failure
@@ -132,13 +141,13 @@ class RunFiles:
                     written_bytes = bytes_before - len(task.content)
                     self._waiting_bytes -= written_bytes
                     self._changed.notify_all()
-                    self._changed.wait_for(lambda: self._closing, RETRY_S)
+                    self._changed.wait_for(lambda: self._closing, RETRY_PERIOD_S)
                 self._changed.notify_all()
         for handle in self._handles.values():
             os.close(handle)
 
     def _drop_task(self, error: Exception) -> None:
-        """Drop a task that raised an unexpected error: it would raise it again, and delay the other tasks."""
+        """Drop a task that raised an unexpected error, because it would raise the error again and delay other tasks."""
         with self._changed:
             if self._tasks:
                 task = self._tasks.popleft()
@@ -146,8 +155,12 @@ class RunFiles:
                 self._lost = self._lost or f"{self.folder}: {task.name} was not written: {error}"
             self._changed.notify_all()
 
-    def _attempt(self, task: _Task) -> str:
-        """Carry out a task; the unwritten rest of an append stays in it. Returns the error, or an empty text."""
+    def _try_task(self, task: _Task) -> str:
+        """Try to carry out a task. The unwritten rest of an append stays in the task.
+
+        Returns:
+            The error as text; empty if the task succeeded.
+        """
         assert self.folder is not None
         try:
             if task.kind == "append":
@@ -162,6 +175,7 @@ class RunFiles:
         return ""
 
     def _append(self, folder: Path, task: _Task) -> None:
+        """Append the content of a task to its file. A new file that stays empty on a full disk is removed."""
         path = folder / task.name
         if task.name not in self._handles:
             flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC

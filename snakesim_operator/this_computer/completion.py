@@ -11,23 +11,27 @@ import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from snakesim_hal.model.fault_kinds import KINDS
-from snakesim_hal.model.files import SHIPPED, list_shipped
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, list_installed
+from snakesim_hal.model.fault_kinds import FAULT_KINDS
+from snakesim_hal.model.files import SHIPPED_FILES_DIR, list_shipped_names
+from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, list_installed_plugins
 from snakesim_hal.wire import keys
 
-KNOWN: dict[str, Callable[[], list[str]]] = {  # values of arguments, by the argument's name in any command
-    "scenario": lambda: list_shipped("scenarios"),
-    "robot": lambda: list_shipped("robots"),
-    "suite": lambda: list_shipped("suites"),
-    "backend": lambda: list_installed(BACKENDS),
-    "controller": lambda: list_installed(CONTROLLERS),
-    "kind": lambda: sorted({kind for kinds in KINDS.values() for kind in kinds}),
-    "policy": lambda: sorted(path.stem for path in (SHIPPED / "policies").glob("*.onnx")),
+LIST_VALUES_BY_ARGUMENT: dict[
+    str, Callable[[], list[str]]
+] = {  # values of arguments, by the argument's name in any command
+    "scenario": lambda: list_shipped_names("scenarios"),
+    "robot": lambda: list_shipped_names("robots"),
+    "suite": lambda: list_shipped_names("suites"),
+    "backend": lambda: list_installed_plugins(BACKENDS),
+    "controller": lambda: list_installed_plugins(CONTROLLERS),
+    "kind": lambda: sorted({kind for kinds in FAULT_KINDS.values() for kind in kinds}),
+    "policy": lambda: sorted(path.stem for path in (SHIPPED_FILES_DIR / "policies").glob("*.onnx")),
     "key": lambda: [row.key for row in keys.SPACE if row.kind in ("stream", "latched")],
 }
-ZSH = "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }; autoload -Uz bashcompinit && bashcompinit"
-FUNCTION = """\
+ZSH_PREAMBLE = (
+    "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }; autoload -Uz bashcompinit && bashcompinit"
+)
+SHELL_FUNCTION = """\
 _snakesim() {
     local given=${COMP_WORDS[COMP_CWORD]} command='' before='' choices='' options='' i
     for ((i = 1; i < COMP_CWORD; i++)); do
@@ -53,7 +57,7 @@ complete -o bashdefault -o default -F _snakesim snakesim
 
 @dataclass
 class Completions:
-    """What can follow a command: its path is empty, ` run`, ` robot arm` and so on."""
+    """The words that can follow one command; the path of the command is empty, ` run`, ` robot arm` and so on."""
 
     path: str
     options: list[str] = field(default_factory=list[str])
@@ -61,9 +65,14 @@ class Completions:
     values: dict[str, list[str]] = field(default_factory=dict[str, list[str]])  # of options that take one; [] is any
 
 
-def write_completion(parser: argparse.ArgumentParser, shell: str) -> Iterator[str]:
-    """Yield the lines of a script for the shell."""
-    commands = list(_walk(parser, ""))
+def generate_completion_script(parser: argparse.ArgumentParser, shell: str) -> Iterator[str]:
+    """Yield the lines of a completion script.
+
+    Args:
+        parser: Parser of all commands.
+        shell: "bash" or "zsh".
+    """
+    commands = list(_find_completions(parser, ""))
     paths = "|".join(f'"{command.path}"' for command in commands if command.path)
     values: dict[str, list[str]] = {}
     for command in commands:
@@ -74,30 +83,31 @@ def write_completion(parser: argparse.ArgumentParser, shell: str) -> Iterator[st
     for command in commands:
         lists = f'choices="{" ".join(command.words)}"; options="{" ".join(command.options)}"'
         words.append(f'                "{command.path}") {lists} ;;')
-    text = FUNCTION.replace("@COMMANDS@", paths).replace("@VALUES@", "\n".join(after))
+    text = SHELL_FUNCTION.replace("@COMMANDS@", paths).replace("@VALUES@", "\n".join(after))
     if shell == "zsh":
-        yield ZSH
+        yield ZSH_PREAMBLE
     yield from text.replace("@WORDS@", "\n".join(words)).splitlines()
 
 
-def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Completions]:
-    """Yield what can follow a command on the command line, then the same for each of its subcommands.
+def _find_completions(parser: argparse.ArgumentParser, command_path: str) -> Iterator[Completions]:
+    """Yield the completions of a command, then those of each of its subcommands.
 
     Args:
-        parser: The parser of the command.
-        path: The words of the command, such as `snakesim robot`.
+        parser: Parser of the command.
+        command_path: Words of the command behind `snakesim`, each after a space, such as ` robot arm`; empty for
+            `snakesim` itself.
     """
-    completions = Completions(path)
+    completions = Completions(command_path)
     subcommand_completions: list[Completions] = []
     for action in parser._actions:
         is_internal = action.help == argparse.SUPPRESS and action.option_strings  # only other processes use it
         if is_internal:
             continue
-        choices = _choices(action)
+        choices = _list_choices(action)
         if isinstance(action, argparse._SubParsersAction):
             completions.words += choices
             for name, subparser in action.choices.items():
-                subcommand_completions += _walk(subparser, f"{path} {name}")
+                subcommand_completions += _find_completions(subparser, f"{command_path} {name}")
         elif not action.option_strings:
             completions.words += choices
         else:
@@ -109,7 +119,7 @@ def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Completions]:
     yield from subcommand_completions
 
 
-def _choices(action: argparse.Action) -> list[str]:
-    if action.dest in KNOWN:
-        return KNOWN[action.dest]()
+def _list_choices(action: argparse.Action) -> list[str]:
+    if action.dest in LIST_VALUES_BY_ARGUMENT:
+        return LIST_VALUES_BY_ARGUMENT[action.dest]()
     return [str(choice) for choice in action.choices or ()]

@@ -21,21 +21,21 @@ import msgspec
 
 from snakesim_hal.base.process import (
     HOST_PRIORITY,
-    child_environment,
-    die_with_parent,
     lock_memory,
-    python_command,
+    make_child_environment,
+    make_python_command,
+    set_parent_death_signal,
 )
-from snakesim_native.libraries import LAWS
+from snakesim_native.libraries import LAWS_LIBRARY
 from snakesim_operator.base import extras
 
 MIN_PYTHON = (3, 11)
-PROBE_LIMIT_S = 30.0
+PROBE_TIMEOUT_S = 30.0
 ARPHRD_CAN = "280"  # the type of a CAN interface in /sys/class/net, from if_arp.h
 IFF_UP = 1  # the flag of an interface that is up, from if.h
 ADJTIMEX_TIME_ERROR = 5  # adjtimex returns it if the clock is not synchronized
 TIMEX_BYTES = 256  # more than a struct timex
-WAKE_UPS = 100
+WAKE_UP_COUNT = 100
 WAKE_UP_PERIOD_S = 0.001
 MAX_WAKE_UP_DELAY_S = 0.002  # a longer one costs a tick at 500 Hz
 MIN_OPEN_FILES = 4096
@@ -46,7 +46,7 @@ WARN_FREE_BYTES = GB
 MIN_FREE_BYTES = 100 * MB
 MAX_ERROR_LENGTH = 100
 
-RENDER_ONE_IMAGE = """
+RENDER_PROBE_PROGRAM = """
 import os, mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><light/><geom size='.1'/></worldbody></mujoco>")
 with mujoco.Renderer(model, 32, 32) as renderer:
@@ -57,11 +57,11 @@ with mujoco.Renderer(model, 32, 32) as renderer:
 """
 
 
-FIND_LAWS_PROBLEM = """
+PHYSICS_LIBRARY_PROBE_PROGRAM = """
 import mujoco
-from snakesim_native.libraries import LAWS
-from snakesim_native.load import load
-print(load(LAWS).problem)
+from snakesim_native.libraries import LAWS_LIBRARY
+from snakesim_native.load import load_shared_library
+print(load_shared_library(LAWS_LIBRARY).problem)
 """
 
 
@@ -86,36 +86,41 @@ def check_python() -> Iterator[Finding]:
 
 
 def check_packages() -> Iterator[Finding]:
-    """Check whether the packages that SnakeSIM requires by its metadata are installed.
+    """Check whether the packages that SnakeSIM requires, by its package metadata, are installed.
 
     Yields:
-        One finding for the core, and one for each extra.
+        One finding for the packages of the core, and one for those of each extra.
     """
-    installed: dict[str, list[str]] = {}  # extra -> packages with their versions; the core's extra is empty
-    missing: dict[str, list[str]] = {}  # extra -> packages
+    installed_by_extra: dict[str, list[str]] = {}  # extra -> packages with their versions; the core's extra is empty
+    missing_by_extra: dict[str, list[str]] = {}  # extra -> packages
     for requirement in importlib.metadata.requires("snakesim") or []:
         # Such as `numpy>=2; extra == "report"`.
         package = re.split(r"[\[<>=!~; ]", requirement)[0]
         if package == "snakesim":  # an extra that includes another extra
             continue
-        marker = re.search(r"""extra == ['"]([^'"]+)""", requirement)
-        extra = marker[1] if marker else ""
+        extra_match = re.search(r"""extra == ['"]([^'"]+)""", requirement)
+        extra = extra_match[1] if extra_match else ""
         try:
             package_with_version = f"{package} {importlib.metadata.version(package)}"
         except importlib.metadata.PackageNotFoundError:
-            missing.setdefault(extra, []).append(package)
+            missing_by_extra.setdefault(extra, []).append(package)
         else:
-            installed.setdefault(extra, []).append(package_with_version)
-    for extra in sorted({*installed, *missing}):
-        if extra in missing:
-            yield _report_missing_packages(extra, missing[extra])
+            installed_by_extra.setdefault(extra, []).append(package_with_version)
+    for extra in sorted({*installed_by_extra, *missing_by_extra}):
+        if extra in missing_by_extra:
+            yield _make_missing_packages_finding(extra, missing_by_extra[extra])
         else:
-            yield Finding(what=_name_packages(extra), state="ok", detail=", ".join(installed[extra]))
+            yield Finding(what=_format_packages_label(extra), state="ok", detail=", ".join(installed_by_extra[extra]))
 
 
-def _report_missing_packages(extra: str, names: list[str]) -> Finding:
-    """Return the finding for missing packages. An extra may be left out on purpose, so it is no failure."""
-    what = _name_packages(extra)
+def _make_missing_packages_finding(extra: str, names: list[str]) -> Finding:
+    """Make the finding for missing packages. An extra may be left out on purpose, so it is no failure.
+
+    Args:
+        extra: Name of the extra that the packages belong to; empty for the core.
+        names: Names of the missing packages.
+    """
+    what = _format_packages_label(extra)
     packages = ", ".join(names)
     if extra:
         fix = ["make setup", f"python -m pip install 'snakesim[{extra}]'"]
@@ -124,7 +129,7 @@ def _report_missing_packages(extra: str, names: list[str]) -> Finding:
     return Finding(what=what, state="fail", detail=f"missing: {packages}", fix=fix)
 
 
-def _name_packages(extra: str) -> str:
+def _format_packages_label(extra: str) -> str:
     return f"packages [{extra}]" if extra else "packages"
 
 
@@ -133,26 +138,26 @@ def check_laws() -> Iterator[Finding]:
     if not extras.is_installed("sim"):
         return
     what = "Physics in C"
-    problem = _run_python(FIND_LAWS_PROBLEM)
+    problem = _run_python_program(PHYSICS_LIBRARY_PROBE_PROGRAM)
     if not problem:
         yield Finding(what=what, state="ok", detail="ground and friction are computed in MuJoCo's engine")
         return
-    detail = f"{LAWS.python_cost}, with the same results: {problem}"
+    detail = f"{LAWS_LIBRARY.python_cost}, with the same results: {problem}"
     fix = ["sudo apt install gcc libc6-dev", "python -m pip install ziglang"]
     yield Finding(what=what, state="warn", detail=detail, fix=fix)
 
 
-def _run_python(program: str) -> str:
-    """Return what a Python program prints."""
+def _run_python_program(program: str) -> str:
+    """Run a Python program in a process of its own, and return what it prints; else the end of its errors."""
     parent = os.getpid()
     completed = subprocess.run(
-        python_command("-c", program),
-        env=child_environment({}),
+        make_python_command("-c", program),
+        env=make_child_environment({}),
         capture_output=True,
         text=True,
-        timeout=PROBE_LIMIT_S,
+        timeout=PROBE_TIMEOUT_S,
         check=False,
-        preexec_fn=lambda: die_with_parent(parent),
+        preexec_fn=lambda: set_parent_death_signal(parent),
     )
     return completed.stdout.strip() or completed.stderr.strip()[-MAX_ERROR_LENGTH:]
 
@@ -176,23 +181,27 @@ def check_opengl() -> Iterator[Finding]:
 
 
 def _find_render_error(renderer: str) -> str | None:
-    """Return why MuJoCo cannot render with an OpenGL library, or None if it can.
+    """Try to render an image with MuJoCo in a process of its own, because a broken graphics driver may crash it.
 
-    The test runs in a process of its own, because a broken graphics driver may crash it.
+    Args:
+        renderer: OpenGL library, as MUJOCO_GL names it: "egl" or "osmesa".
+
+    Returns:
+        The reason why MuJoCo cannot render with this library; None if it can.
     """
     parent = os.getpid()
     try:
         completed = subprocess.run(
-            python_command("-c", RENDER_ONE_IMAGE),
-            env=child_environment({"MUJOCO_GL": renderer}),
+            make_python_command("-c", RENDER_PROBE_PROGRAM),
+            env=make_child_environment({"MUJOCO_GL": renderer}),
             capture_output=True,
             text=True,
-            timeout=PROBE_LIMIT_S,
+            timeout=PROBE_TIMEOUT_S,
             check=False,
-            preexec_fn=lambda: die_with_parent(parent),
+            preexec_fn=lambda: set_parent_death_signal(parent),
         )
     except subprocess.TimeoutExpired:
-        return f"no image within {PROBE_LIMIT_S:.0f} s"
+        return f"no image within {PROBE_TIMEOUT_S:.0f} s"
     if completed.returncode == 0:
         return None
     error_lines = [line for line in completed.stderr.splitlines() if "Error" in line]
@@ -220,11 +229,11 @@ def check_can() -> Iterator[Finding]:
     if not interfaces:
         yield Finding(what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"])
         return
-    up = [name for name in interfaces if _is_interface_up(name)]
-    down = [name for name in interfaces if name not in up]
-    detail = f"up: {', '.join(up) or 'none'}"
-    fix = [f"sudo ip link set {name} up" for name in down]
-    yield Finding(what="CAN", state="warn" if down else "ok", detail=detail, fix=fix)
+    up_interfaces = [name for name in interfaces if _is_interface_up(name)]
+    down_interfaces = [name for name in interfaces if name not in up_interfaces]
+    detail = f"up: {', '.join(up_interfaces) or 'none'}"
+    fix = [f"sudo ip link set {name} up" for name in down_interfaces]
+    yield Finding(what="CAN", state="warn" if down_interfaces else "ok", detail=detail, fix=fix)
 
 
 def _is_interface_up(name: str) -> bool:
@@ -264,13 +273,13 @@ def check_clocks() -> Iterator[Finding]:
 def _check_wake_ups() -> Finding:
     """Sleep many times, and report how late the process wakes up."""
     delays_s: list[float] = []
-    for _ in range(WAKE_UPS):
-        due_s = time.monotonic() + WAKE_UP_PERIOD_S
+    for _ in range(WAKE_UP_COUNT):
+        expected_wake_up_s = time.monotonic() + WAKE_UP_PERIOD_S
         time.sleep(WAKE_UP_PERIOD_S)
-        delays_s.append(time.monotonic() - due_s)
+        delays_s.append(time.monotonic() - expected_wake_up_s)
     delays_s.sort()
-    median_s = delays_s[50]
-    p99_s = delays_s[98]
+    median_s = delays_s[WAKE_UP_COUNT // 2]
+    p99_s = delays_s[int(0.99 * WAKE_UP_COUNT) - 1]
     detail = (
         f"wake-ups {median_s * 1e6:.0f} us late in the median, {p99_s * 1e6:.0f} us in 99 % (no real-time priority)"
     )
@@ -298,7 +307,7 @@ def _check_priority() -> Finding:
         detail = (
             f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs miss ticks on a busy machine"
         )
-        fix = [_raise_limit(f"rtprio {HOST_PRIORITY}")]
+        fix = [_format_limit_command(f"rtprio {HOST_PRIORITY}")]
         return Finding(what="priority", state="warn", detail=detail, fix=fix)
     return Finding(what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted")
 
@@ -309,7 +318,7 @@ def _check_memory_lock() -> Finding:
     ctypes.CDLL(None).munlockall()
     if refusal is None:
         return Finding(what="memory lock", state="ok", detail="granted")
-    return Finding(what="memory lock", state="warn", detail=refusal, fix=[_raise_limit("memlock unlimited")])
+    return Finding(what="memory lock", state="warn", detail=refusal, fix=[_format_limit_command("memlock unlimited")])
 
 
 def _check_open_files() -> Finding:
@@ -317,10 +326,10 @@ def _check_open_files() -> Finding:
     detail = f"{soft_limit}, at most {hard_limit}"
     if hard_limit == resource.RLIM_INFINITY or hard_limit >= MIN_OPEN_FILES:
         return Finding(what="open files", state="ok", detail=detail)
-    return Finding(what="open files", state="warn", detail=detail, fix=[_raise_limit("nofile 8192")])
+    return Finding(what="open files", state="warn", detail=detail, fix=[_format_limit_command("nofile 8192")])
 
 
-def _raise_limit(limit: str) -> str:
+def _format_limit_command(limit: str) -> str:
     """Return the command that raises a limit of this user."""
     return f'echo "$USER - {limit}" | sudo tee -a {LIMITS_FILE}    # then log in again'
 

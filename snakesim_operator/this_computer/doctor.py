@@ -8,7 +8,7 @@ from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.this_computer import computer
 from snakesim_operator.this_computer.computer import Finding
-from snakesim_operator.this_computer.kernel import kernel
+from snakesim_operator.this_computer.kernel import check_kernel
 from snakesim_operator.this_computer.network_findings import check_ports, check_routers
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
@@ -20,34 +20,34 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     computer.check_kvm,
     computer.check_clocks,
     computer.check_real_time,
-    kernel,
+    check_kernel,
     computer.check_disk,
 )
 
 
-def doctor(where: RobotSelection, *, as_json: bool) -> int:
+def run_doctor(selection: RobotSelection, *, as_json: bool) -> int:
     """Check this computer and its network, and print a finding for each check.
 
     Args:
-        where: selects the endpoints that are checked.
-        as_json: print all findings as one JSON object.
+        selection: Selects the endpoints that are checked.
+        as_json: Whether to print all findings as one JSON object instead of text.
 
     Returns:
-        1 if a run is not possible, 0 otherwise.
+        The exit code: 1 if a run is not possible, 0 otherwise.
     """
     findings: list[Finding] = []
-    for check in (*CHECKS, check_ports, lambda: check_routers(where)):
+    for check in (*CHECKS, check_ports, lambda: check_routers(selection)):
         for finding in check():
             findings.append(finding)
             if not as_json:
                 _print_finding(finding)
-    failed = [finding.what for finding in findings if finding.state == "fail"]
+    failed_checks = [finding.what for finding in findings if finding.state == "fail"]
     if as_json:
-        print_json({"ok": not failed, "findings": msgspec.to_builtins(findings)})
+        print_json({"ok": not failed_checks, "findings": msgspec.to_builtins(findings)})
     else:
-        warnings = sum(finding.state == "warn" for finding in findings)
-        print_line(f"{len(findings)} checked; fail: {', '.join(failed) or 'none'}; warnings: {warnings}")
-    return 1 if failed else 0
+        warning_count = sum(finding.state == "warn" for finding in findings)
+        print_line(f"{len(findings)} checked; fail: {', '.join(failed_checks) or 'none'}; warnings: {warning_count}")
+    return 1 if failed_checks else 0
 
 
 def _print_finding(finding: Finding) -> None:

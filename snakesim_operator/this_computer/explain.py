@@ -6,44 +6,48 @@ from typing import Any
 from snakesim_hal.base.errors import ConfigError, find_nearest_word, shorten
 from snakesim_hal.base.terminal import align_columns, print_json, print_line
 from snakesim_hal.model.field_words import format_value
-from snakesim_hal.model.scenario import CHOSEN, Loaded, RunConfig
-from snakesim_hal.programs.preflight import check_plugins
-from snakesim_operator.this_computer.scenario_keys import Key, list_keys
+from snakesim_hal.model.scenario import CHOSEN_PREFIXES, LoadedScenario, RunConfig
+from snakesim_hal.programs.preflight import validate_and_complete_config
+from snakesim_operator.this_computer.scenario_keys import ScenarioKey, collect_keys
 
 MAX_VALUE_CHARACTERS = 40  # of a value in the list of a table's keys
-MAX_KEYS_IN_ERROR = 400  # characters
+MAX_KEYS_TEXT_CHARACTERS = 400  # characters
 COLUMNS = ("key", "value", "unit", "description")
 
 
-def explain_key(loaded: Loaded, name: str, *, as_json: bool) -> int:
+def explain_key(scenario: LoadedScenario, requested_name: str, *, as_json: bool) -> int:
     """Print type, unit, range, default, meaning, value and origin of a key; for a table also one line for each key.
 
     Args:
-        loaded: the checked scenario, with the origin of each value.
-        name: dotted key; `control.KEY` and `backend.KEY` are those of the chosen controller and backend.
-        as_json: print JSON.
+        scenario: The checked scenario, with the origin of each value.
+        requested_name: Dotted name of the key. `control.KEY` and `backend.KEY` refer to the chosen controller and
+            backend.
+        as_json: Whether to print JSON instead of text.
+
+    Returns:
+        0, the exit code of the command.
 
     Raises:
         ConfigError: The scenario is not valid, or there is no such key.
     """
-    check_plugins(loaded.config, loaded.table, run_files=False)
-    full_name = _expand_chosen(loaded.config, name)
-    keys = list_keys(loaded, named=full_name)
+    validate_and_complete_config(scenario.config, scenario.table, load_file_plugins=False)
+    full_name = _expand_shorthand_key(scenario.config, requested_name)
+    keys = collect_keys(scenario, include_section_of=full_name)
     if full_name not in keys:
-        raise _unknown_key_error(keys, name, full_name)
+        raise _make_unknown_key_error(keys, requested_name, full_name)
     key = keys[full_name]
     inner_keys = _find_inner_keys(keys, full_name)
     if as_json:
-        print_json(_as_json(key, inner_keys))
+        print_json(_convert_to_json(key, inner_keys))
         return 0
-    for line in _as_text(key, inner_keys):
+    for line in _format_explanation(key, inner_keys):
         print_line(line)
     return 0
 
 
-def _expand_chosen(config: RunConfig, name: str) -> str:
-    """Return the key in the section of the chosen controller or backend, for `control.KEY` or `backend.KEY`."""
-    control_prefix, backend_prefix = CHOSEN
+def _expand_shorthand_key(config: RunConfig, name: str) -> str:
+    """Return the full name of a key: `control.KEY` and `backend.KEY` are in the sections of the chosen plugins."""
+    control_prefix, backend_prefix = CHOSEN_PREFIXES
     if f"{name}." == control_prefix:
         return config.control_section
     if name.startswith(control_prefix):
@@ -53,21 +57,21 @@ def _expand_chosen(config: RunConfig, name: str) -> str:
     return name
 
 
-def _find_inner_keys(keys: Mapping[str, Key], table: str) -> list[Key]:
+def _find_inner_keys(keys: Mapping[str, ScenarioKey], table: str) -> list[ScenarioKey]:
     """Return the keys directly inside of a table."""
     prefix = f"{table}."
     return [key for name, key in keys.items() if name.startswith(prefix) and "." not in name.removeprefix(prefix)]
 
 
-def _unknown_key_error(keys: Mapping[str, Key], name: str, full_name: str) -> ConfigError:
-    """Return the error for a key that does not exist. It names a similar key, or all keys of the same table.
+def _make_unknown_key_error(keys: Mapping[str, ScenarioKey], requested_name: str, full_name: str) -> ConfigError:
+    """Make the error for a key that does not exist. Its text names a similar key, or all keys of the same table.
 
     Args:
         keys: All keys of the scenario by their dotted names.
-        name: The key as the user typed it.
-        full_name: The same key with the section of the chosen controller or backend.
+        requested_name: Name of the key as the user typed it.
+        full_name: Full name of the same key, with the section of the chosen controller or backend.
     """
-    problem = f"--explain {shorten(name)}: there is no such key"
+    problem = f"--explain {shorten(requested_name)}: there is no such key"
     *parents, last_word = full_name.split(".")
     while parents and ".".join(parents) not in keys:
         parents.pop()
@@ -85,24 +89,24 @@ def _unknown_key_error(keys: Mapping[str, Key], name: str, full_name: str) -> Co
     if nearest is not None:
         return ConfigError(f"{problem}; did you mean `{nearest.name}`?")
     sibling_names = ", ".join(key.doc.name for key in siblings)
-    where = f"`{table}` has" if table else "the tables and keys at the top are"
-    return ConfigError(f"{problem}; {where} {shorten(sibling_names, MAX_KEYS_IN_ERROR)}")
+    context = f"`{table}` has" if table else "the tables and keys at the top are"
+    return ConfigError(f"{problem}; {context} {shorten(sibling_names, MAX_KEYS_TEXT_CHARACTERS)}")
 
 
-def _find_nearest_key(last_part: str, keys: Sequence[Key]) -> Key | None:
-    """Return the key whose last part is most similar; None if none is similar."""
+def _find_nearest_key(last_part: str, keys: Sequence[ScenarioKey]) -> ScenarioKey | None:
+    """Return the key whose last part is most similar to a word; None if none is similar."""
     nearest = find_nearest_word(last_part, [key.doc.name for key in keys])
     return next((key for key in keys if key.doc.name == nearest), None)
 
 
-def _as_json(key: Key, inner_keys: Sequence[Key]) -> dict[str, Any]:
+def _convert_to_json(key: ScenarioKey, inner_keys: Sequence[ScenarioKey]) -> dict[str, Any]:
     described = _describe_as_json(key)
     if key.is_table:
         described["keys"] = {inner.doc.name: _describe_as_json(inner) for inner in inner_keys}
     return described
 
 
-def _describe_as_json(key: Key) -> dict[str, Any]:
+def _describe_as_json(key: ScenarioKey) -> dict[str, Any]:
     return {
         "key": key.name,
         "type": key.doc.type_words,
@@ -115,7 +119,7 @@ def _describe_as_json(key: Key) -> dict[str, Any]:
     }
 
 
-def _as_text(key: Key, inner_keys: Sequence[Key]) -> Iterator[str]:
+def _format_explanation(key: ScenarioKey, inner_keys: Sequence[ScenarioKey]) -> Iterator[str]:
     """Yield the lines that explain a key."""
     yield key.name
     yield f"  {key.doc.description}"
@@ -124,17 +128,17 @@ def _as_text(key: Key, inner_keys: Sequence[Key]) -> Iterator[str]:
         yield f"  {name:<8} {text}"
     if inner_keys:
         yield "keys"
-        yield from (f"  {line}" for line in align_columns(COLUMNS, [_as_row(inner) for inner in inner_keys]))
+        yield from (f"  {line}" for line in align_columns(COLUMNS, [_make_table_row(inner) for inner in inner_keys]))
 
 
-def _describe_table(key: Key) -> dict[str, str]:
+def _describe_table(key: ScenarioKey) -> dict[str, str]:
     rows = {"type": key.doc.type_words}
     if key.doc.range_words:
         rows["range"] = key.doc.range_words
     return rows
 
 
-def _describe_value(key: Key) -> dict[str, str]:
+def _describe_value(key: ScenarioKey) -> dict[str, str]:
     rows = {
         "type": key.doc.type_words,
         "unit": key.doc.unit or "none",
@@ -149,7 +153,7 @@ def _describe_value(key: Key) -> dict[str, str]:
     return rows
 
 
-def _as_row(key: Key) -> dict[str, str]:
+def _make_table_row(key: ScenarioKey) -> dict[str, str]:
     """Return one line of the keys of a table, by column."""
     value = "" if key.is_pattern or (key.is_table and key.value) else format_value(key.value)
     return {

@@ -11,33 +11,33 @@ from pathlib import Path
 
 from snakesim_operator.this_computer.computer import Finding
 
-FTDI_LATENCY_MS = 1  # the driver's default of 16 ms is longer than a tick at 100 Hz
+MAX_FTDI_LATENCY_MS = 1  # the driver's default of 16 ms is longer than a tick at 100 Hz
 ROOT = Path("/")
 
 
-def kernel(root: Path = ROOT) -> Iterator[Finding]:
+def check_kernel(root: Path = ROOT) -> Iterator[Finding]:
     """Yield findings about preemption, processor clocks, isolated processors, serial adapters and their ports."""
-    yield from _preemption(root)
-    yield from _governor(root)
-    yield from _isolated(root)
-    yield from _serial_adapters(root)
-    yield from _serial_ports(root)
+    yield from _check_preemption(root)
+    yield from _check_governor(root)
+    yield from _check_isolated_processors(root)
+    yield from _check_serial_adapters(root)
+    yield from _check_serial_ports(root)
 
 
-def _preemption(root: Path) -> Iterator[Finding]:
-    version = _read(root / "proc/version")
+def _check_preemption(root: Path) -> Iterator[Finding]:
+    version = _read_text_or_none(root / "proc/version")
     if version is None:
         return
-    if _read(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
+    if _read_text_or_none(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         yield Finding(what="kernel", state="ok", detail="PREEMPT_RT")
         return
     detail = "not PREEMPT_RT: ticks may be milliseconds late; `snakesim topic rate` shows it (docs/how-to/real-time.md)"
     yield Finding(what="kernel", state="warn", detail=detail, fix=["sudo apt install linux-image-rt-amd64"])
 
 
-def _governor(root: Path) -> Iterator[Finding]:
+def _check_governor(root: Path) -> Iterator[Finding]:
     paths = (root / "sys/devices/system/cpu").glob("cpu*/cpufreq/scaling_governor")
-    governors = {_read(path) for path in paths} - {None}
+    governors = {_read_text_or_none(path) for path in paths} - {None}
     if not governors:
         yield Finding(what="governor", state="ok", detail="not known: this kernel does not set the processors' clock")
     elif governors == {"performance"}:
@@ -48,8 +48,8 @@ def _governor(root: Path) -> Iterator[Finding]:
         yield Finding(what="governor", state="warn", detail=detail, fix=["sudo cpupower frequency-set -g performance"])
 
 
-def _isolated(root: Path) -> Iterator[Finding]:
-    isolated = _read(root / "sys/devices/system/cpu/isolated")
+def _check_isolated_processors(root: Path) -> Iterator[Finding]:
+    isolated = _read_text_or_none(root / "sys/devices/system/cpu/isolated")
     if isolated:
         detail = f"{isolated} without other programs; a host uses them when started with `taskset -c {isolated}`"
     else:
@@ -57,30 +57,30 @@ def _isolated(root: Path) -> Iterator[Finding]:
     yield Finding(what="isolated processors", state="ok", detail=detail)
 
 
-def _serial_adapters(root: Path) -> Iterator[Finding]:
+def _check_serial_adapters(root: Path) -> Iterator[Finding]:
     """Yield a finding for each FTDI adapter, whose driver collects bytes for `latency_timer` milliseconds."""
     for timer in sorted((root / "sys/bus/usb-serial/devices").glob("*/latency_timer")):
-        latency_ms = _read(timer) or ""
+        latency_ms = _read_text_or_none(timer) or ""
         port = timer.parent.name
-        if latency_ms.isdecimal() and int(latency_ms) > FTDI_LATENCY_MS:
-            fix = [f"echo {FTDI_LATENCY_MS} | sudo tee {timer}"]
+        if latency_ms.isdecimal() and int(latency_ms) > MAX_FTDI_LATENCY_MS:
+            fix = [f"echo {MAX_FTDI_LATENCY_MS} | sudo tee {timer}"]
             detail = f"{port} holds back what it received for up to {latency_ms} ms"
             yield Finding(what="serial adapter", state="warn", detail=detail, fix=fix)
         else:
             yield Finding(what="serial adapter", state="ok", detail=f"{port}: latency timer {latency_ms or '?'} ms")
 
 
-def _serial_ports(root: Path) -> Iterator[Finding]:
-    """Yield a finding for each port of an adapter."""
+def _check_serial_ports(root: Path) -> Iterator[Finding]:
+    """Yield a finding for each serial port of a USB adapter."""
     folder = root / "dev"
     for port in sorted([*folder.glob("ttyUSB*"), *folder.glob("ttyACM*")]):
         yield _check_serial_port(port)
 
 
 def _check_serial_port(port: Path) -> Finding:
-    """Check whether this user may open a port, and no other program has locked it."""
+    """Check whether this user may open a serial port, and whether another program has locked it."""
     try:
-        handle = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        file_descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
         fix = [f"ls -l {port}"]
         if error.errno == errno.EACCES:
@@ -88,16 +88,16 @@ def _check_serial_port(port: Path) -> Finding:
         detail = f"{port.name} cannot be opened: {error.strerror}"
         return Finding(what="serial port", state="warn", detail=detail, fix=fix)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file_descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         detail = f"{port.name} is in use by another program"
         return Finding(what="serial port", state="warn", detail=detail, fix=[f"sudo fuser -v {port}"])
     finally:
-        os.close(handle)
+        os.close(file_descriptor)
     return Finding(what="serial port", state="ok", detail=f"{port.name} can be opened")
 
 
-def _read(path: Path) -> str | None:
+def _read_text_or_none(path: Path) -> str | None:
     try:
         return path.read_text().strip()
     except OSError:

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
-from snakesim_hal.network.local_registry import local_robots
+from snakesim_hal.network.local_registry import list_local_robots
 from snakesim_hal.network.session import open_session
-from snakesim_operator.base.targets import CONNECT_S, RobotSelection, robots_on
+from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_namespaces
 from snakesim_operator.this_computer.computer import Finding
 
 
@@ -17,7 +17,7 @@ def check_ports() -> Iterator[Finding]:
     """Check whether the default endpoint is free, or used by a robot or by another program."""
     host, _, port = DEFAULT_ENDPOINT.partition("/")[2].rpartition(":")
     what = f"port {port}"
-    robots = [robot for robot in local_robots() if robot.endpoint == DEFAULT_ENDPOINT]
+    robots = [robot for robot in list_local_robots() if robot.endpoint == DEFAULT_ENDPOINT]
     used_protocols = _find_used_protocols(host, int(port))
     if robots:
         yield Finding(what=what, state="ok", detail=f"used by {robots[0].namespace}, process {robots[0].pid}")
@@ -43,15 +43,15 @@ def _find_used_protocols(host: str, port: int) -> list[str]:
     return used
 
 
-def check_routers(where: RobotSelection) -> Iterator[Finding]:
+def check_routers(selection: RobotSelection) -> Iterator[Finding]:
     """Check that a Zenoh router answers at every named endpoint, or that has a robot of this computer."""
-    links = where.networks() if where.endpoint or local_robots() else []
+    links = selection.list_networks() if selection.endpoint or list_local_robots() else []
     for link in links:
-        begin_s = time.monotonic()
+        start_s = time.monotonic()
         try:
-            with open_session(replace(link, namespace=None), CONNECT_S) as session:
-                duration_s = time.monotonic() - begin_s
-                robots = ", ".join(robots_on(session)) or "no robot"
+            with open_session(replace(link, namespace=None), CONNECT_TIMEOUT_S) as session:
+                duration_s = time.monotonic() - start_s
+                robots = ", ".join(find_namespaces(session)) or "no robot"
         except SnakesimError as error:
             fix = ["snakesim start router    # there; and is a firewall between?"]
             detail = f"{link.endpoint}: {error}"

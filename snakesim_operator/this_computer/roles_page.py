@@ -2,7 +2,15 @@
 
 from collections.abc import Iterable, Iterator
 
-from snakesim_hal.wire.roles import INJECTION, MESSAGES, MESSAGES_OF_LATCHED, ROLE_DESCRIPTIONS, TABLE, KeyRights, Role
+from snakesim_hal.wire.roles import (
+    ACCESS_RULES,
+    FAULT_INJECTION_KEYS,
+    LATCHED_ZENOH_MESSAGES_BY_ACTION,
+    ROLE_DESCRIPTIONS,
+    ZENOH_MESSAGES_BY_ACTION,
+    AccessRule,
+    Role,
+)
 
 INTRODUCTION = """\
 # Roles
@@ -21,44 +29,49 @@ then delivered is decided key by key.
 """
 
 
-def roles_page() -> str:
-    """Return the documentation page about the roles in a lab, generated from the table of permissions."""
+def make_roles_page() -> str:
+    """Generate the documentation page about the roles in a lab from the table of permissions, as Markdown."""
     return "\n".join(
         [
             INTRODUCTION,
-            *_table(("role", "is"), ROLE_DESCRIPTIONS.items()),
+            *_format_table(("role", "is"), ROLE_DESCRIPTIONS.items()),
             "",
-            *_table(("key", *Role), [_key_row(line) for line in TABLE]),
+            *_format_table(("key", *Role), [_make_key_row(rights) for rights in ACCESS_RULES]),
             "",
             NOTES,
             "## In Zenoh's words",
             "",
             "What a router lets in from such a process, and what it sends to it.",
             "",
-            *_table(("act", "in", "out"), _message_rows()),
+            *_format_table(("act", "in", "out"), _iter_message_rows()),
             "",
         ]
     )
 
 
-def _key_row(line: KeyRights) -> tuple[str, ...]:
-    """Return a key, and what each role may do at it."""
-    condition = " (if allowed)" if line.key in INJECTION else ""
-    cells = [f"`{line.key}`{condition}"]
+def _make_key_row(rights: AccessRule) -> tuple[str, ...]:
+    """Return one row of the table: a key, and the actions that each role may do at it."""
+    condition = " (if allowed)" if rights.key in FAULT_INJECTION_KEYS else ""
+    cells = [f"`{rights.key}`{condition}"]
     for role in Role:
-        cells.append(", ".join(line.acts(role)) or "-")
+        cells.append(", ".join(rights.list_actions(role)) or "-")
     return tuple(cells)
 
 
-def _message_rows() -> Iterator[tuple[str, ...]]:
-    """Yield each act with the Zenoh messages that it consists of, into the router and out of it."""
-    for suffix, acts in (("", MESSAGES), (", of a latched key also", MESSAGES_OF_LATCHED)):
+def _iter_message_rows() -> Iterator[tuple[str, ...]]:
+    """Yield rows of an action and its Zenoh messages: those into the router, and those out of it."""
+    for suffix, acts in (("", ZENOH_MESSAGES_BY_ACTION), (", of a latched key also", LATCHED_ZENOH_MESSAGES_BY_ACTION)):
         for act, messages in acts.items():
             yield f"{act}{suffix}", _format_messages(messages, "ingress"), _format_messages(messages, "egress")
 
 
 def _format_messages(messages: Iterable[tuple[str, str, str]], flow: str) -> str:
-    """Return the messages of a flow, as a cell. messages: flow, name, and what follows the key."""
+    """Return the messages of one direction as text for a cell of the table.
+
+    Args:
+        messages: Direction, name and suffix of the key for each message.
+        flow: Direction: "ingress" into the router, or "egress" out of it.
+    """
     names: list[str] = []
     for message_flow, message, key_suffix in messages:
         if message_flow != flow:
@@ -68,13 +81,13 @@ def _format_messages(messages: Iterable[tuple[str, str, str]], flow: str) -> str
     return ", ".join(names) or "-"
 
 
-def _table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+def _format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     """Return the lines of a Markdown table."""
     titles = list(header)
-    lines = [_table_line(titles), _table_line(["---"] * len(titles))]
-    lines += [_table_line(row) for row in rows]
+    lines = [_format_table_row(titles), _format_table_row(["---"] * len(titles))]
+    lines += [_format_table_row(row) for row in rows]
     return lines
 
 
-def _table_line(cells: Iterable[str]) -> str:
+def _format_table_row(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"

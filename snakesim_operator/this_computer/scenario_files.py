@@ -8,17 +8,17 @@ import msgspec
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.controller import Controller, decode_parameters
-from snakesim_hal.model.files import Table, leaves, list_shipped, read_part
+from snakesim_hal.model.files import ConfigTable, iterate_leaves, list_shipped_names, read_table_with_base
 from snakesim_hal.model.plugins import (
     BACKENDS,
     CONTROLLERS,
-    find_installed,
-    in_file,
-    plugin_settings,
+    decode_plugin_settings,
+    is_file_plugin,
+    load_plugin_unless_file,
     require_base_class,
 )
-from snakesim_hal.model.scenario import Loaded, RunConfig
-from snakesim_hal.programs.preflight import check_plugins
+from snakesim_hal.model.scenario import LoadedScenario, RunConfig
+from snakesim_hal.programs.preflight import validate_and_complete_config
 
 DESCRIPTION_KEYS = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}
 MAX_VALUE_CHARACTERS = 48  # longer values are not aligned
@@ -31,7 +31,7 @@ def print_shipped_files(*, as_json: bool) -> int:
     shipped_files: dict[str, dict[str, str]] = {}
     for kind, description_key in DESCRIPTION_KEYS.items():
         shipped_files[kind] = {
-            name: read_part(name, kind).values.get(description_key, "") for name in list_shipped(kind)
+            name: read_table_with_base(name, kind).values.get(description_key, "") for name in list_shipped_names(kind)
         }
     if as_json:
         print_json(shipped_files)
@@ -43,18 +43,18 @@ def print_shipped_files(*, as_json: bool) -> int:
     return 0
 
 
-def show_config(loaded: Loaded, *, as_json: bool) -> int:
+def print_config(scenario: LoadedScenario, *, as_json: bool) -> int:
     """Print every value of a scenario, and the file or flag that it came from. Raises ConfigError.
 
     Returns the exit code.
     """
-    check_plugins(loaded.config, loaded.table, run_files=False)
-    rows = list_values(loaded)
+    validate_and_complete_config(scenario.config, scenario.table, load_file_plugins=False)
+    rows = collect_values(scenario)
     if as_json:
         print_json({key: {"value": value, "origin": origin} for key, value, origin in rows})
         return 0
     _print_rows(rows)
-    _print_unchecked(loaded.config)
+    _print_unchecked_sections(scenario.config)
     return 0
 
 
@@ -67,43 +67,46 @@ def _print_rows(rows: Sequence[Row]) -> None:
         print_line(f"{key:<{key_width}}  {text:<{value_width}}  {origin}")
 
 
-def _print_unchecked(config: RunConfig) -> None:
+def _print_unchecked_sections(config: RunConfig) -> None:
     """Print which sections are not checked, because their plugin is a file whose code would run."""
     plugins = [
         (config.control_section, config.controller),
         (config.backend_section, config.backend),
     ]
-    plugins += [(f"services.{name}", service.plugin) for name, service in config.own_services.items()]
+    plugins += [(f"services.{name}", service.plugin) for name, service in config.internal_services.items()]
     for section, plugin in plugins:
-        if in_file(plugin):
+        if is_file_plugin(plugin):
             print_line(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")
 
 
-def list_values(loaded: Loaded) -> list[Row]:
+def collect_values(scenario: LoadedScenario) -> list[Row]:
     """Return all values of the scenario, with every setting of the chosen controller and backend."""
-    config = loaded.config
-    table = loaded.table
+    config = scenario.config
+    table = scenario.table
     values: dict[str, tuple[Any, str]] = {}
-    for key, value, origin in loaded.explain():
+    for key, value, origin in scenario.list_effective_values():
         if key not in ("controllers", "backends"):
             values[key] = (value, origin)
     for section, checked in _check_plugin_sections(config, table):
-        for key, value in leaves(msgspec.to_builtins(checked), section):
-            values[key] = (value, table.origin_of(key))
+        for key, value in iterate_leaves(msgspec.to_builtins(checked), section):
+            values[key] = (value, table.find_origin(key))
     return [(key, value, origin) for key, (value, origin) in values.items()]
 
 
-def _check_plugin_sections(config: RunConfig, table: Table) -> Iterator[tuple[str, Any]]:
+def _check_plugin_sections(config: RunConfig, table: ConfigTable) -> Iterator[tuple[str, Any]]:
     """Yield the dotted key and the checked values of the controller's and the backend's section; files are left out."""
-    plugin = find_installed(CONTROLLERS, config.controller)
+    plugin = load_plugin_unless_file(CONTROLLERS, config.controller)
     if plugin is not None:
         controller = require_base_class(plugin, Controller, f"controller {shorten(config.controller)!r}")
         section = config.control_section
         yield (
             section,
-            decode_parameters(controller, config.controller_parameters, table.source, section, table.origin),
+            decode_parameters(controller, config.controller_parameters, table.source, section, table.origin_by_key),
         )
-    backend = find_installed(BACKENDS, config.backend)
+    backend = load_plugin_unless_file(BACKENDS, config.backend)
     if backend is not None:
         section = config.backend_section
-        yield section, plugin_settings(backend, config.backend_settings, table.source, section, table.origin)
+        yield (
+            section,
+            decode_plugin_settings(backend, config.backend_settings, table.source, section, table.origin_by_key),
+        )

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import SCHEMAS
+from snakesim_hal.model.files import SCHEMAS_DIR
 from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, FILES, PHYSICS_MODELS
 from snakesim_hal.model.robot import RobotFile
@@ -19,22 +19,28 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding
 from snakesim_hal.wire.messages import VERSIONS
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.this_computer.plugin_sections import list_shipped_plugins, section_type
-from snakesim_operator.this_computer.roles_page import roles_page
+from snakesim_operator.this_computer.plugin_sections import find_bundled_plugins, get_section_type
+from snakesim_operator.this_computer.roles_page import make_roles_page
 
-KEYS, TITLE = "keys.md", "# Key space"
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
+KEY_SPACE_FILENAME, KEY_SPACE_TITLE = "keys.md", "# Key space"
+JSON_SCHEMA_DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
-def published() -> list[Path]:
-    """Every installed file, including the DBC file of the bus."""
-    return sorted(path for path in SCHEMAS.rglob("*") if path.is_file())
+def list_published_files() -> list[Path]:
+    """Return the paths of all installed files of the wire contract, including the DBC file of the CAN bus."""
+    return sorted(path for path in SCHEMAS_DIR.rglob("*") if path.is_file())
 
 
 def write_schemas(folder: Path) -> list[Path]:
-    """Write everything; returns the files in order. Files of an earlier call that are no longer written are removed."""
-    contents = dict(contract())
-    if _is_contract(folder):
+    """Write all files of the wire contract into a folder.
+
+    Files of an earlier call that are no longer part of the contract are removed.
+
+    Returns:
+        The paths of the written files.
+    """
+    contents = dict(generate_contract_files())
+    if _is_contract_folder(folder):
         for old in [*folder.glob("messages/*.json"), *folder.glob("files/*.json")]:
             if str(old.relative_to(folder)) not in contents:
                 old.unlink()
@@ -43,41 +49,41 @@ def write_schemas(folder: Path) -> list[Path]:
     return [folder / name for name in contents]
 
 
-def _is_contract(folder: Path) -> bool:
-    """Whether a folder was written by this command: other folders called `files/` stay unchanged."""
+def _is_contract_folder(folder: Path) -> bool:
+    """Return whether a folder was written by `write_schemas`, so that its old files may be removed."""
     try:
-        return read_text(folder / KEYS).startswith(TITLE)
+        return read_text(folder / KEY_SPACE_FILENAME).startswith(KEY_SPACE_TITLE)
     except ConfigError:
         return False
 
 
-def contract() -> Iterator[tuple[str, str]]:
-    """Every file of the contract as (relative path, text)."""
-    yield KEYS, _key_space()
-    yield "roles.md", roles_page()
+def generate_contract_files() -> Iterator[tuple[str, str]]:
+    """Yield every file of the wire contract, as its relative path and its text."""
+    yield KEY_SPACE_FILENAME, _format_key_space_page()
+    yield "roles.md", make_roles_page()
     for message in VERSIONS:
         extra = {"encoding": format_encoding(message)}
-        yield f"messages/{message.__name__}.json", _schema(message, extra)
-    yield "files/robot.json", _schema(RobotFile)
-    yield "files/scene.json", _schema(SceneFile)
-    yield "files/run.json", _schema(RunConfig)
-    yield "files/summary.json", _schema(RunSummary)
-    for name, struct in list_shipped_plugins(FILES):
-        yield f"files/{name}.json", _schema(struct)
+        yield f"messages/{message.__name__}.json", _format_schema(message, extra)
+    yield "files/robot.json", _format_schema(RobotFile)
+    yield "files/scene.json", _format_schema(SceneFile)
+    yield "files/run.json", _format_schema(RunConfig)
+    yield "files/summary.json", _format_schema(RunSummary)
+    for name, struct in find_bundled_plugins(FILES):
+        yield f"files/{name}.json", _format_schema(struct)
     for group, section in ((BACKENDS, "backends"), (CONTROLLERS, "control"), (PHYSICS_MODELS, "physics_models")):
-        for name, plugin in list_shipped_plugins(group):
-            yield f"files/{section}.{name}.json", _schema(section_type(plugin))
+        for name, plugin in find_bundled_plugins(group):
+            yield f"files/{section}.{name}.json", _format_schema(get_section_type(plugin))
 
 
-def _schema(struct: type[msgspec.Struct], extra: dict[str, Any] | None = None) -> str:
-    schema = {"$schema": DIALECT, **(extra or {}), **make_schema(struct)}
+def _format_schema(struct: type[msgspec.Struct], extra: dict[str, Any] | None = None) -> str:
+    schema = {"$schema": JSON_SCHEMA_DIALECT, **(extra or {}), **make_schema(struct)}
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
 
 
-def _key_space() -> str:
-    """Return the page that lists all keys of the network with their messages and writers, as Markdown."""
+def _format_key_space_page() -> str:
+    """Return the page that lists all keys of the key space with their messages and writers, as Markdown."""
     rows = [
-        TITLE,
+        KEY_SPACE_TITLE,
         "",
         "Made by `make schemas` from `snakesim_hal/wire/keys.py`. Keys are relative to the robot's Zenoh namespace.",
         "`*` stands for a service's name, of `hal/host/*` for the id of a host. How to use these keys",

@@ -5,11 +5,11 @@ from typing import ClassVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_settings import joint_label
+from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.emulator import MAX_CURRENT, MODEL, EmulatedDynamixel, EmulatedModel
 from snakesim_serial_backend.dynamixel.load import PORT_LOAD
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
@@ -34,20 +34,20 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
-        check_joints(config, settings, joints)
-        cls.check_port_load(config, settings, joints)
+        validate_joints(config, settings, joints)
+        cls.validate_port_load(config, settings, joints)
 
     @classmethod
-    def open_servos(cls, opened: OpenedPort[EmulatedDynamixel]) -> Servos:
-        port = Port(opened.wire, opened.gap_s)
+    def open_servos(cls, opened_port: OpenedPort[EmulatedDynamixel]) -> Servos:
+        port = Port(opened_port.wire, opened_port.response_gap_s)
         context = ServosContext(
-            servos=[servo_of(joint, port, opened.settings) for joint in opened.joints],
+            servos=[make_servo(joint, port, opened_port.settings) for joint in opened_port.joints],
             port=port,
-            readings=opened.readings,
-            settings=opened.settings,
-            emulator=opened.emulator,
-            answer_s=opened.answer_s,
-            clock_ns=opened.clock_ns,
+            readings=opened_port.readings,
+            settings=opened_port.settings,
+            emulator=opened_port.emulator,
+            response_timeout_s=opened_port.response_timeout_s,
+            clock_ns=opened_port.clock_ns,
         )
         return Servos(context)
 
@@ -60,12 +60,12 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
         ptys: Sequence[Pty],
         clock: DriverClock,
     ) -> EmulatedDynamixel:
-        model = emulated_model(settings)
-        constants = [constant_of(joint, model) for joint in joints]
-        return EmulatedDynamixel(body, ptys, constants, settings.baud, clock.now_ns, model)
+        model = select_emulated_model(settings)
+        torque_constants_nm_per_a = [get_torque_constant(joint, model) for joint in joints]
+        return EmulatedDynamixel(body, ptys, torque_constants_nm_per_a, settings.baud, clock.now_ns, model)
 
 
-def servo_of(joint: Joint, port: Port, settings: DynamixelSettings) -> Servo:
+def make_servo(joint: Joint, port: Port, settings: DynamixelSettings) -> Servo:
     """Return a servo with the parameters of its joint, converted to its horn."""
     drive = joint.drive
     limits = joint.limits
@@ -74,7 +74,7 @@ def servo_of(joint: Joint, port: Port, settings: DynamixelSettings) -> Servo:
         id=joint.id,
         name=joint.name,
         port=port,
-        constant=constant_of(joint, emulated_model(settings)),
+        torque_constant_nm_per_a=get_torque_constant(joint, select_emulated_model(settings)),
         stiffness=joint.motor.stiffness_nm_per_rad / drive.gear**2,
         damping=joint.motor.damping_nm_s_per_rad / drive.gear**2,
         lower_rad=lower_rad,
@@ -84,7 +84,7 @@ def servo_of(joint: Joint, port: Port, settings: DynamixelSettings) -> Servo:
     )
 
 
-def constant_of(joint: Joint, model: EmulatedModel) -> float:
+def get_torque_constant(joint: Joint, model: EmulatedModel) -> float:
     """Return a joint's torque constant in N·m/A.
 
     Without one, which only emulated servos may lack, it is such that half of the possible current gives full torque.
@@ -93,40 +93,40 @@ def constant_of(joint: Joint, model: EmulatedModel) -> float:
     return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / max_a
 
 
-def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
+def validate_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError for joints that no servo can drive."""
     has_real_servos = not all(is_emulated(port) for port in settings.ports)
     for joint in joints:
         travel_rad = (joint.limits.upper_rad - joint.limits.lower_rad) * joint.drive.gear
         if joint.id > LAST_ID:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}",
+                f"{make_joint_label(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}",
                 code="drive/unsupported-setting",
             )
         if travel_rad + 2 * SLACK_RAD >= REVOLUTION_RAD:
             raise ConfigError(
-                f"{joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and loses the count of whole "
-                f"turns when it is off: its angle would be ambiguous afterwards. Narrow its limits (or `gear`) to "
-                f"less than {REVOLUTION_RAD - 2 * SLACK_RAD:.2f} rad",
+                f"{make_joint_label(config, joint)}: its servo travels {travel_rad:.2f} rad, and loses the count of "
+                "whole turns when it is off: its angle would be ambiguous afterwards. Narrow its limits (or `gear`) "
+                f"to less than {REVOLUTION_RAD - 2 * SLACK_RAD:.2f} rad",
                 code="drive/unsupported-setting",
             )
         if joint.motor.torque_constant_nm_per_a is None and has_real_servos:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `torque_constant_nm_per_a` is missing, and servos measure and limit "
-                "amperes: take stall torque over stall current from the e-Manual, and measure it "
+                f"{make_joint_label(config, joint)}: `torque_constant_nm_per_a` is missing, and servos measure and "
+                "limit amperes: take stall torque over stall current from the e-Manual, and measure it "
                 "(docs/hardware/dynamixel.md)",
                 code="drive/unsupported-setting",
             )
 
 
-def emulated_model(settings: DynamixelSettings) -> EmulatedModel:
+def select_emulated_model(settings: DynamixelSettings) -> EmulatedModel:
     """Return the model that servos are emulated as: that of the settings, if they name one that is known."""
-    number = at.model_number(settings.model)
+    number = registers.find_model_number(settings.model)
     if number is None:
         number = MODEL
     current_a = settings.current_unit_a.get(str(number))
-    if current_a is None and number in at.MODELS:
-        current_a = at.MODELS[number].current_a
+    if current_a is None and number in registers.MODELS:
+        current_a = registers.MODELS[number].current_a
     if current_a is None:
         current_a = UNKNOWN_CURRENT_UNIT_A
     return EmulatedModel(number, current_a)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from snakesim_hal.base.errors import BackendError
-from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.packets import LAST_ID, Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, Servo
@@ -19,150 +19,176 @@ from snakesim_serial_backend.servo_bus import GARBLED, Registers
 from snakesim_serial_backend.servo_checks import NO_ANSWER, find_shared_id
 
 # Registers that are written at every start.
-STARTUP_REGISTERS = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
+STARTUP_REGISTERS = {registers.STATUS_LEVEL: 2, registers.TORQUE_ENABLE: 0, registers.WATCHDOG: 0}
 # Registers that are written only where they differ, as each write wears out their memory.
-EEPROM_VALUES = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}
+EEPROM_VALUES = {registers.OPERATING_MODE: registers.CURRENT_BASED_POSITION, registers.DELAY: 0}
 TORQUE_AT_START = 0x01  # bit of the startup configuration
 # Registers in which two servos differ: position, voltage, temperature.
-MEASURED = Registers(at.PRESENT, at.TEMPERATURE + 1 - at.PRESENT)
+MEASURED = Registers(registers.PRESENT, registers.TEMPERATURE + 1 - registers.PRESENT)
 
 _log = logging.getLogger("snakesim.dynamixel")
 
 
 def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
-    """Find all servos, check them, and write the registers that the driver needs.
+    """Find all servos of a port, check them, and write the registers that the driver needs. Torque is off afterwards.
+
+    Args:
+        servos: Servos of the port; the properties that they report are stored in them.
+        port: Port to which the servos are connected.
+        settings: Settings of the driver type.
 
     Returns:
-        What every servo measures, and its health.
+        For each servo its status packets with the motion registers and with the health registers, in this order.
 
     Raises:
-        BackendError: a servo is missing or cannot be used; the message lists all of these.
+        BackendError: A servo is missing or cannot be used; the message lists all such servos.
     """
-    with port.wait_patiently():
-        return _bring_up(servos, port, settings)
+    with port.extended_timeouts():
+        return _bring_up_with_extended_timeouts(servos, port, settings)
 
 
-def _bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
-    """Do what `bring_up` declares."""
-    pings, objections = _find_servos(servos, settings.bring_up_limit_s)
-    flaws: list[str] = []
+def _bring_up_with_extended_timeouts(
+    servos: Sequence[Servo], port: Port, settings: DynamixelSettings
+) -> list[tuple[Packet, Packet]]:
+    """Bring up the servos, as `bring_up` declares, while the port waits longer for responses."""
+    pings, problem_by_name = _find_servos(servos, settings.bring_up_limit_s)
+    problems: list[str] = []
     for servo in servos:
-        flaw = objections.get(servo.name) or _check_servo(servo, pings.get(servo.name), settings)
-        if flaw:
-            flaws.append(f"  {servo.label} {flaw}")
-    if flaws:
+        problem = problem_by_name.get(servo.name) or _find_servo_problem(servo, pings.get(servo.name), settings)
+        if problem:
+            problems.append(f"  {servo.label} {problem}")
+    if problems:
         if len(pings) < len(servos):
-            flaws += _describe_unknown_servos(servos, port)
-        raise BackendError("the robot is not complete; nothing was enabled:", *flaws, code="drive/not-complete")
+            problems += _describe_unknown_servos(servos, port)
+        raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
     for servo in servos:
         _write_registers(servo)
     ids = [servo.id for servo in servos]
-    port.fast = len(port.read_all(ids, at.PRESENT, at.present_form.size)) == len(ids)  # older firmware is not
-    return [(_read_present(servo), _read_registers(servo, at.TORQUE_ENABLE, at.HEALTH_SIZE)) for servo in servos]
+    port.fast = len(port.read_all(ids, registers.PRESENT, registers.present_form.size)) == len(
+        ids
+    )  # older firmware is not
+    return [
+        (_read_measurements(servo), _read_registers(servo, registers.TORQUE_ENABLE, registers.HEALTH_SIZE))
+        for servo in servos
+    ]
 
 
-def _check_servo(servo: Servo, ping: Packet | None, settings: DynamixelSettings) -> str:
+def _find_servo_problem(servo: Servo, ping: Packet | None, settings: DynamixelSettings) -> str:
     """Return why a servo cannot be used; empty if it can. ping: its answer to a ping, None without one."""
     if ping is None:
         return NO_ANSWER
     shared_id = find_shared_id(servo, MEASURED)
     if shared_id:
         return shared_id
-    eeprom = servo.port.try_to_read(servo.id, 0, at.EEPROM_SIZE)
+    eeprom = servo.port.try_to_read(servo.id, 0, registers.EEPROM_SIZE)
     if eeprom is None:
         return NO_ANSWER
     number, firmware = struct.unpack("<HB", ping.data[:3])
     return (
-        _check_model(servo, number, settings)
-        or _check_firmware(firmware)
-        or _check_eeprom(eeprom)
-        or _check_current_limit(servo, eeprom)
+        _find_model_problem(servo, number, settings)
+        or _find_firmware_problem(firmware)
+        or _find_eeprom_problem(eeprom)
+        or _find_current_limit_problem(servo, eeprom)
     )
 
 
-def _find_servos(servos: Sequence[Servo], limit_s: float) -> tuple[dict[str, Packet], dict[str, str]]:
-    """Ping all servos until all have answered, or the time is over.
+def _find_servos(servos: Sequence[Servo], timeout_s: float) -> tuple[dict[str, Packet], dict[str, str]]:
+    """Ping all servos until all have responded, or until a timeout.
+
+    Args:
+        servos: Servos to find.
+        timeout_s: Maximum duration of the search.
 
     Returns:
-        The answer of each servo that answered, and the objection to each that sends garbled bytes; by its name.
+        The response of each servo that has responded, and a problem text for each servo that sends garbled bytes; both
+        by the name of the servo.
     """
-    end_s = time.monotonic() + limit_s
-    found: dict[str, Packet] = {}
-    objections: dict[str, str] = {}
+    deadline_s = time.monotonic() + timeout_s
+    responses_by_name: dict[str, Packet] = {}
+    problem_by_name: dict[str, str] = {}
     while True:
         for servo in servos:
-            if servo.name in found:
+            if servo.name in responses_by_name:
                 continue
-            answers = servo.port.ping(servo.id)
-            objections.pop(servo.name, None)
-            if answers.statuses:
-                found[servo.name] = answers.statuses[0]
-            elif answers.garbled:
-                objections[servo.name] = f"sends garbled bytes in answer to a ping: {GARBLED}"
-        if len(found) == len(servos) or time.monotonic() > end_s:
-            return found, objections
+            responses = servo.port.ping(servo.id)
+            problem_by_name.pop(servo.name, None)
+            if responses.statuses:
+                responses_by_name[servo.name] = responses.statuses[0]
+            elif responses.garbled:
+                problem_by_name[servo.name] = f"sends garbled bytes in answer to a ping: {GARBLED}"
+        if len(responses_by_name) == len(servos) or time.monotonic() > deadline_s:
+            return responses_by_name, problem_by_name
 
 
-def _check_model(servo: Servo, number: int, settings: DynamixelSettings) -> str:
-    """Return why a servo of this model cannot be used; empty if it can, and then its unit of current is known."""
-    name = at.model_name(number)
+def _find_model_problem(servo: Servo, number: int, settings: DynamixelSettings) -> str:
+    """Check the model of a servo, and store the torque of its current unit.
+
+    Args:
+        servo: Servo whose model is checked; `torque_unit_nm` is set if the model can be used.
+        number: Model number that the servo has reported.
+        settings: Settings of the driver type, which may name a model and current units.
+
+    Returns:
+        The reason why the servo cannot be used, to be put after its name; an empty string if it can be used.
+    """
+    name = registers.get_model_name(number)
     if settings.model and name != settings.model:
         return (
             f"is of another model: {name}, but `backends.dynamixel.model` = {settings.model}; correct the scenario, or "
             f"replace the servo"
         )
-    if number in at.WITHOUT_CURRENT:
+    if number in registers.WITHOUT_CURRENT:
         return f"is of another model: {name} neither measures nor limits current, which this driver needs"
     current_a = settings.current_unit_a.get(str(number))
-    if current_a is None and number in at.MODELS:
-        current_a = at.MODELS[number].current_a
+    if current_a is None and number in registers.MODELS:
+        current_a = registers.MODELS[number].current_a
     if current_a is None:
         return (
             f"is of another model: {name}, whose unit of current is not known here; give that of its e-Manual, in A, "
             f"as `backends.dynamixel.current_unit_a.{number}`"
         )
-    servo.unit_nm = current_a * servo.constant
+    servo.torque_unit_nm = current_a * servo.torque_constant_nm_per_a
     return ""
 
 
-def _check_firmware(firmware: int) -> str:
+def _find_firmware_problem(firmware: int) -> str:
     """Return why this firmware cannot be used; empty if it can."""
-    if firmware < at.FIRST_FIRMWARE:
-        return f"has firmware {firmware}, and its bus watchdog needs {at.FIRST_FIRMWARE}: update it"
+    if firmware < registers.FIRST_FIRMWARE:
+        return f"has firmware {firmware}, and its bus watchdog needs {registers.FIRST_FIRMWARE}: update it"
     return ""
 
 
-def _check_eeprom(eeprom: Packet) -> str:
-    """Return which of the registers that a servo keeps without power is unsafe; empty if none is."""
-    drive_mode = eeprom.data[at.DRIVE_MODE]
-    (offset,) = struct.unpack_from("<i", eeprom.data, at.HOMING_OFFSET)
+def _find_eeprom_problem(eeprom: Packet) -> str:
+    """Return which EEPROM register of a servo has an unsafe value, and what to do; an empty string if none has."""
+    drive_mode = eeprom.data[registers.DRIVE_MODE]
+    (offset,) = struct.unpack_from("<i", eeprom.data, registers.HOMING_OFFSET)
     if drive_mode or offset:
         return (
             f"has drive mode {drive_mode} and homing offset {offset}; both must be 0, as direction and zero are those "
             f"of the robot file (`sign`, `zero_rad`)"
         )
-    secondary_id = eeprom.data[at.SECONDARY_ID]
+    secondary_id = eeprom.data[registers.SECONDARY_ID]
     if secondary_id <= LAST_ID:
         return (
-            f"has the secondary id {secondary_id} (register {at.SECONDARY_ID}), and would take the setpoints of that "
-            f"id, too: set it to 255, which is off"
+            f"has the secondary id {secondary_id} (register {registers.SECONDARY_ID}), and would take the setpoints "
+            f"of that id, too: set it to 255, which is off"
         )
-    startup = eeprom.data[at.STARTUP]
+    startup = eeprom.data[registers.STARTUP]
     if startup & TORQUE_AT_START:
         return (
-            f"has startup configuration {startup} (register {at.STARTUP}): it switches its torque on "
+            f"has startup configuration {startup} (register {registers.STARTUP}): it switches its torque on "
             f"when it starts, before the driver has found it. Clear bit 0"
         )
     return ""
 
 
-def _check_current_limit(servo: Servo, eeprom: Packet) -> str:
+def _find_current_limit_problem(servo: Servo, eeprom: Packet) -> str:
     """Return why a servo's own limit does not suit its joint; empty if it does."""
-    (servo.max_current,) = struct.unpack_from("<H", eeprom.data, at.CURRENT_LIMIT)
-    limit_nm = servo.max_current * servo.unit_nm
+    (servo.max_current,) = struct.unpack_from("<H", eeprom.data, registers.CURRENT_LIMIT)
+    limit_nm = servo.max_current * servo.torque_unit_nm
     if servo.torque_nm > limit_nm:
         return (
-            f"has a current limit of {limit_nm / servo.constant:.2f} A, which is "
+            f"has a current limit of {limit_nm / servo.torque_constant_nm_per_a:.2f} A, which is "
             f"{limit_nm:.2f} N·m, and its joint may command {servo.torque_nm:.2f} N·m: "
             f"raise the one, or lower `torque_nm`"
         )
@@ -175,15 +201,21 @@ def _describe_unknown_servos(servos: Sequence[Servo], port: Port) -> Iterator[st
     for ping in port.scan():
         if ping.id not in ids:
             (number,) = struct.unpack("<H", ping.data[:2])
-            yield f"  id {ping.id} on {port.wire.port} is no joint's: {at.model_name(number)}"
+            yield f"  id {ping.id} on {port.wire.port} is no joint's: {registers.get_model_name(number)}"
 
 
 def _write_registers(servo: Servo) -> None:
-    """Write the registers that the driver needs; torque is off afterwards. Raises BackendError."""
-    state = _read_registers(servo, at.TORQUE_ENABLE, at.STATE_SIZE).data
-    if state[at.WATCHDOG - at.TORQUE_ENABLE] == at.TRIPPED:
+    """Write the registers that the driver needs; torque is off afterwards.
+
+    EEPROM registers are written only where they differ, because each write wears out their memory.
+
+    Raises:
+        BackendError: The servo does not respond, or rejects a value.
+    """
+    state = _read_registers(servo, registers.TORQUE_ENABLE, registers.STATE_SIZE).data
+    if state[registers.WATCHDOG - registers.TORQUE_ENABLE] == registers.TRIPPED:
         _log.warning("%s: clearing an expired bus watchdog of an earlier run", servo.label)
-    eeprom = _read_registers(servo, 0, at.EEPROM_SIZE).data
+    eeprom = _read_registers(servo, 0, registers.EEPROM_SIZE).data
     differing = {address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value}
     for address, value in {**STARTUP_REGISTERS, **differing}.items():
         status = _try_to_write(servo, address, value)
@@ -199,12 +231,16 @@ def _write_registers(servo: Servo) -> None:
         )
 
 
-def _read_present(servo: Servo) -> Packet:
-    """Read what a servo measures. Raises BackendError for an angle that does not tell where its joint is."""
-    status = _read_registers(servo, at.PRESENT, at.present_form.size)
-    _, _, position = at.present_form.unpack(status.data)
-    angle_rad = position * at.RAD
-    if at.whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD) is None:
+def _read_measurements(servo: Servo) -> Packet:
+    """Read the motion registers of a servo, and check that its angle is unambiguous within its travel.
+
+    Raises:
+        BackendError: The servo does not respond, or no number or several numbers of whole turns fit its travel.
+    """
+    status = _read_registers(servo, registers.PRESENT, registers.present_form.size)
+    _, _, position = registers.present_form.unpack(status.data)
+    angle_rad = position * registers.RAD
+    if registers.find_whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD) is None:
         raise BackendError(
             f"{servo.label}: woke up at {angle_rad:.2f} rad, which no number of whole turns, or more than one, brings "
             f"into its travel of {servo.lower_rad:.2f} to {servo.upper_rad:.2f} rad; nothing was enabled. Turn it "

@@ -12,16 +12,16 @@ from typing import NamedTuple
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.wire.messages import Mode
-from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.packets import (
     ALERT,
-    EVERYBODY,
+    BROADCAST_ID,
     Decoder,
     Instruction,
     Packet,
     Refusal,
-    encoded,
-    fast_status,
+    encode_fast_status,
+    encode_packet,
 )
 from snakesim_serial_backend.servo_backend import ServoEmulator
 from snakesim_serial_backend.wire import Pty
@@ -60,10 +60,10 @@ class EmulatedServo:
 
     table: bytearray
     port: Pty
-    unit_nm: float  # torque of one unit of current
-    from_counts: int = 0  # angle at which its present position was 0 when it woke up
-    fed_us: float = 0.0  # when it received its last packet
-    held_counts: int | None = None  # where the watchdog has stopped it
+    torque_unit_nm: float  # torque of one unit of current
+    turn_offset_counts: int = 0  # angle at which its present position was 0 when it woke up
+    last_packet_us: float = 0.0  # when it received its last packet
+    hold_position_counts: int | None = None  # where the watchdog has stopped it
 
     def read_register(self, form: str, address: int) -> int:
         """Return a register; form: its type for `struct`."""
@@ -79,9 +79,9 @@ class EmulatedServo:
         return self.table[ID]
 
     @property
-    def on(self) -> bool:
+    def is_torque_on(self) -> bool:
         """Whether the torque is on."""
-        return self.table[at.TORQUE_ENABLE] == 1
+        return self.table[registers.TORQUE_ENABLE] == 1
 
 
 class EmulatedDynamixel(ServoEmulator):
@@ -91,31 +91,31 @@ class EmulatedDynamixel(ServoEmulator):
         self,
         body: EmulatedBody,
         ports: Sequence[Pty],
-        constants: Sequence[float],
+        torque_constants_nm_per_a: Sequence[float],
         baud: int,
         clock_ns: Callable[[], int],
         model: EmulatedModel,
     ) -> None:
-        """Make a servo for every joint of a body.
+        """Create an emulated servo for every joint of a body.
 
         Args:
-            body: the body that the servos move.
-            ports: the port of every joint's servo.
-            constants: torque constant of every joint's servo, N·m/A.
-            baud: baud rate that the servos are set to.
-            clock_ns: a clock with any origin.
-            model: the model of all servos.
+            body: Body that the servos move.
+            ports: Pseudo terminal of every joint's servo; servos of one port have the same object.
+            torque_constants_nm_per_a: Torque constant of every joint's servo in N·m/A.
+            baud: Baud rate that the servos are set to, in bit/s.
+            clock_ns: Function that returns a steady time in ns, with any origin.
+            model: Model of all servos.
         """
         self.servos: list[EmulatedServo] = []
-        for joint, port, constant in zip(body.joints, ports, constants, strict=True):
-            servo = EmulatedServo(bytearray(at.SIZE), port, model.current_a * constant)
-            servo.write_register("H", at.MODEL, model.number)
+        for joint, port, torque_constant_nm_per_a in zip(body.joints, ports, torque_constants_nm_per_a, strict=True):
+            servo = EmulatedServo(bytearray(registers.SIZE), port, model.current_a * torque_constant_nm_per_a)
+            servo.write_register("H", registers.MODEL, model.number)
             self._write_factory_settings(servo, joint.id, baud)
-            servo.write_register("H", at.MIN_VOLTAGE, round(joint.limits.min_voltage_v / at.VOLTS))
+            servo.write_register("H", registers.MIN_VOLTAGE, round(joint.limits.min_voltage_v / registers.VOLTS))
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
         self._decoders = [Decoder() for _ in self._bus_ends]
-        self._delay_of_second = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
+        self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
         for i in range(len(self.servos)):
             self.restart(i)
 
@@ -124,14 +124,14 @@ class EmulatedDynamixel(ServoEmulator):
         """Set the registers that a servo keeps without power."""
         servo.table[FIRMWARE_VERSION] = FIRMWARE
         servo.table[ID] = id_
-        servo.table[at.BAUD_RATE] = at.RATE[baud]
-        servo.table[at.DELAY] = FACTORY_DELAY
-        servo.table[at.OPERATING_MODE] = 3  # position
-        servo.table[at.SECONDARY_ID] = ID_WITHOUT_SERVO
+        servo.table[registers.BAUD_RATE] = registers.RATE[baud]
+        servo.table[registers.DELAY] = FACTORY_DELAY
+        servo.table[registers.OPERATING_MODE] = 3  # position
+        servo.table[registers.SECONDARY_ID] = ID_WITHOUT_SERVO
         servo.table[PROTOCOL] = 2
         servo.table[MAX_TEMPERATURE] = 80  # °C
         servo.write_register("H", PWM_LIMIT, MAX_PWM)
-        servo.write_register("H", at.CURRENT_LIMIT, MAX_CURRENT)
+        servo.write_register("H", registers.CURRENT_LIMIT, MAX_CURRENT)
         servo.table[SHUTDOWN] = SHUTDOWN_ERRORS
 
     def __call__(self) -> None:
@@ -142,176 +142,205 @@ class EmulatedDynamixel(ServoEmulator):
                 for packet in decoder.feed(data):
                     if packet.instruction != Instruction.STATUS:
                         self._handle_packet(port, packet)
-            self.pass_time()
+            self.simulate_to_now()
 
     # --- packets ----------------------------------------------------------------------------------------------
 
     def _handle_packet(self, port: Pty, packet: Packet) -> None:
         """Handle a packet for one servo or for several servos of a port."""
-        listening = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)]
-        index_of_id = {self.servos[i].id: i for i in listening}
-        for i in listening:
-            self.servos[i].fed_us = self.body.now_us
+        listening_servos = [
+            i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)
+        ]
+        index_by_id = {self.servos[i].id: i for i in listening_servos}
+        for i in listening_servos:
+            self.servos[i].last_packet_us = self.body.now_us
         parameters = packet.parameters
         match packet.instruction:
             case Instruction.SYNC_WRITE:
-                self._write_several(parameters, index_of_id)
+                self._execute_sync_write(parameters, index_by_id)
             case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ:
-                indices = [index_of_id.get(id_) for id_ in parameters[4:]]
-                self._read_several(port, packet.instruction, parameters[:4], indices)
-            case Instruction.PING if packet.id == EVERYBODY:
-                for _, i in sorted(index_of_id.items()):
-                    self._execute(i, packet.instruction, parameters)
-            case instruction if packet.id in index_of_id:
-                self._execute(index_of_id[packet.id], instruction, parameters)
+                indices = [index_by_id.get(id_) for id_ in parameters[4:]]
+                self._execute_sync_read(port, packet.instruction, parameters[:4], indices)
+            case Instruction.PING if packet.id == BROADCAST_ID:
+                for _, i in sorted(index_by_id.items()):
+                    self._execute_instruction(i, packet.instruction, parameters)
+            case instruction if packet.id in index_by_id:
+                self._execute_instruction(index_by_id[packet.id], instruction, parameters)
             case _:
                 pass
 
-    def _execute(self, i: int, instruction: int, parameters: bytes) -> None:
-        """Execute an instruction to one servo, and answer it."""
+    def _execute_instruction(self, i: int, instruction: int, parameters: bytes) -> None:
+        """Execute an instruction for one servo, and send its status.
+
+        Args:
+            i: Index of the servo.
+            instruction: Instruction of the packet.
+            parameters: Parameters of the packet.
+        """
         servo = self.servos[i]
         match instruction:
             case Instruction.PING:
-                self._answer(i, bytes(servo.table[:2]) + bytes([servo.table[FIRMWARE_VERSION]]))
+                self._send_status(i, bytes(servo.table[:2]) + bytes([servo.table[FIRMWARE_VERSION]]))
             case Instruction.READ:
-                data, refusal = self._read(i, parameters)
-                self._answer(i, data, refusal, self._read_second(i, parameters))
+                data, refusal = self._read_registers(i, parameters)
+                self._send_status(i, data, refusal, self._read_second_servo(i, parameters))
             case Instruction.WRITE:
                 (address,) = struct.unpack_from("<H", parameters)
-                refusal = self._write(i, address, parameters[2:])
-                self._answer(i, b"", refusal)
+                refusal = self._write_registers(i, address, parameters[2:])
+                self._send_status(i, b"", refusal)
             case Instruction.REBOOT:
-                self._answer(i, b"")
+                self._send_status(i, b"")
                 self.body.start_boot(i)
                 self.restart(i)
             case _:
-                self._answer(i, b"", Refusal.INSTRUCTION)
+                self._send_status(i, b"", Refusal.INSTRUCTION)
 
-    def _write_several(self, parameters: bytes, index_of_id: Mapping[int, int]) -> None:
+    def _execute_sync_write(self, parameters: bytes, index_by_id: Mapping[int, int]) -> None:
         """Execute a sync write: address, size, and an id with data for each servo."""
         address, size = struct.unpack_from("<HH", parameters)
         for start in range(4, len(parameters), size + 1):
-            i = index_of_id.get(parameters[start])
+            i = index_by_id.get(parameters[start])
             if i is not None:
-                self._write(i, address, parameters[start + 1 : start + 1 + size])
+                self._write_registers(i, address, parameters[start + 1 : start + 1 + size])
 
-    def _read_several(self, port: Pty, instruction: int, registers: bytes, indices: Sequence[int | None]) -> None:
-        """Answer a sync read in the order of its ids.
+    def _execute_sync_read(
+        self, port: Pty, instruction: int, register_range: bytes, indices: Sequence[int | None]
+    ) -> None:
+        """Send the responses to a sync read, in the order of the ids in the packet.
 
-        Each servo waits for the one before it without end, so the first one that is silent ends the answer.
+        Each servo waits for the one before it without a timeout, so the first silent servo ends the response.
 
         Args:
-            port: the port of the servos.
-            instruction: SYNC_READ or FAST_SYNC_READ.
-            registers: address and size, as in the packet.
-            indices: the servo of each id in the packet; None for an id that no servo has.
+            port: Pseudo terminal of the servos.
+            instruction: SYNC_READ, for one status of each servo, or FAST_SYNC_READ, for one common status.
+            register_range: Address and size of the registers, as bytes of the packet.
+            indices: Index of the servo of each id in the packet; None for an id that no servo has.
         """
         parts: list[tuple[int, int, bytes]] = []  # error, id and data of each servo
         second_parts: list[tuple[int, int, bytes]] = []  # the same, with the data of a second servo with its id
         for i in indices:
             if i is None or self.body.is_silent(i):
                 break
-            data, refusal = self._read(i, registers)
-            second_data = self._read_second(i, registers)
+            data, refusal = self._read_registers(i, register_range)
+            second_data = self._read_second_servo(i, register_range)
             if instruction == Instruction.SYNC_READ:
-                self._answer(i, data, refusal, second_data)
+                self._send_status(i, data, refusal, second_data)
             else:
-                error = refusal | self._alert(i)
+                error = refusal | self._get_alert_bit(i)
                 parts.append((error, self.servos[i].id, data))
                 second_parts.append((error, self.servos[i].id, second_data))
         if parts:
-            port.send(collide(fast_status(parts, len(indices)), fast_status(second_parts, len(indices))))
+            port.send(
+                simulate_collision(
+                    encode_fast_status(parts, len(indices)), encode_fast_status(second_parts, len(indices))
+                )
+            )
 
-    def _answer(self, i: int, data: bytes, refusal: int = 0, second_data: bytes | None = None) -> None:
+    def _send_status(self, i: int, data: bytes, refusal: int = 0, second_data: bytes | None = None) -> None:
         """Send a servo's status. second_data: the data of a second servo with its id, where they differ."""
         if self.body.is_silent(i):
             return
         servo = self.servos[i]
-        error = bytes([refusal | self._alert(i)])
-        status = encoded(servo.id, Instruction.STATUS, error + data)
+        error = bytes([refusal | self._get_alert_bit(i)])
+        status = encode_packet(servo.id, Instruction.STATUS, error + data)
         if not self.body.is_duplicated(i):
             servo.port.send(status)
             return
         if second_data is None:
             second_data = data
-        second_status = encoded(servo.id, Instruction.STATUS, error + second_data)
-        if servo.table[at.DELAY] == self._delay_of_second[i]:
-            servo.port.send(collide(status, second_status))
+        second_status = encode_packet(servo.id, Instruction.STATUS, error + second_data)
+        if servo.table[registers.DELAY] == self._second_servo_delays[i]:
+            servo.port.send(simulate_collision(status, second_status))
         else:
             servo.port.send(status + second_status)
 
-    def _alert(self, i: int) -> int:
+    def _get_alert_bit(self, i: int) -> int:
         """Return the bit of a status that reports a hardware error."""
-        if self.servos[i].table[at.HARDWARE_ERROR]:
+        if self.servos[i].table[registers.HARDWARE_ERROR]:
             return ALERT
         return 0
 
-    def _read(self, i: int, registers: bytes) -> tuple[bytes, int]:
+    def _read_registers(self, i: int, register_range: bytes) -> tuple[bytes, int]:
         """Return the data of registers, and the refusal, 0 for none. registers: address and size."""
-        address, size = struct.unpack("<HH", registers)
-        if address + size > at.SIZE:
+        address, size = struct.unpack("<HH", register_range)
+        if address + size > registers.SIZE:
             return b"", Refusal.ACCESS
-        self._measure(i)
+        self._update_measurements(i)
         return bytes(self.servos[i].table[address : address + size]), 0
 
-    def _read_second(self, i: int, registers: bytes) -> bytes:
+    def _read_second_servo(self, i: int, register_range: bytes) -> bytes:
         """Return the same registers of a second servo with the id of this one; without one, of the servo itself."""
-        address, size = struct.unpack("<HH", registers)
+        address, size = struct.unpack("<HH", register_range)
         table = self.servos[i].table[:]
         if self.body.is_duplicated(i):
-            (counts,) = struct.unpack_from("<i", table, at.PRESENT_POSITION)
-            struct.pack_into("<i", table, at.PRESENT_POSITION, counts + SECOND_SERVO_COUNTS)
+            (counts,) = struct.unpack_from("<i", table, registers.PRESENT_POSITION)
+            struct.pack_into("<i", table, registers.PRESENT_POSITION, counts + SECOND_SERVO_COUNTS)
         return bytes(table[address : address + size])
 
-    def _measure(self, i: int) -> None:
+    def _update_measurements(self, i: int) -> None:
         """Update the registers of what a servo measures."""
         servo = self.servos[i]
         angle_rad, velocity_rad_s, torque_nm = self.body.read_shaft(i)
         voltage_v = self.body.read_supply(i)[0]
         temperature_c = self.body.read_temperatures(i)[0]
-        current = max(min(round(torque_nm / servo.unit_nm), 32767), -32768)
-        servo.write_register("h", at.PRESENT, current)
-        servo.write_register("i", at.PRESENT_VELOCITY, round(velocity_rad_s / at.SPEED))
-        servo.write_register("i", at.PRESENT_POSITION, round(angle_rad / at.RAD) - servo.from_counts)
-        servo.write_register("H", at.VOLTAGE, round(voltage_v / at.VOLTS))
-        servo.table[at.TEMPERATURE] = min(max(round(temperature_c), 0), 255)
+        current = max(min(round(torque_nm / servo.torque_unit_nm), 32767), -32768)
+        servo.write_register("h", registers.PRESENT, current)
+        servo.write_register("i", registers.PRESENT_VELOCITY, round(velocity_rad_s / registers.SPEED))
+        servo.write_register(
+            "i", registers.PRESENT_POSITION, round(angle_rad / registers.RAD) - servo.turn_offset_counts
+        )
+        servo.write_register("H", registers.VOLTAGE, round(voltage_v / registers.VOLTS))
+        servo.table[registers.TEMPERATURE] = min(max(round(temperature_c), 0), 255)
 
-    def _write(self, i: int, address: int, data: bytes) -> int:
-        """Set registers, all of them or none, and return the refusal, 0 for none."""
+    def _write_registers(self, i: int, address: int, data: bytes) -> int:
+        """Set consecutive registers, all of them or none, and let the new values take effect.
+
+        Args:
+            i: Index of the servo.
+            address: Address of the first register.
+            data: New values of the registers.
+
+        Returns:
+            The reason for a refusal; 0 if the registers were set.
+        """
         servo = self.servos[i]
         end = address + len(data)
         if not any(first <= address and end <= last for first, last in WRITABLE):
             return Refusal.ACCESS
-        if address < at.TORQUE_ENABLE and servo.on:
+        if address < registers.TORQUE_ENABLE and servo.is_torque_on:
             return Refusal.ACCESS
         table = servo.table[:]
         table[address:end] = data
-        refusal = self._check_registers(servo, table, address, end)
+        refusal = self._find_write_refusal(servo, table, address, end)
         if refusal:
             return refusal
         servo.table = table
-        if address <= at.DELAY < end and self.body.is_duplicated(i):
-            self._delay_of_second[i] = table[at.DELAY]
-        if address <= at.WATCHDOG < end and table[at.WATCHDOG] == 0:
-            servo.held_counts = None
-        self._drive(i)
+        if address <= registers.DELAY < end and self.body.is_duplicated(i):
+            self._second_servo_delays[i] = table[registers.DELAY]
+        if address <= registers.WATCHDOG < end and table[registers.WATCHDOG] == 0:
+            servo.hold_position_counts = None
+        self._drive_motor(i)
         return 0
 
     @staticmethod
-    def _check_registers(servo: EmulatedServo, table: bytearray, address: int, end: int) -> int:
+    def _find_write_refusal(servo: EmulatedServo, table: bytearray, address: int, end: int) -> int:
         """Return the refusal of a write, 0 for none. table: the control table after it; address, end: what it sets."""
-        after = EmulatedServo(table, servo.port, servo.unit_nm)
-        sets_watchdog = address <= at.WATCHDOG < end
-        sets_goals = address < at.GOAL_POSITION + 4 and end > FIRST_GOAL
-        if servo.table[at.WATCHDOG] == at.TRIPPED and sets_goals:
+        after = EmulatedServo(table, servo.port, servo.torque_unit_nm)
+        sets_watchdog = address <= registers.WATCHDOG < end
+        sets_goals = address < registers.GOAL_POSITION + 4 and end > FIRST_GOAL
+        if servo.table[registers.WATCHDOG] == registers.TRIPPED and sets_goals:
             return Refusal.RANGE
-        if table[at.OPERATING_MODE] not in OPERATING_MODES or (sets_watchdog and table[at.WATCHDOG] > 127):
+        if table[registers.OPERATING_MODE] not in OPERATING_MODES or (
+            sets_watchdog and table[registers.WATCHDOG] > 127
+        ):
             return Refusal.RANGE
-        if table[at.TORQUE_ENABLE] > 1 or table[at.DELAY] > 254:
+        if table[registers.TORQUE_ENABLE] > 1 or table[registers.DELAY] > 254:
             return Refusal.RANGE
-        if sets_goals and abs(after.read_register("h", at.GOALS)) > after.read_register("H", at.CURRENT_LIMIT):
+        if sets_goals and abs(after.read_register("h", registers.GOALS)) > after.read_register(
+            "H", registers.CURRENT_LIMIT
+        ):
             return Refusal.LIMIT
-        if table[at.TORQUE_ENABLE] and servo.table[at.HARDWARE_ERROR] & servo.table[SHUTDOWN]:
+        if table[registers.TORQUE_ENABLE] and servo.table[registers.HARDWARE_ERROR] & servo.table[SHUTDOWN]:
             return Refusal.FAILED
         return 0
 
@@ -320,65 +349,77 @@ class EmulatedDynamixel(ServoEmulator):
     def restart(self, i: int) -> None:
         """Reset all registers from address 64 on, and forget whole revolutions."""
         servo = self.servos[i]
-        servo.table[at.TORQUE_ENABLE :] = bytes(at.SIZE - at.TORQUE_ENABLE)
-        servo.table[at.STATUS_LEVEL] = 2
-        servo.held_counts = None
-        servo.write_register("H", at.P_GAIN, 800)
-        servo.write_register("h", at.GOALS, servo.read_register("H", at.CURRENT_LIMIT))
-        counts = round(self.body.read_shaft(i)[0] / at.RAD)
-        servo.from_counts = counts // at.COUNTS * at.COUNTS
-        self._measure(i)
-        servo.write_register("i", at.GOAL_POSITION, servo.read_register("i", at.PRESENT_POSITION))
-        self._drive(i)
+        servo.table[registers.TORQUE_ENABLE :] = bytes(registers.SIZE - registers.TORQUE_ENABLE)
+        servo.table[registers.STATUS_LEVEL] = 2
+        servo.hold_position_counts = None
+        servo.write_register("H", registers.P_GAIN, 800)
+        servo.write_register("h", registers.GOALS, servo.read_register("H", registers.CURRENT_LIMIT))
+        counts = round(self.body.read_shaft(i)[0] / registers.RAD)
+        servo.turn_offset_counts = counts // registers.COUNTS * registers.COUNTS
+        self._update_measurements(i)
+        servo.write_register("i", registers.GOAL_POSITION, servo.read_register("i", registers.PRESENT_POSITION))
+        self._drive_motor(i)
 
-    def _drive(self, i: int) -> None:
-        """Drive the body in current-based position mode or in current mode, as the registers specify."""
+    def _drive_motor(self, i: int) -> None:
+        """Apply operating mode, gains and goals in the control table of a servo to its motor.
+
+        The motor is passive unless the torque is on in current-based position mode or in current mode.
+
+        Args:
+            i: Index of the servo.
+        """
         servo = self.servos[i]
-        current = servo.read_register("h", at.GOALS)
-        limit_nm = abs(current) * servo.unit_nm
+        current = servo.read_register("h", registers.GOALS)
+        limit_nm = abs(current) * servo.torque_unit_nm
         joint = self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
-        mode = servo.table[at.OPERATING_MODE]
-        if servo.on and mode == at.CURRENT_BASED_POSITION:
-            d_gain = servo.read_register("H", at.GAINS)
-            p_gain = servo.read_register("H", at.P_GAIN)
-            stiffness, damping = at.law(d_gain, p_gain, servo.unit_nm)
-            goal_counts = servo.held_counts
+        mode = servo.table[registers.OPERATING_MODE]
+        if servo.is_torque_on and mode == registers.CURRENT_BASED_POSITION:
+            d_gain = servo.read_register("H", registers.GAINS)
+            p_gain = servo.read_register("H", registers.P_GAIN)
+            stiffness, damping = registers.compute_position_law(d_gain, p_gain, servo.torque_unit_nm)
+            goal_counts = servo.hold_position_counts
             if goal_counts is None:
-                goal_counts = servo.read_register("i", at.GOAL_POSITION) + servo.from_counts
-            self.body.drive_motor(i, Mode.POSITION, goal_counts * at.RAD, limit_nm, stiffness, damping, speed_rad_s)
-        elif servo.on and mode == at.CURRENT_CONTROL:
-            self.body.drive_motor(i, Mode.TORQUE, current * servo.unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
+                goal_counts = servo.read_register("i", registers.GOAL_POSITION) + servo.turn_offset_counts
+            self.body.drive_motor(
+                i, Mode.POSITION, goal_counts * registers.RAD, limit_nm, stiffness, damping, speed_rad_s
+            )
+        elif servo.is_torque_on and mode == registers.CURRENT_CONTROL:
+            self.body.drive_motor(i, Mode.TORQUE, current * servo.torque_unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
         else:
             self.body.drive_motor(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
     def on_step(self, now_us: float) -> None:
         """Let watchdogs expire, and detect servos that are too hot or have too little supply voltage."""
         for i, servo in enumerate(self.servos):
-            watchdog = servo.table[at.WATCHDOG]
-            if servo.on and 0 < watchdog != at.TRIPPED and now_us - servo.fed_us > watchdog * at.WATCHDOG_S * 1e6:
-                servo.table[at.WATCHDOG] = at.TRIPPED
-                servo.held_counts = round(self.body.read_shaft(i)[0] / at.RAD)
-                self._drive(i)
+            watchdog = servo.table[registers.WATCHDOG]
+            if (
+                servo.is_torque_on
+                and 0 < watchdog != registers.TRIPPED
+                and now_us - servo.last_packet_us > watchdog * registers.WATCHDOG_S * 1e6
+            ):
+                servo.table[registers.WATCHDOG] = registers.TRIPPED
+                servo.hold_position_counts = round(self.body.read_shaft(i)[0] / registers.RAD)
+                self._drive_motor(i)
             errors = self._detect_errors(i)
-            if errors & ~servo.table[at.HARDWARE_ERROR]:
-                servo.table[at.HARDWARE_ERROR] |= errors
+            if errors & ~servo.table[registers.HARDWARE_ERROR]:
+                servo.table[registers.HARDWARE_ERROR] |= errors
                 if errors & SHUTDOWN_ERRORS:
-                    servo.table[at.TORQUE_ENABLE] = 0
-                    self._drive(i)
+                    servo.table[registers.TORQUE_ENABLE] = 0
+                    self._drive_motor(i)
 
     def _detect_errors(self, i: int) -> int:
         """Return the bits of the hardware errors that a servo has now."""
         errors = 0
         if self.body.is_too_hot(i):
-            errors |= at.HardwareError.OVERHEATING
-        min_voltage_v = self.servos[i].read_register("H", at.MIN_VOLTAGE) * at.VOLTS
+            errors |= registers.HardwareError.OVERHEATING
+        min_voltage_v = self.servos[i].read_register("H", registers.MIN_VOLTAGE) * registers.VOLTS
         if self.body.read_supply(i)[0] < min_voltage_v:
-            errors |= at.HardwareError.INPUT_VOLTAGE
+            errors |= registers.HardwareError.INPUT_VOLTAGE
         return errors
 
 
-def collide(first: bytes, second: bytes) -> bytes:
+def simulate_collision(first: bytes, second: bytes) -> bytes:
     """Return what two servos that send at the same time leave on the line: a 0 of either wins."""
     longest = max(len(first), len(second))
     first = first.ljust(longest, b"\xff")

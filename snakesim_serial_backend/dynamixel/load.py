@@ -4,7 +4,7 @@ A cycle is a sync read of all servos, their answer, the health of one, and a syn
 one cycle with about a third more bytes.
 """
 
-from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.registers import RATE
 from snakesim_serial_backend.port_load import PortLoad
 
@@ -12,13 +12,13 @@ PACKET_OVERHEAD = 10  # bytes around the parameters: header, id, length, instruc
 REGISTERS = 4  # bytes of the address and the size in a request
 
 
-def cycle_bytes(servos: int) -> int:
+def count_cycle_bytes(servos: int) -> int:
     """Return the number of bytes on the wire, in both directions, without stuffing."""
     read_request = PACKET_OVERHEAD + REGISTERS + servos
-    read_answer = PACKET_OVERHEAD + servos * (at.present_form.size + 4)  # each with error, id and CRC
-    health = PACKET_OVERHEAD + REGISTERS + PACKET_OVERHEAD + 1 + at.HEALTH_SIZE  # request, and answer with error
-    goals = PACKET_OVERHEAD + REGISTERS + servos * (1 + at.goals_form.size)  # each with id
+    read_answer = PACKET_OVERHEAD + servos * (registers.present_form.size + 4)  # each with error, id and CRC
+    health = PACKET_OVERHEAD + REGISTERS + PACKET_OVERHEAD + 1 + registers.HEALTH_SIZE  # request, and answer with error
+    goals = PACKET_OVERHEAD + REGISTERS + servos * (1 + registers.goals_form.size)  # each with id
     return read_request + read_answer + health + goals
 
 
-PORT_LOAD = PortLoad(list(RATE), cycle_bytes, "fast sync read, health of one, sync write")
+PORT_LOAD = PortLoad(list(RATE), count_cycle_bytes, "fast sync read, health of one, sync write")

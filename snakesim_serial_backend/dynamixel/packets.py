@@ -16,12 +16,12 @@ from typing import ClassVar
 from snakesim_serial_backend.stream_decoder import StreamDecoder
 
 HEADER = b"\xff\xff\xfd\x00"
-PLAIN = b"\xff\xff\xfd"  # the begin of a header, which must not occur among the parameters
-STUFFED = b"\xff\xff\xfd\xfd"  # what is sent in its place
-BYTES_BEFORE = 7  # instruction and parameters: header, id, length
-BYTES_AFTER = 2  # instruction and parameters: CRC
+HEADER_PREFIX = b"\xff\xff\xfd"  # the start of a header, which must not occur among the parameters
+STUFFED_HEADER_PREFIX = b"\xff\xff\xfd\xfd"  # what is sent in its place
+PREFIX_BYTES = 7  # instruction and parameters: header, id, length
+SUFFIX_BYTES = 2  # instruction and parameters: CRC
 MAX_PACKET_BYTES = 1024
-EVERYBODY = 0xFE  # id of a packet to all servos
+BROADCAST_ID = 0xFE  # id of a packet to all servos
 LAST_ID = 252
 ALERT = 0x80  # bit of a status' error: there is a hardware error
 POLYNOMIAL = 0x8005  # of the CRC
@@ -102,44 +102,44 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def encoded(id_: int, instruction: int, parameters: bytes = b"") -> bytes:
+def encode_packet(id_: int, instruction: int, parameters: bytes = b"") -> bytes:
     """Return the bytes of a packet."""
-    inside = (bytes([instruction]) + parameters).replace(PLAIN, STUFFED)
-    packet = HEADER + struct.pack("<BH", id_, len(inside) + BYTES_AFTER) + inside
+    body = (bytes([instruction]) + parameters).replace(HEADER_PREFIX, STUFFED_HEADER_PREFIX)
+    packet = HEADER + struct.pack("<BH", id_, len(body) + SUFFIX_BYTES) + body
     return packet + struct.pack("<H", crc16(packet))
 
 
-def read_request(id_: int, address: int, size: int) -> bytes:
+def encode_read_request(id_: int, address: int, size: int) -> bytes:
     """Return a packet that reads registers of one servo."""
-    return encoded(id_, Instruction.READ, struct.pack("<HH", address, size))
+    return encode_packet(id_, Instruction.READ, struct.pack("<HH", address, size))
 
 
-def sync_read_request(ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
+def encode_sync_read_request(ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
     """Return a packet that reads the same registers of several servos; they answer in this order."""
     instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
-    return encoded(EVERYBODY, instruction, struct.pack("<HH", address, size) + bytes(ids))
+    return encode_packet(BROADCAST_ID, instruction, struct.pack("<HH", address, size) + bytes(ids))
 
 
-def sync_write(address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> bytes:
+def encode_sync_write(address: int, data_by_id: Sequence[tuple[int, bytes]]) -> bytes:
     """Return a packet that writes the same registers of several servos, which do not answer.
 
-    data_of_ids: id and data of each servo, all equally long.
+    data_by_id: id and data of each servo, all equally long.
     """
-    _, first_data = data_of_ids[0]
-    values = b"".join(bytes([id_]) + data for id_, data in data_of_ids)
-    return encoded(EVERYBODY, Instruction.SYNC_WRITE, struct.pack("<HH", address, len(first_data)) + values)
+    _, first_data = data_by_id[0]
+    values = b"".join(bytes([id_]) + data for id_, data in data_by_id)
+    return encode_packet(BROADCAST_ID, Instruction.SYNC_WRITE, struct.pack("<HH", address, len(first_data)) + values)
 
 
-def fast_status(parts: Sequence[tuple[int, int, bytes]], requested: int) -> bytes:
+def encode_fast_status(parts: Sequence[tuple[int, int, bytes]], requested: int) -> bytes:
     """Return the answer to a fast sync read.
 
     Args:
-        parts: error, id and data of each servo that answers.
-        requested: number of servos in the request, which decides the length in the header.
+        parts: Error, id and data of each servo that answers.
+        requested: Number of servos in the request, which decides the length in the header.
     """
     _, _, first_data = parts[0]
     part_size = len(first_data) + PART_OVERHEAD
-    packet = HEADER + struct.pack("<BHB", EVERYBODY, 1 + requested * part_size, Instruction.STATUS)
+    packet = HEADER + struct.pack("<BHB", BROADCAST_ID, 1 + requested * part_size, Instruction.STATUS)
     for error, id_, data in parts:
         packet += bytes([error, id_]) + data
         packet += struct.pack("<H", crc16(packet))
@@ -150,35 +150,35 @@ class Decoder(StreamDecoder[Packet]):
     """Finds packets in a stream of bytes; noise, and packets with a wrong CRC, are skipped."""
 
     header: ClassVar[bytes] = HEADER
-    bytes_before: ClassVar[int] = BYTES_BEFORE
+    bytes_before: ClassVar[int] = PREFIX_BYTES
 
     def read_length(self, start: bytes) -> int | None:
-        length = BYTES_BEFORE + struct.unpack_from("<H", start, 5)[0]
-        if not BYTES_BEFORE + 1 + BYTES_AFTER <= length <= MAX_PACKET_BYTES:
+        length = PREFIX_BYTES + struct.unpack_from("<H", start, 5)[0]
+        if not PREFIX_BYTES + 1 + SUFFIX_BYTES <= length <= MAX_PACKET_BYTES:
             return None
         return length
 
     def decode(self, data: bytes) -> Packet | None:
         """Return the packet that these bytes are; None for a wrong CRC, or a status without an error."""
-        (crc,) = struct.unpack("<H", data[-BYTES_AFTER:])
-        if crc16(data[:-BYTES_AFTER]) != crc:
+        (crc,) = struct.unpack("<H", data[-SUFFIX_BYTES:])
+        if crc16(data[:-SUFFIX_BYTES]) != crc:
             return None
         id_ = data[4]
-        inside = data[BYTES_BEFORE:-BYTES_AFTER]
-        if id_ == EVERYBODY and inside[0] == Instruction.STATUS:
+        body = data[PREFIX_BYTES:-SUFFIX_BYTES]
+        if id_ == BROADCAST_ID and body[0] == Instruction.STATUS:
             # A fast status is not stuffed. Its last CRC belongs to the last servo's part.
-            return Packet(id_, inside[0], data[BYTES_BEFORE + 1 :])
-        inside = inside.replace(STUFFED, PLAIN)
-        if inside[0] == Instruction.STATUS and len(inside) == 1:
+            return Packet(id_, body[0], data[PREFIX_BYTES + 1 :])
+        body = body.replace(STUFFED_HEADER_PREFIX, HEADER_PREFIX)
+        if body[0] == Instruction.STATUS and len(body) == 1:
             return None
-        return Packet(id_, inside[0], inside[1:])
+        return Packet(id_, body[0], body[1:])
 
     def feed_statuses(self, data: bytes) -> Iterator[Packet]:
-        """Take in bytes, and yield the statuses that are complete now."""
+        """Add received bytes, and yield the statuses that are complete now."""
         return (packet for packet in self.feed(data) if packet.instruction == Instruction.STATUS)
 
 
-def fast_parts(packet: Packet, size: int) -> list[Packet]:
+def split_fast_status(packet: Packet, size: int) -> list[Packet]:
     """Return the statuses in the answer to a fast sync read of `size` bytes each.
 
     Only the packet's own CRC has been checked, which covers all parts.
@@ -188,28 +188,28 @@ def fast_parts(packet: Packet, size: int) -> list[Packet]:
     for start in range(0, len(packet.parameters), part_size):
         part = packet.parameters[start : start + part_size]
         if len(part) == part_size:
-            statuses.append(_part_status(part))
+            statuses.append(_decode_fast_status_part(part))
     return statuses
 
 
-def intact_parts(data: bytes, size: int) -> list[Packet]:
+def split_damaged_fast_status(data: bytes, size: int) -> list[Packet]:
     """Return the statuses that are intact in a fast answer that ends early, or is garbled from some servo on."""
-    start = data.find(HEADER + bytes([EVERYBODY]))
+    start = data.find(HEADER + bytes([BROADCAST_ID]))
     if start < 0:
         return []
     packet = data[start:]
     part_size = size + PART_OVERHEAD
     statuses: list[Packet] = []
-    for start in range(BYTES_BEFORE + 1, len(packet) - part_size + 1, part_size):
+    for start in range(PREFIX_BYTES + 1, len(packet) - part_size + 1, part_size):
         end = start + part_size
         (crc,) = struct.unpack("<H", packet[end - 2 : end])
         if crc16(packet[: end - 2]) != crc:
             break
-        statuses.append(_part_status(packet[start:end]))
+        statuses.append(_decode_fast_status_part(packet[start:end]))
     return statuses
 
 
-def _part_status(part: bytes) -> Packet:
+def _decode_fast_status_part(part: bytes) -> Packet:
     """Return one servo's part of a fast status as a status of its own: error, id, data, CRC."""
     error = part[:1]
     id_ = part[1]

@@ -4,18 +4,18 @@ import struct
 from collections.abc import Sequence
 
 from snakesim_serial_backend.dynamixel.packets import (
-    EVERYBODY,
+    BROADCAST_ID,
     LAST_ID,
     PART_OVERHEAD,
     Decoder,
     Instruction,
     Packet,
-    encoded,
-    fast_parts,
-    intact_parts,
-    read_request,
-    sync_read_request,
-    sync_write,
+    encode_packet,
+    encode_read_request,
+    encode_sync_read_request,
+    encode_sync_write,
+    split_damaged_fast_status,
+    split_fast_status,
 )
 from snakesim_serial_backend.request_port import Answers, RequestPort
 from snakesim_serial_backend.wire import SerialWire
@@ -28,38 +28,43 @@ class Port(RequestPort[Packet]):
     """The requests of protocol 2.0.
 
     Attributes:
-        fast: whether its servos support fast sync reads.
+        fast: Whether its servos support fast sync reads.
     """
 
-    def __init__(self, wire: SerialWire, gap_s: float) -> None:
+    def __init__(self, wire: SerialWire, response_gap_s: float) -> None:
         """gap_s: silence that ends an answer, besides the time that bytes and adapter take."""
-        super().__init__(wire, gap_s)
+        super().__init__(wire, response_gap_s)
         self.fast = True
 
     def ping(self, id_: int) -> Answers[Packet]:
         """Request the model (2 bytes) and firmware of a servo."""
-        return self._request_all_answers(id_, encoded(id_, Instruction.PING), PING_SIZE, 1)
+        return self._request_all_responses(id_, encode_packet(id_, Instruction.PING), PING_SIZE, 1)
 
     def read_alone(self, id_: int, address: int, size: int) -> Answers[Packet]:
         """Read registers of a servo, and wait for a second answer, too."""
-        return self._request_all_answers(id_, read_request(id_, address, size), size, 2)
+        return self._request_all_responses(id_, encode_read_request(id_, address, size), size, 2)
 
     def scan(self) -> list[Packet]:
         """Return the answers of all servos to a ping to all."""
-        gap_s = self._gap_s + LAST_ID * SCAN_S
-        return list(self._request(self._make_decoder(), encoded(EVERYBODY, Instruction.PING), gap_s, gap_s))
+        response_gap_s = self._response_gap_s + LAST_ID * SCAN_S
+        return list(
+            self._send_request(
+                self._make_decoder(), encode_packet(BROADCAST_ID, Instruction.PING), response_gap_s, response_gap_s
+            )
+        )
 
     def read(self, id_: int, address: int, size: int) -> Packet | None:
         """Read registers of a servo; None without an answer that is complete."""
-        return self._request_one(id_, read_request(id_, address, size), size)
+        return self._request_single_response(id_, encode_read_request(id_, address, size), size)
 
     def write(self, id_: int, address: int, data: bytes) -> Packet | None:
         """Write registers of a servo, and return its answer; its `error` is 0 if the servo accepted them."""
-        return self._request_one(id_, encoded(id_, Instruction.WRITE, struct.pack("<H", address) + data), 0)
+        parameters = struct.pack("<H", address) + data
+        return self._request_single_response(id_, encode_packet(id_, Instruction.WRITE, parameters), 0)
 
     def reboot(self, id_: int) -> None:
         """Restart a servo."""
-        self._request_one(id_, encoded(id_, Instruction.REBOOT), 0)
+        self._request_single_response(id_, encode_packet(id_, Instruction.REBOOT), 0)
 
     def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, Packet]:
         """Read the same registers of several servos at once.
@@ -69,17 +74,17 @@ class Port(RequestPort[Packet]):
         """
         if not ids:
             return {}
-        request = sync_read_request(ids, address, size, fast=self.fast)
-        statuses = self._request_fast(len(ids), request, size) if self.fast else self._request_each(ids, request, size)
+        request = encode_sync_read_request(ids, address, size, fast=self.fast)
+        statuses = self._request_fast(len(ids), request, size) if self.fast else self._sync_read(ids, request, size)
         return {status.id: status for status in statuses if status.id in ids and len(status.data) == size}
 
-    def write_all(self, address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> None:
+    def write_all(self, address: int, data_by_id: Sequence[tuple[int, bytes]]) -> None:
         """Write the same registers of several servos at once; they do not answer.
 
-        data_of_ids: id and data of each servo, all equally long.
+        data_by_id: id and data of each servo, all equally long.
         """
-        if data_of_ids:
-            self.wire.send(sync_write(address, data_of_ids))
+        if data_by_id:
+            self.wire.send(encode_sync_write(address, data_by_id))
 
     # --- inside -----------------------------------------------------------------------------------------------
 
@@ -90,13 +95,13 @@ class Port(RequestPort[Packet]):
         """Send a fast sync read, and return the parts of the answer that are intact.
 
         Args:
-            count: number of servos, which write one answer together.
-            request: the packet to them.
-            size: bytes of data in each part; a packet of another length is a late answer to another request.
+            count: Number of servos, which write one answer together.
+            request: The packet to them.
+            size: Bytes of data in each part; a packet of another length is a late answer to another request.
         """
         length = count * (size + PART_OVERHEAD)
-        for status in self._request(self._make_decoder(), request, self._gap_s, self._gap_s):
-            if status.id == EVERYBODY and len(status.parameters) == length:
-                return fast_parts(status, size)
-            self._match_answer(status.id)
-        return intact_parts(bytes(self._received), size)
+        for status in self._send_request(self._make_decoder(), request, self._response_gap_s, self._response_gap_s):
+            if status.id == BROADCAST_ID and len(status.parameters) == length:
+                return split_fast_status(status, size)
+            self._match_response(status.id)
+        return split_damaged_fast_status(bytes(self._received), size)

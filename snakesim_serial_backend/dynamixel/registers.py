@@ -107,7 +107,7 @@ WITHOUT_CURRENT = {
 }
 
 
-def model_name(number: int) -> str:
+def get_model_name(number: int) -> str:
     """Return the name of a model as its maker writes it."""
     model = MODELS.get(number)
     if model is not None:
@@ -115,8 +115,8 @@ def model_name(number: int) -> str:
     return WITHOUT_CURRENT.get(number, f"model {number}")
 
 
-def model_number(name: str) -> int | None:
-    """Return the number of a model with this name, as `model_name` returns it; None for an unknown name."""
+def find_model_number(name: str) -> int | None:
+    """Return the number of a model with this name, as `get_model_name` returns it; None for an unknown name."""
     names = {number: model.name for number, model in MODELS.items()} | WITHOUT_CURRENT
     for number, known_name in names.items():
         if known_name == name:
@@ -127,13 +127,13 @@ def model_number(name: str) -> int | None:
     return None
 
 
-def error_names(errors: int) -> str:
+def describe_errors(errors: int) -> str:
     """Return the names of the bits of a hardware error."""
     names = [error.name.lower().replace("_", " ") for error in HardwareError if errors & error and error.name]
     return ", ".join(names) or f"0x{errors:02x}"
 
 
-def gains(stiffness: float, damping: float, unit_nm: float) -> tuple[int, int, int]:
+def gains(stiffness: float, damping: float, torque_unit_nm: float) -> tuple[int, int, int]:
     """Return the registers of the gains D, I and P for a stiffness and a damping at the horn.
 
     Assumed: the output of the position law is in units of current, its error in counts, and its difference is taken
@@ -144,24 +144,31 @@ def gains(stiffness: float, damping: float, unit_nm: float) -> tuple[int, int, i
     Args:
         stiffness: N·m/rad.
         damping: N·m·s/rad.
-        unit_nm: torque of one unit of current, N·m.
+        torque_unit_nm: Torque of one unit of current, N·m.
     """
-    p_gain = stiffness * RAD / unit_nm * P_SCALE
-    d_gain = damping * RAD / LAW_S / unit_nm * D_SCALE
+    p_gain = stiffness * RAD / torque_unit_nm * P_SCALE
+    d_gain = damping * RAD / LAW_S / torque_unit_nm * D_SCALE
     return min(round(d_gain), MAX_GAIN), 0, min(round(p_gain), MAX_GAIN)
 
 
-def law(d_gain: int, p_gain: int, unit_nm: float) -> tuple[float, float]:
+def compute_position_law(d_gain: int, p_gain: int, torque_unit_nm: float) -> tuple[float, float]:
     """Return the stiffness in N·m/rad and the damping in N·m·s/rad of gains: the inverse of `gains`."""
-    stiffness = p_gain / P_SCALE * unit_nm / RAD
-    damping = d_gain / D_SCALE * unit_nm / RAD * LAW_S
+    stiffness = p_gain / P_SCALE * torque_unit_nm / RAD
+    damping = d_gain / D_SCALE * torque_unit_nm / RAD * LAW_S
     return stiffness, damping
 
 
-def whole_turns(angle_rad: float, lower_rad: float, upper_rad: float, slack_rad: float) -> int | None:
-    """Return how many revolutions to add to the reported angle, so that a servo is within its travel.
+def find_whole_turns(angle_rad: float, lower_rad: float, upper_rad: float, slack_rad: float) -> int | None:
+    """Return the number of whole revolutions to add to a reported angle, so that a servo is within its travel.
 
-    None: no number of revolutions does it, or several do.
+    Args:
+        angle_rad: Reported angle.
+        lower_rad: Lower end of the travel.
+        upper_rad: Upper end of the travel.
+        slack_rad: Angle beyond both ends that is still accepted.
+
+    Returns:
+        The number of revolutions; None if no number or several numbers are possible.
     """
     turn_rad = 2 * math.pi
     first = math.ceil((lower_rad - slack_rad - angle_rad) / turn_rad)

@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Iterator
 
-from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.packets import Packet
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.wire import SerialWire
@@ -23,10 +23,15 @@ def scan(wire: SerialWire) -> Iterator[dict[str, str]]:
 
 
 def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
-    """Return the row of a servo. ping: its answer to a ping, with model and firmware."""
+    """Return the row of the scan for one servo, by the names in `COLUMNS`.
+
+    Args:
+        port: Port of the servo.
+        ping: Response of the servo to a ping, with model and firmware.
+    """
     number, firmware = struct.unpack("<HB", ping.data[:3])
-    model = at.model_name(number)
-    if number in at.MODELS:
+    model = registers.get_model_name(number)
+    if number in registers.MODELS:
         model = f"{model} ({number})"
     row = dict.fromkeys(COLUMNS, "-")
     row |= {
@@ -36,28 +41,32 @@ def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
         "model": model,
         "firmware": str(firmware),
     }
-    table = port.read(ping.id, 0, at.SIZE)
+    table = port.read(ping.id, 0, registers.SIZE)
     if table is not None:
         row |= _describe_registers(table.data)
     return row
 
 
 def _describe_registers(data: bytes) -> dict[str, str]:
-    """Return the columns that are read from a servo's control table."""
-    (position,) = struct.unpack_from("<i", data, at.PRESENT_POSITION)
-    (homing_offset,) = struct.unpack_from("<i", data, at.HOMING_OFFSET)
-    (current_limit,) = struct.unpack_from("<H", data, at.CURRENT_LIMIT)
-    (voltage,) = struct.unpack_from("<H", data, at.VOLTAGE)
-    errors = data[at.HARDWARE_ERROR]
-    baud_of_value = {value: baud for baud, value in at.RATE.items()}
-    baud = baud_of_value.get(data[at.BAUD_RATE])
+    """Return the columns of a scan that are read from a servo's control table.
+
+    Args:
+        data: Control table, from address 0 on.
+    """
+    (position,) = struct.unpack_from("<i", data, registers.PRESENT_POSITION)
+    (homing_offset,) = struct.unpack_from("<i", data, registers.HOMING_OFFSET)
+    (current_limit,) = struct.unpack_from("<H", data, registers.CURRENT_LIMIT)
+    (voltage,) = struct.unpack_from("<H", data, registers.VOLTAGE)
+    errors = data[registers.HARDWARE_ERROR]
+    baud_of_value = {value: baud for baud, value in registers.RATE.items()}
+    baud = baud_of_value.get(data[registers.BAUD_RATE])
     return {
         "baud": str(baud) if baud is not None else "-",
-        "mode": str(data[at.OPERATING_MODE]),
+        "mode": str(data[registers.OPERATING_MODE]),
         "offset": str(homing_offset),
-        "angle": f"{position * at.RAD:.3f} rad",
+        "angle": f"{position * registers.RAD:.3f} rad",
         "current limit": str(current_limit),
-        "voltage": f"{voltage * at.VOLTS:.1f} V",
-        "heat": f"{data[at.TEMPERATURE]} °C",
-        "errors": at.error_names(errors) if errors else "none",
+        "voltage": f"{voltage * registers.VOLTS:.1f} V",
+        "heat": f"{data[registers.TEMPERATURE]} °C",
+        "errors": registers.describe_errors(errors) if errors else "none",
     }

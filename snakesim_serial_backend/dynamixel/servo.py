@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.servo_bus import SerialServo
 
@@ -17,14 +17,14 @@ class Servo(SerialServo[Port]):
     """A servo of one joint. Angles and torques are those of its horn."""
 
     # How it is built.
-    constant: float  # N·m/A
+    torque_constant_nm_per_a: float  # N·m/A
     stiffness: float  # N·m/rad
     damping: float  # N·m·s/rad
     lower_rad: float
     upper_rad: float
     torque_nm: float  # largest torque that its joint may demand
     speed_rad_s: float
-    unit_nm: float = 1.0  # torque of one unit of current
+    torque_unit_nm: float = 1.0  # torque of one unit of current
     max_current: int = 0  # its own limit, in units of current
 
     # What it reported.
@@ -42,6 +42,6 @@ class Servo(SerialServo[Port]):
             return self.upper_rad + beyond_rad
         return self.lower_rad - beyond_rad
 
-    def gain_registers(self) -> bytes:
+    def encode_gain_registers(self) -> bytes:
         """Return the gains of its position law as registers."""
-        return at.gains_form.pack(*at.gains(self.stiffness, self.damping, self.unit_nm))
+        return registers.gains_form.pack(*registers.gains(self.stiffness, self.damping, self.torque_unit_nm))

@@ -6,11 +6,11 @@ from typing import ClassVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_settings import joint_label
+from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint, Measurement
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.emulator import EmulatedFeetech
 from snakesim_serial_backend.feetech.load import PORT_LOAD
 from snakesim_serial_backend.feetech.packets import LAST_ID
@@ -36,21 +36,21 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
     @classmethod
     def check_drives(cls, config: RunConfig, settings: FeetechSettings, joints: Sequence[Joint]) -> None:
         if not all(is_emulated(port) for port in settings.ports):
-            check_real_servos(settings)
-        check_joints(config, joints)
-        cls.check_port_load(config, settings, joints)
+            validate_real_servos(settings)
+        validate_joints(config, joints)
+        cls.validate_port_load(config, settings, joints)
 
     @classmethod
-    def open_servos(cls, opened: OpenedPort[EmulatedFeetech]) -> Servos:
-        port = Port(opened.wire, opened.gap_s)
+    def open_servos(cls, opened_port: OpenedPort[EmulatedFeetech]) -> Servos:
+        port = Port(opened_port.wire, opened_port.response_gap_s)
         context = ServosContext(
-            servos=[servo_of(joint, port, opened.settings) for joint in opened.joints],
+            servos=[make_servo(joint, port, opened_port.settings) for joint in opened_port.joints],
             port=port,
-            readings=opened.readings,
-            settings=opened.settings,
-            emulator=opened.emulator,
-            answer_s=opened.answer_s,
-            clock_ns=opened.clock_ns,
+            readings=opened_port.readings,
+            settings=opened_port.settings,
+            emulator=opened_port.emulator,
+            response_timeout_s=opened_port.response_timeout_s,
+            clock_ns=opened_port.clock_ns,
         )
         return Servos(context)
 
@@ -63,11 +63,11 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
         ptys: Sequence[Pty],
         clock: DriverClock,
     ) -> EmulatedFeetech:
-        stall_torques_nm = [stall_torque_of(joint, settings) for joint in joints]
+        stall_torques_nm = [get_stall_torque_nm(joint, settings) for joint in joints]
         return EmulatedFeetech(body, ptys, stall_torques_nm, settings.baud, settings.speed_unit_counts_s, clock.now_ns)
 
 
-def servo_of(joint: Joint, port: Port, settings: FeetechSettings) -> Servo:
+def make_servo(joint: Joint, port: Port, settings: FeetechSettings) -> Servo:
     """Return a servo with the parameters of its joint, converted to its horn."""
     lower_rad, upper_rad = find_travel_rad(joint)
     return Servo(
@@ -77,13 +77,13 @@ def servo_of(joint: Joint, port: Port, settings: FeetechSettings) -> Servo:
         lower_rad=lower_rad,
         upper_rad=upper_rad,
         torque_nm=joint.limits.torque_nm / joint.drive.gear,
-        stall_torque_nm=stall_torque_of(joint, settings),
+        stall_torque_nm=get_stall_torque_nm(joint, settings),
         min_voltage_v=joint.limits.min_voltage_v,
         homing_offset=settings.homing_offsets.get(joint.name),
     )
 
 
-def stall_torque_of(joint: Joint, settings: FeetechSettings) -> float:
+def get_stall_torque_nm(joint: Joint, settings: FeetechSettings) -> float:
     """Return the stall torque of a joint's servo. Without a setting, which only emulated servos may lack, the joint's.
 
     It is a little more than the joint demands, because the torque limit is rounded down.
@@ -91,7 +91,7 @@ def stall_torque_of(joint: Joint, settings: FeetechSettings) -> float:
     return settings.stall_torque_nm or 1.01 * joint.limits.torque_nm / joint.drive.gear
 
 
-def check_real_servos(settings: FeetechSettings) -> None:
+def validate_real_servos(settings: FeetechSettings) -> None:
     """Raise ConfigError if the scenario does not state what real servos need."""
     if not settings.accept_no_watchdog:
         raise ConfigError(
@@ -109,21 +109,22 @@ def check_real_servos(settings: FeetechSettings) -> None:
         )
 
 
-def check_joints(config: RunConfig, joints: Sequence[Joint]) -> None:
+def validate_joints(config: RunConfig, joints: Sequence[Joint]) -> None:
     """Raise ConfigError for joints that no servo can drive."""
-    last_rad = math.pi - at.RAD
+    last_rad = math.pi - registers.RAD
     for joint in joints:
         if joint.id > LAST_ID:
             raise ConfigError(
-                f"{joint_label(config, joint)}: `id` = {joint.id}; ids of Feetech servos are 0 to {LAST_ID}",
+                f"{make_joint_label(config, joint)}: `id` = {joint.id}; ids of Feetech servos are 0 to {LAST_ID}",
                 code="drive/unsupported-setting",
             )
         lower_rad, upper_rad = find_travel_rad(joint)
         if lower_rad < -math.pi or upper_rad > last_rad:
             raise ConfigError(
-                f"{joint_label(config, joint)}: its servo travels from {lower_rad:.2f} to {upper_rad:.2f} rad, and its "
-                f"position starts again at {math.pi:.2f} rad, where it would turn the long way round: all angles must "
-                f"be within -{math.pi:.2f} and {last_rad:.2f} rad. Mount the horn, or set the homing offset, so that "
-                "the middle of the travel is at position 2048, and correct `zero_rad`; or narrow the limits or `gear`",
+                f"{make_joint_label(config, joint)}: its servo travels from {lower_rad:.2f} to {upper_rad:.2f} rad, "
+                f"and its position starts again at {math.pi:.2f} rad, where it would turn the long way round: all "
+                f"angles must be within -{math.pi:.2f} and {last_rad:.2f} rad. Mount the horn, or set the homing "
+                "offset, so that the middle of the travel is at position 2048, and correct `zero_rad`; or narrow the "
+                "limits or `gear`",
                 code="drive/unsupported-setting",
             )

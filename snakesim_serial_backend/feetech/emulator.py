@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.wire.messages import Mode
-from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.packets import (
-    EVERYBODY,
+    BROADCAST_ID,
     OFFSET_SIGN_BIT,
     SIGN_BIT,
     Decoder,
     Instruction,
     Packet,
     ServoError,
-    encode,
-    from_signed,
-    to_signed,
+    decode_sign_magnitude,
+    encode_packet,
+    encode_sign_magnitude,
 )
 from snakesim_serial_backend.servo_backend import ServoEmulator
 from snakesim_serial_backend.wire import Pty
@@ -52,12 +52,12 @@ class EmulatedServo:
     @property
     def id(self) -> int:
         """The id to which the servo answers."""
-        return self.table[at.ID]
+        return self.table[registers.ID]
 
     @property
-    def on(self) -> bool:
+    def is_torque_on(self) -> bool:
         """Whether the torque is on."""
-        return self.table[at.TORQUE_ENABLE] == 1
+        return self.table[registers.TORQUE_ENABLE] == 1
 
 
 class EmulatedFeetech(ServoEmulator):
@@ -72,27 +72,27 @@ class EmulatedFeetech(ServoEmulator):
         speed_unit_counts_s: float,
         clock_ns: Callable[[], int],
     ) -> None:
-        """Make a servo for every joint of a body.
+        """Create an emulated servo for every joint of a body.
 
         Args:
-            body: the body that the servos move.
-            ports: the port of every joint's servo.
-            stall_torques_nm: stall torque of every joint's servo.
-            baud: baud rate that the servos are set to.
-            speed_unit_counts_s: counts per second in a unit of speed.
-            clock_ns: a clock with any origin.
+            body: Body that the servos move.
+            ports: Pseudo terminal of every joint's servo; servos of one port have the same object.
+            stall_torques_nm: Stall torque of every joint's servo.
+            baud: Baud rate that the servos are set to, in bit/s.
+            speed_unit_counts_s: Counts per second in a unit of the speed registers.
+            clock_ns: Function that returns a steady time in ns, with any origin.
         """
-        self._speed_unit_rad_s = speed_unit_counts_s * at.RAD
+        self._speed_unit_rad_s = speed_unit_counts_s * registers.RAD
         self.servos: list[EmulatedServo] = []
         for joint, port, stall_torque_nm in zip(body.joints, ports, stall_torques_nm, strict=True):
-            servo = EmulatedServo(bytearray(at.SIZE), port, stall_torque_nm)
+            servo = EmulatedServo(bytearray(registers.SIZE), port, stall_torque_nm)
             _write_factory_settings(servo, joint.id, baud)
-            servo.table[at.MIN_VOLTAGE] = round(joint.limits.min_voltage_v / at.VOLTS)
-            servo.table[at.MAX_VOLTAGE] = min(round(joint.supply.voltage_v / at.VOLTS) + 20, 255)
+            servo.table[registers.MIN_VOLTAGE] = round(joint.limits.min_voltage_v / registers.VOLTS)
+            servo.table[registers.MAX_VOLTAGE] = min(round(joint.supply.voltage_v / registers.VOLTS) + 20, 255)
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
         self._decoders = [Decoder() for _ in self._bus_ends]
-        self._delay_of_second = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
+        self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
         for i in range(len(self.servos)):
             self.restart(i)
 
@@ -103,148 +103,154 @@ class EmulatedFeetech(ServoEmulator):
             for port, decoder, data in zip(self._bus_ends, self._decoders, received, strict=True):
                 for packet in decoder.feed(data):
                     self._handle_packet(port, packet)
-            self.pass_time()
+            self.simulate_to_now()
 
     # --- packets ----------------------------------------------------------------------------------------------
 
     def _handle_packet(self, port: Pty, packet: Packet) -> None:
         """Handle a packet for one servo or for several servos of a port."""
-        listening = [i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)]
-        index_of_id = {self.servos[i].id: i for i in listening}
+        listening_servos = [
+            i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)
+        ]
+        index_by_id = {self.servos[i].id: i for i in listening_servos}
         match packet.code:
             case Instruction.SYNC_WRITE:
-                self._write_several(packet.parameters, index_of_id)
+                self._execute_sync_write(packet.parameters, index_by_id)
             case Instruction.SYNC_READ:
-                self._read_several(packet.parameters, index_of_id)
-            case Instruction.PING if packet.id == EVERYBODY:
-                for _, i in sorted(index_of_id.items()):
-                    self._answer(i, b"")
-            case _ if packet.id in index_of_id:
-                self._execute(index_of_id[packet.id], packet)
+                self._execute_sync_read(packet.parameters, index_by_id)
+            case Instruction.PING if packet.id == BROADCAST_ID:
+                for _, i in sorted(index_by_id.items()):
+                    self._send_status(i, b"")
+            case _ if packet.id in index_by_id:
+                self._execute_instruction(index_by_id[packet.id], packet)
             case _:
                 pass
 
-    def _execute(self, i: int, packet: Packet) -> None:
+    def _execute_instruction(self, i: int, packet: Packet) -> None:
         """Execute an instruction to one servo, and answer it."""
         match packet.code:
             case Instruction.PING:
-                self._answer(i, b"")
+                self._send_status(i, b"")
             case Instruction.READ:
                 address, size = packet.parameters
-                self._answer(i, self._read(i, address, size), self._read_second(i, address, size))
+                self._send_status(i, self._read_registers(i, address, size), self._read_second_servo(i, address, size))
             case Instruction.WRITE:
-                self._write(i, packet.parameters[0], packet.parameters[1:])
-                if self.servos[i].table[at.STATUS_LEVEL]:
-                    self._answer(i, b"")
+                self._write_registers(i, packet.parameters[0], packet.parameters[1:])
+                if self.servos[i].table[registers.STATUS_LEVEL]:
+                    self._send_status(i, b"")
             case _:
                 pass
 
-    def _write_several(self, parameters: bytes, index_of_id: Mapping[int, int]) -> None:
+    def _execute_sync_write(self, parameters: bytes, index_by_id: Mapping[int, int]) -> None:
         """Execute a sync write: address, size, and an id with data for each servo."""
         address, size = parameters[:2]
         for start in range(2, len(parameters), size + 1):
-            i = index_of_id.get(parameters[start])
+            i = index_by_id.get(parameters[start])
             if i is not None:
-                self._write(i, address, parameters[start + 1 : start + 1 + size])
+                self._write_registers(i, address, parameters[start + 1 : start + 1 + size])
 
-    def _read_several(self, parameters: bytes, index_of_id: Mapping[int, int]) -> None:
+    def _execute_sync_read(self, parameters: bytes, index_by_id: Mapping[int, int]) -> None:
         """Answer a sync read in the order of its ids. The first servo that is silent ends the answers."""
         address, size = parameters[:2]
         for id_ in parameters[2:]:
-            i = index_of_id.get(id_)
+            i = index_by_id.get(id_)
             if i is None or self.body.is_silent(i):
                 return
-            self._answer(i, self._read(i, address, size), self._read_second(i, address, size))
+            self._send_status(i, self._read_registers(i, address, size), self._read_second_servo(i, address, size))
 
-    def _answer(self, i: int, data: bytes, second_data: bytes | None = None) -> None:
+    def _send_status(self, i: int, data: bytes, second_data: bytes | None = None) -> None:
         """Send a servo's status. second_data: the data of a second servo with its id, where they differ."""
         if self.body.is_silent(i):
             return
         servo = self.servos[i]
-        error = servo.table[at.STATUS]
-        status = encode(servo.id, error, data)
+        error = servo.table[registers.STATUS]
+        status = encode_packet(servo.id, error, data)
         if not self.body.is_duplicated(i):
             servo.port.send(status)
             return
-        second_status = encode(servo.id, error, data if second_data is None else second_data)
-        if servo.table[at.DELAY] == self._delay_of_second[i]:
+        second_status = encode_packet(servo.id, error, data if second_data is None else second_data)
+        if servo.table[registers.DELAY] == self._second_servo_delays[i]:
             servo.port.send(bytes(a & b for a, b in zip(status, second_status, strict=True)))  # a 0 of either wins
         else:
             servo.port.send(status + second_status)
 
-    def _read(self, i: int, address: int, size: int) -> bytes:
+    def _read_registers(self, i: int, address: int, size: int) -> bytes:
         """Return the data of registers; 0 beyond the last one."""
-        self._measure(i)
+        self._update_measurements(i)
         return bytes(self.servos[i].table[address : address + size]).ljust(size, b"\0")
 
-    def _read_second(self, i: int, address: int, size: int) -> bytes:
+    def _read_second_servo(self, i: int, address: int, size: int) -> bytes:
         """Return the same registers of a second servo with the id of this one."""
         table = self.servos[i].table[:]
-        position = int.from_bytes(table[at.PRESENT : at.PRESENT + 2], "little")
-        second_position = (position + SECOND_SERVO_COUNTS) % at.COUNTS
-        table[at.PRESENT : at.PRESENT + 2] = second_position.to_bytes(2, "little")
+        position = int.from_bytes(table[registers.PRESENT : registers.PRESENT + 2], "little")
+        second_position = (position + SECOND_SERVO_COUNTS) % registers.COUNTS
+        table[registers.PRESENT : registers.PRESENT + 2] = second_position.to_bytes(2, "little")
         return bytes(table[address : address + size]).ljust(size, b"\0")
 
-    def _measure(self, i: int) -> None:
+    def _update_measurements(self, i: int) -> None:
         """Update the registers of what a servo measures."""
         servo = self.servos[i]
         angle_rad, velocity_rad_s, torque_nm = self.body.read_shaft(i)
         voltage_v, current_a = self.body.read_supply(i)
-        offset = to_signed(servo.read_word(at.HOMING_OFFSET), OFFSET_SIGN_BIT)
-        position = (round(angle_rad / at.RAD) + at.MIDDLE - offset) % at.COUNTS
+        offset = decode_sign_magnitude(servo.read_word(registers.HOMING_OFFSET), OFFSET_SIGN_BIT)
+        position = (round(angle_rad / registers.RAD) + registers.MIDDLE - offset) % registers.COUNTS
         speed = max(min(round(velocity_rad_s / self._speed_unit_rad_s), 32767), -32767)
-        load = max(min(round(torque_nm / servo.stall_torque_nm * at.PER_MILLE), 1023), -1023)
-        servo.write_word(at.PRESENT, position)
-        servo.write_word(at.PRESENT + 2, from_signed(speed, SIGN_BIT))
-        servo.write_word(at.PRESENT + 4, from_signed(load, 10))
-        servo.table[at.VOLTAGE] = min(round(voltage_v / at.VOLTS), 255)
-        servo.table[at.TEMPERATURE] = min(max(round(self.body.read_temperatures(i)[0]), 0), 255)
-        servo.write_word(at.CURRENT, min(round(abs(current_a) / at.CURRENT_A), 32767))
+        load = max(min(round(torque_nm / servo.stall_torque_nm * registers.PER_MILLE), 1023), -1023)
+        servo.write_word(registers.PRESENT, position)
+        servo.write_word(registers.PRESENT + 2, encode_sign_magnitude(speed, SIGN_BIT))
+        servo.write_word(registers.PRESENT + 4, encode_sign_magnitude(load, 10))
+        servo.table[registers.VOLTAGE] = min(round(voltage_v / registers.VOLTS), 255)
+        servo.table[registers.TEMPERATURE] = min(max(round(self.body.read_temperatures(i)[0]), 0), 255)
+        servo.write_word(registers.CURRENT, min(round(abs(current_a) / registers.CURRENT_A), 32767))
 
-    def _write(self, i: int, address: int, data: bytes) -> None:
+    def _write_registers(self, i: int, address: int, data: bytes) -> None:
         """Set registers, as far as they can be written: a servo does not report a refusal."""
         servo = self.servos[i]
         end = address + len(data)
-        if address < at.ID or end > at.PRESENT:
+        if address < registers.ID or end > registers.PRESENT:
             return
-        if address < at.EEPROM_SIZE and (servo.table[at.LOCK] or servo.on):
+        if address < registers.EEPROM_SIZE and (servo.table[registers.LOCK] or servo.is_torque_on):
             return
         servo.table[address:end] = data
-        if address <= at.DELAY < end and self.body.is_duplicated(i):
-            self._delay_of_second[i] = data[at.DELAY - address]
-        if address <= at.GOALS < end:
-            servo.table[at.TORQUE_ENABLE] = 1
-        if servo.table[at.STATUS] & servo.table[at.UNLOADING]:
-            servo.table[at.TORQUE_ENABLE] = 0
-        self._drive(i)
+        if address <= registers.DELAY < end and self.body.is_duplicated(i):
+            self._second_servo_delays[i] = data[registers.DELAY - address]
+        if address <= registers.GOALS < end:
+            servo.table[registers.TORQUE_ENABLE] = 1
+        if servo.table[registers.STATUS] & servo.table[registers.UNLOADING]:
+            servo.table[registers.TORQUE_ENABLE] = 0
+        self._drive_motor(i)
 
     # --- motors -----------------------------------------------------------------------------------------------
 
     def restart(self, i: int) -> None:
         """Reset all registers from address 40 on."""
         servo = self.servos[i]
-        servo.table[at.TORQUE_ENABLE :] = bytes(at.SIZE - at.TORQUE_ENABLE)
-        servo.write_word(at.TORQUE_LIMIT, servo.read_word(at.MAX_TORQUE))
-        servo.table[at.LOCK] = at.LOCKED
-        self._measure(i)
-        servo.write_word(at.GOALS, servo.read_word(at.PRESENT))
-        self._drive(i)
+        servo.table[registers.TORQUE_ENABLE :] = bytes(registers.SIZE - registers.TORQUE_ENABLE)
+        servo.write_word(registers.TORQUE_LIMIT, servo.read_word(registers.MAX_TORQUE))
+        servo.table[registers.LOCK] = registers.LOCKED
+        self._update_measurements(i)
+        servo.write_word(registers.GOALS, servo.read_word(registers.PRESENT))
+        self._drive_motor(i)
 
-    def _drive(self, i: int) -> None:
+    def _drive_motor(self, i: int) -> None:
         """Drive the body to the goal, as the registers specify."""
         servo = self.servos[i]
         joint = self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
-        if not servo.on or servo.table[at.OPERATING_MODE] != at.POSITION_MODE:
+        if not servo.is_torque_on or servo.table[registers.OPERATING_MODE] != registers.POSITION_MODE:
             self.body.drive_motor(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
             return
-        offset = to_signed(servo.read_word(at.HOMING_OFFSET), OFFSET_SIGN_BIT)
-        goal = to_signed(servo.read_word(at.GOALS), SIGN_BIT)
-        goal = min(max(goal, servo.read_word(at.MIN_POSITION)), servo.read_word(at.MAX_POSITION))
-        limit_nm = min(servo.read_word(at.TORQUE_LIMIT), at.PER_MILLE) / at.PER_MILLE * servo.stall_torque_nm
+        offset = decode_sign_magnitude(servo.read_word(registers.HOMING_OFFSET), OFFSET_SIGN_BIT)
+        goal = decode_sign_magnitude(servo.read_word(registers.GOALS), SIGN_BIT)
+        goal = min(max(goal, servo.read_word(registers.MIN_POSITION)), servo.read_word(registers.MAX_POSITION))
+        limit_nm = (
+            min(servo.read_word(registers.TORQUE_LIMIT), registers.PER_MILLE)
+            / registers.PER_MILLE
+            * servo.stall_torque_nm
+        )
         stiffness = joint.motor.stiffness_nm_per_rad / joint.drive.gear**2
         damping = joint.motor.damping_nm_s_per_rad / joint.drive.gear**2
-        goal_rad = at.to_angle_rad(goal + offset)
+        goal_rad = registers.to_angle_rad(goal + offset)
         self.body.drive_motor(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
 
     def on_step(self, now_us: float) -> None:
@@ -254,27 +260,27 @@ class EmulatedFeetech(ServoEmulator):
             errors = 0
             if self.body.is_too_hot(i):
                 errors |= ServoError.OVERHEATING
-            if self.body.read_supply(i)[0] < servo.table[at.MIN_VOLTAGE] * at.VOLTS:
+            if self.body.read_supply(i)[0] < servo.table[registers.MIN_VOLTAGE] * registers.VOLTS:
                 errors |= ServoError.VOLTAGE
-            servo.table[at.STATUS] = errors
-            if servo.on and errors & servo.table[at.UNLOADING]:
-                servo.table[at.TORQUE_ENABLE] = 0
-                self._drive(i)
+            servo.table[registers.STATUS] = errors
+            if servo.is_torque_on and errors & servo.table[registers.UNLOADING]:
+                servo.table[registers.TORQUE_ENABLE] = 0
+                self._drive_motor(i)
 
 
 def _write_factory_settings(servo: EmulatedServo, id_: int, baud: int) -> None:
     """Set the registers that a servo keeps without power."""
-    servo.table[at.FIRMWARE : at.FIRMWARE + 2] = bytes(FIRMWARE)
-    servo.write_word(at.MODEL, MODEL)
-    servo.table[at.ID] = id_
-    servo.table[at.BAUD_RATE] = at.RATE[baud]
-    servo.table[at.DELAY] = FACTORY_DELAY
-    servo.table[at.STATUS_LEVEL] = 1
-    servo.write_word(at.MAX_POSITION, at.LAST_POSITION)
-    servo.table[at.MAX_TEMPERATURE] = 70  # °C
-    servo.write_word(at.MAX_TORQUE, at.PER_MILLE)
-    servo.table[at.PHASE] = 12
-    servo.table[at.UNLOADING] = FACTORY_UNLOADING
-    servo.table[at.PROTECTIVE_TORQUE] = 20  # percent
-    servo.table[at.PROTECTION_TIME] = 200
-    servo.table[at.OVERLOAD_TORQUE] = 80  # percent
+    servo.table[registers.FIRMWARE : registers.FIRMWARE + 2] = bytes(FIRMWARE)
+    servo.write_word(registers.MODEL, MODEL)
+    servo.table[registers.ID] = id_
+    servo.table[registers.BAUD_RATE] = registers.RATE[baud]
+    servo.table[registers.DELAY] = FACTORY_DELAY
+    servo.table[registers.STATUS_LEVEL] = 1
+    servo.write_word(registers.MAX_POSITION, registers.LAST_POSITION)
+    servo.table[registers.MAX_TEMPERATURE] = 70  # °C
+    servo.write_word(registers.MAX_TORQUE, registers.PER_MILLE)
+    servo.table[registers.PHASE] = 12
+    servo.table[registers.UNLOADING] = FACTORY_UNLOADING
+    servo.table[registers.PROTECTIVE_TORQUE] = 20  # percent
+    servo.table[registers.PROTECTION_TIME] = 200
+    servo.table[registers.OVERLOAD_TORQUE] = 80  # percent

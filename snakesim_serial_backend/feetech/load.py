@@ -3,7 +3,7 @@
 A cycle is a sync read of all servos, their answers, the state of one, and a sync write to all.
 """
 
-from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.packets import OVERHEAD
 from snakesim_serial_backend.feetech.registers import RATE
 from snakesim_serial_backend.port_load import PortLoad
@@ -11,13 +11,13 @@ from snakesim_serial_backend.port_load import PortLoad
 REGISTERS = 2  # bytes of the address and the size in a request
 
 
-def cycle_bytes(servos: int) -> int:
+def count_cycle_bytes(servos: int) -> int:
     """Return the number of bytes on the wire, in both directions."""
     read_request = OVERHEAD + REGISTERS + servos
-    read_answers = servos * (OVERHEAD + at.present_form.size)
-    state = OVERHEAD + REGISTERS + OVERHEAD + at.STATE_SIZE
-    goals = OVERHEAD + REGISTERS + servos * (1 + at.goals_form.size)  # each with id
+    read_answers = servos * (OVERHEAD + registers.present_form.size)
+    state = OVERHEAD + REGISTERS + OVERHEAD + registers.STATE_SIZE
+    goals = OVERHEAD + REGISTERS + servos * (1 + registers.goals_form.size)  # each with id
     return read_request + read_answers + state + goals
 
 
-PORT_LOAD = PortLoad(list(RATE), cycle_bytes, "sync read, state of one, sync write")
+PORT_LOAD = PortLoad(list(RATE), count_cycle_bytes, "sync read, state of one, sync write")

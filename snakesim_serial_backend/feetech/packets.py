@@ -14,11 +14,11 @@ from typing import ClassVar
 from snakesim_serial_backend.stream_decoder import StreamDecoder
 
 HEADER = b"\xff\xff"
-BYTES_BEFORE = 4  # instruction and parameters: header, id, length
+PREFIX_BYTES = 4  # instruction and parameters: header, id, length
 MIN_LENGTH = 2  # of an instruction without parameters, with its checksum
 MAX_LENGTH = 250
 OVERHEAD = 6  # bytes around the parameters
-EVERYBODY = 0xFE  # id of a packet to all servos
+BROADCAST_ID = 0xFE  # id of a packet to all servos
 LAST_ID = 253
 SIGN_BIT = 15  # of positions and speeds: sign and magnitude
 LOAD_SIGN_BIT = 10
@@ -74,28 +74,28 @@ def checksum(data: bytes) -> int:
     return ~sum(data) & 0xFF
 
 
-def encode(id_: int, code: int, parameters: bytes = b"") -> bytes:
+def encode_packet(id_: int, code: int, parameters: bytes = b"") -> bytes:
     """Return the bytes of a packet. code: an instruction, or the error of a status."""
-    inside = bytes([id_, len(parameters) + MIN_LENGTH, code]) + parameters
-    return HEADER + inside + bytes([checksum(inside)])
+    body = bytes([id_, len(parameters) + MIN_LENGTH, code]) + parameters
+    return HEADER + body + bytes([checksum(body)])
 
 
 def encode_sync_read(ids: Sequence[int], address: int, size: int) -> bytes:
     """Return a packet that reads the same registers of several servos; they answer in this order."""
-    return encode(EVERYBODY, Instruction.SYNC_READ, bytes([address, size, *ids]))
+    return encode_packet(BROADCAST_ID, Instruction.SYNC_READ, bytes([address, size, *ids]))
 
 
-def encode_sync_write(address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> bytes:
+def encode_sync_write(address: int, data_by_id: Sequence[tuple[int, bytes]]) -> bytes:
     """Return a packet that writes the same registers of several servos, which do not answer.
 
-    data_of_ids: id and data of each servo, all equally long.
+    data_by_id: id and data of each servo, all equally long.
     """
-    _, first_data = data_of_ids[0]
-    values = b"".join(bytes([id_]) + data for id_, data in data_of_ids)
-    return encode(EVERYBODY, Instruction.SYNC_WRITE, bytes([address, len(first_data)]) + values)
+    _, first_data = data_by_id[0]
+    values = b"".join(bytes([id_]) + data for id_, data in data_by_id)
+    return encode_packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes([address, len(first_data)]) + values)
 
 
-def to_signed(word: int, sign_bit: int) -> int:
+def decode_sign_magnitude(word: int, sign_bit: int) -> int:
     """Return the value of a register that has a sign bit above its magnitude."""
     magnitude = word & ((1 << sign_bit) - 1)
     if word >> sign_bit & 1:
@@ -103,8 +103,8 @@ def to_signed(word: int, sign_bit: int) -> int:
     return magnitude
 
 
-def from_signed(value: int, sign_bit: int) -> int:
-    """Return the register of a value: the inverse of `to_signed`."""
+def encode_sign_magnitude(value: int, sign_bit: int) -> int:
+    """Return the register of a value: the inverse of `decode_sign_magnitude`."""
     if value < 0:
         return -value | 1 << sign_bit
     return value
@@ -114,13 +114,13 @@ class Decoder(StreamDecoder[Packet]):
     """Finds packets in a stream of bytes; noise, and packets with a wrong checksum, are skipped."""
 
     header: ClassVar[bytes] = HEADER
-    bytes_before: ClassVar[int] = BYTES_BEFORE
+    bytes_before: ClassVar[int] = PREFIX_BYTES
 
     def read_length(self, start: bytes) -> int | None:
         length = start[3]
-        if start[2] > EVERYBODY or not MIN_LENGTH <= length <= MAX_LENGTH:
+        if start[2] > BROADCAST_ID or not MIN_LENGTH <= length <= MAX_LENGTH:
             return None
-        return BYTES_BEFORE + length
+        return PREFIX_BYTES + length
 
     def decode(self, data: bytes) -> Packet | None:
         if checksum(data[2:-1]) != data[-1]:
@@ -128,5 +128,5 @@ class Decoder(StreamDecoder[Packet]):
         return Packet(data[2], data[4], data[5:-1])
 
     def feed_statuses(self, data: bytes) -> Iterator[Packet]:
-        """Take in bytes, and yield the statuses that are complete now: all packets in the direction of the driver."""
+        """Add received bytes, and yield the statuses that are complete now: all packets to the driver."""
         return self.feed(data)

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 from snakesim_serial_backend.feetech.packets import (
-    EVERYBODY,
+    BROADCAST_ID,
     LAST_ID,
     Decoder,
     Instruction,
     Packet,
-    encode,
+    encode_packet,
     encode_sync_read,
     encode_sync_write,
 )
@@ -22,24 +22,28 @@ class Port(RequestPort[Packet]):
 
     def ping(self, id_: int) -> Answers[Packet]:
         """Request a sign of life of a servo, which has no data."""
-        return self._request_all_answers(id_, encode(id_, Instruction.PING), 0, 1)
+        return self._request_all_responses(id_, encode_packet(id_, Instruction.PING), 0, 1)
 
     def read_alone(self, id_: int, address: int, size: int) -> Answers[Packet]:
         """Read registers of a servo, and wait for a second answer, too."""
-        return self._request_all_answers(id_, encode(id_, Instruction.READ, bytes([address, size])), size, 2)
+        return self._request_all_responses(id_, encode_packet(id_, Instruction.READ, bytes([address, size])), size, 2)
 
     def scan(self) -> list[Packet]:
         """Return the answers of all servos to a ping to all."""
-        gap_s = self._gap_s + LAST_ID * SCAN_S
-        return list(self._request(self._make_decoder(), encode(EVERYBODY, Instruction.PING), gap_s, gap_s))
+        response_gap_s = self._response_gap_s + LAST_ID * SCAN_S
+        return list(
+            self._send_request(
+                self._make_decoder(), encode_packet(BROADCAST_ID, Instruction.PING), response_gap_s, response_gap_s
+            )
+        )
 
     def read(self, id_: int, address: int, size: int) -> Packet | None:
         """Read registers of a servo; None without an answer that is complete."""
-        return self._request_one(id_, encode(id_, Instruction.READ, bytes([address, size])), size)
+        return self._request_single_response(id_, encode_packet(id_, Instruction.READ, bytes([address, size])), size)
 
     def write(self, id_: int, address: int, data: bytes) -> Packet | None:
         """Write registers of a servo, and return its answer, which does not tell whether it accepted them."""
-        return self._request_one(id_, encode(id_, Instruction.WRITE, bytes([address]) + data), 0)
+        return self._request_single_response(id_, encode_packet(id_, Instruction.WRITE, bytes([address]) + data), 0)
 
     def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, Packet]:
         """Read the same registers of several servos at once.
@@ -49,16 +53,16 @@ class Port(RequestPort[Packet]):
         """
         if not ids:
             return {}
-        statuses = self._request_each(ids, encode_sync_read(ids, address, size), size)
+        statuses = self._sync_read(ids, encode_sync_read(ids, address, size), size)
         return {status.id: status for status in statuses}
 
-    def write_all(self, address: int, data_of_ids: Sequence[tuple[int, bytes]]) -> None:
+    def write_all(self, address: int, data_by_id: Sequence[tuple[int, bytes]]) -> None:
         """Write the same registers of several servos at once; they do not answer.
 
-        data_of_ids: id and data of each servo, all equally long.
+        data_by_id: id and data of each servo, all equally long.
         """
-        if data_of_ids:
-            self.wire.send(encode_sync_write(address, data_of_ids))
+        if data_by_id:
+            self.wire.send(encode_sync_write(address, data_by_id))
 
     def _make_decoder(self) -> Decoder:
         return Decoder()

@@ -78,12 +78,12 @@ STATE_SIZE = CURRENT + 2 - TORQUE_ENABLE  # from TORQUE_ENABLE on
 MODELS = {777: "STS3215", 2825: "STS3250"}
 
 
-def model_name(number: int) -> str:
+def get_model_name(number: int) -> str:
     """Return the name of a model as its maker writes it."""
     return MODELS.get(number, f"model {number}")
 
 
-def error_names(errors: int) -> str:
+def describe_errors(errors: int) -> str:
     """Return the names of the bits of an error."""
     names = [error.name.lower().replace("_", " ") for error in ServoError if errors & error and error.name]
     return ", ".join(names) or f"0x{errors:02x}"

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
-from snakesim_serial_backend.feetech import registers as at
-from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, Packet, to_signed
+from snakesim_serial_backend.feetech import registers
+from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, Packet, decode_sign_magnitude
 from snakesim_serial_backend.feetech.port import Port
 from snakesim_serial_backend.wire import SerialWire
 
@@ -25,29 +25,29 @@ def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
     """Return the row of a servo. ping: its answer to a ping."""
     row = dict.fromkeys(COLUMNS, "-")
     row |= {"port": port.wire.port, "baud": str(port.wire.baud), "id": str(ping.id)}
-    table = port.read(ping.id, 0, at.CURRENT + 2)
+    table = port.read(ping.id, 0, registers.CURRENT + 2)
     if table is not None:
         row |= _describe_registers(table.data)
-        row["errors"] = at.error_names(table.error) if table.error else "none"
+        row["errors"] = registers.describe_errors(table.error) if table.error else "none"
     return row
 
 
 def _describe_registers(data: bytes) -> dict[str, str]:
     """Return the columns that are read from a servo's control table."""
-    number = _word(data, at.MODEL)
-    model = at.model_name(number)
-    if number in at.MODELS:
+    number = _word(data, registers.MODEL)
+    model = registers.get_model_name(number)
+    if number in registers.MODELS:
         model = f"{model} ({number})"
-    angle_rad = at.to_angle_rad(to_signed(_word(data, at.PRESENT), SIGN_BIT))
+    angle_rad = registers.to_angle_rad(decode_sign_magnitude(_word(data, registers.PRESENT), SIGN_BIT))
     return {
         "model": model,
-        "firmware": f"{data[at.FIRMWARE]}.{data[at.FIRMWARE + 1]}",
-        "mode": str(data[at.OPERATING_MODE]),
-        "offset": str(to_signed(_word(data, at.HOMING_OFFSET), OFFSET_SIGN_BIT)),
+        "firmware": f"{data[registers.FIRMWARE]}.{data[registers.FIRMWARE + 1]}",
+        "mode": str(data[registers.OPERATING_MODE]),
+        "offset": str(decode_sign_magnitude(_word(data, registers.HOMING_OFFSET), OFFSET_SIGN_BIT)),
         "angle": f"{angle_rad:.3f} rad",
-        "torque": "on" if data[at.TORQUE_ENABLE] else "off",
-        "voltage": f"{data[at.VOLTAGE] * at.VOLTS:.1f} V",
-        "heat": f"{data[at.TEMPERATURE]} °C",
+        "torque": "on" if data[registers.TORQUE_ENABLE] else "off",
+        "voltage": f"{data[registers.VOLTAGE] * registers.VOLTS:.1f} V",
+        "heat": f"{data[registers.TEMPERATURE]} °C",
     }
 
 

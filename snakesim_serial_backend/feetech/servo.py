@@ -27,4 +27,6 @@ class Servo(SerialServo[Port]):
     has_restarted: bool = False  # since its torque was switched on: it has forgotten what it was sent
 
     # What happened to it.
-    alone_s: float = 0.0  # how long it held its last goal while the driver did not run, until a reset; 0: it did not
+    unsupervised_s: float = (
+        0.0  # how long it held its last goal while the driver did not run, until a reset; 0: it did not
+    )

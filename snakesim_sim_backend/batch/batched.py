@@ -12,15 +12,15 @@ from mujoco.batch import Batch, SimulationError
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
-from snakesim_sim_backend.actuators import INPUTS
-from snakesim_sim_backend.batch.placed import TOUCH_NUMBERS, PlacedRobot, find_touches, read_rotations
+from snakesim_sim_backend.actuators import INPUTS_PER_MOTOR
+from snakesim_sim_backend.batch.placed import TOUCH_NUMBERS, PlacedRobot, find_contact_slice, view_link_rotations
 from snakesim_sim_backend.batch.simulations import (
+    NO_CONTACT_ARRAYS,
     NO_MOTORS,
-    NO_TOUCHES,
+    ContactArrays,
     Mask,
     MotorArrays,
     Simulations,
-    TouchArrays,
 )
 from snakesim_sim_backend.laws.native_laws import CONTACT_COUNT, CONTACT_NUMBERS, FOOT_NUMBERS, MEMORY_NUMBERS
 from snakesim_sim_backend.laws.version import FRICTION_INSTANCE
@@ -49,8 +49,8 @@ class BatchedSimulations(Simulations):
 
     def load(self, robot: int, placed: PlacedRobot) -> bool:
         if self._batch is None:
-            self._make_batch(placed)
-        elif not self._fits(robot, placed):
+            self._allocate_batch(placed)
+        elif not self._try_model(robot, placed):
             return False
         batch = self._require_batch()
         data = placed.data
@@ -60,18 +60,18 @@ class BatchedSimulations(Simulations):
         self._good_states[robot] = batch.state[robot]
         batch.warning[robot] = 0
         self.torque_nm[robot] = data.actuator_force[: self._joints]
-        self._start_rotations[robot] = read_rotations(placed)
+        self._start_rotations[robot] = view_link_rotations(placed)
         self._is_at_start[robot] = True
-        placed.motors.use_state(MotorArrays(self, robot))
+        placed.motors.bind_state(MotorArrays(self, robot))
         return True
 
-    def _make_batch(self, placed: PlacedRobot) -> None:
+    def _allocate_batch(self, placed: PlacedRobot) -> None:
         """Allocate the batch for all robots, with the simulation of the first robot in every row.
 
         Other robots with equal joints and sensors replace their rows later. Attributes are views of the batch's arrays.
 
         Args:
-            placed: the first robot, in its scene at the start of an episode.
+            placed: The first robot, in its scene at the start of an episode.
         """
         sim = placed.sim
         model = sim.model
@@ -91,7 +91,7 @@ class BatchedSimulations(Simulations):
         self.angle_rad = self._qpos[:, FREE_QPOS : FREE_QPOS + joints]
         self.velocity_rad_s = self._qvel[:, FREE_DOFS : FREE_DOFS + joints]
         self.motor_state = batch.bind("act")
-        self.motor_inputs = batch.bind("ctrl")[:, : INPUTS * joints]
+        self.motor_inputs = batch.bind("ctrl")[:, : INPUTS_PER_MOTOR * joints]
         self._qacc = batch.bind("qacc")
         self._all_torques_nm = batch.bind("actuator_force")
         self._rotations = batch.bind("xmat")
@@ -102,11 +102,11 @@ class BatchedSimulations(Simulations):
         # What the laws have written into the states.
         plugin_state = batch.bind("plugin_state")
         friction = model.plugin_stateadr[mujoco.mj_name2id(model, PLUGIN, FRICTION_INSTANCE)]
-        touches = find_touches(model)
+        contact_slice = find_contact_slice(model)
         self._contact_counts = plugin_state[:, friction + CONTACT_COUNT]
-        self._touch_counts = plugin_state[:, touches.start]
-        self._touches = plugin_state[:, touches.start + 1 : touches.stop]
-        self._touches = self._touches.reshape(self._count, -1, TOUCH_NUMBERS)
+        self._obstacle_contact_counts = plugin_state[:, contact_slice.start]
+        self._contact_records = plugin_state[:, contact_slice.start + 1 : contact_slice.stop]
+        self._contact_records = self._contact_records.reshape(self._count, -1, TOUCH_NUMBERS)
 
         # The last good states. Contacts come last in a state, and there is room for many more than there are.
         feet = len(sim.link_geoms) + 1
@@ -114,7 +114,7 @@ class BatchedSimulations(Simulations):
         self._numbers_before_contacts = numbers_before_plugins + friction + MEMORY_NUMBERS + FOOT_NUMBERS * feet
         self._good_states = np.empty_like(batch.state)
 
-    def _fits(self, robot: int, placed: PlacedRobot) -> bool:
+    def _try_model(self, robot: int, placed: PlacedRobot) -> bool:
         """Use the model of a robot in its row. Returns False if it has other sizes than the others."""
         sim = placed.sim
         if sim.steps_per_tick != self._steps or sim.first_link_body != self._links.start:
@@ -134,40 +134,41 @@ class BatchedSimulations(Simulations):
         return self._batch
 
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
-        """Step the physics of some robots through one control period, and restore those that diverge.
+        """Step the physics of some robots through one control period, and restore the states that diverge.
 
         Args:
-            robots: rows of the robots.
-            ticks: for every row, number of the control cycle that ends with this step, for messages.
+            robots: Rows of the robots.
+            ticks: For every row, number of the control cycle that ends with this step, for messages.
 
         Returns:
-            Why a simulation has diverged, by its row. Its state is the last good one.
+            The reason of the divergence by row, for each simulation that has diverged. The state of such a simulation
+            is its last good one.
         """
         batch = self._require_batch()
-        diverged: dict[int, str] = {}
-        ids = None if len(robots) == self._count else np.array(robots)
-        rows = slice(None) if ids is None else ids
+        divergence_reasons: dict[int, str] = {}
+        row_ids = None if len(robots) == self._count else np.array(robots)  # None means all rows
+        rows = slice(None) if row_ids is None else row_ids
         try:
-            batch.step(ids, nstep=self._steps)
+            batch.step(row_ids, nstep=self._steps)
         except SimulationError as error:
             for robot in error.ids.tolist():
-                diverged[robot] = f"MuJoCo cannot go on at tick {ticks[robot]}: {batch.error(robot)}"
+                divergence_reasons[robot] = f"MuJoCo cannot go on at tick {ticks[robot]}: {batch.error(robot)}"
         self.torque_nm[rows] = self._all_torques_nm[rows, : self._joints]
         self._is_at_start[rows] = False
-        is_good = self._find_good()
+        is_good = self._find_good_states()
         if not is_good.all():
             for robot in robots:
-                if not is_good[robot] and robot not in diverged:
-                    diverged[robot] = self._explain_divergence(robot, ticks[robot])
-        self._keep_states()
-        return diverged
+                if not is_good[robot] and robot not in divergence_reasons:
+                    divergence_reasons[robot] = self._restore_diverged_state(robot, ticks[robot])
+        self._store_states()
+        return divergence_reasons
 
-    def _keep_states(self) -> None:
+    def _store_states(self) -> None:
         """Keep the states as the last good ones, without the room for more contacts than there are."""
         width = self._numbers_before_contacts + CONTACT_NUMBERS * int(self._contact_counts.max())
         self._good_states[:, :width] = self._require_batch().state[:, :width]
 
-    def _find_good(self) -> Mask:
+    def _find_good_states(self) -> Mask:
         """Return which states are good, by the rule of `DivergenceWatch`."""
         warnings = self._require_batch().warning[:, :, 1]
         return (
@@ -177,14 +178,14 @@ class BatchedSimulations(Simulations):
             & (warnings.sum(axis=1) == 0)
         )
 
-    def _explain_divergence(self, robot: int, tick: int) -> str:
-        """Return why a simulation has diverged, and restore its last good state.
+    def _restore_diverged_state(self, robot: int, tick: int) -> str:
+        """Restore the last good state of a simulation that has diverged, and return the reason of the divergence.
 
-        The step is repeated from the last good state in a simulation of its own, as for a single robot.
+        To find the reason, the step is repeated from the last good state in a separate simulation.
 
         Args:
-            robot: row of the robot.
-            tick: number of the control cycle, for the message.
+            robot: Row of the robot.
+            tick: Number of the control cycle, for the message.
         """
         placed = self._placed[robot]
         assert placed is not None
@@ -194,7 +195,7 @@ class BatchedSimulations(Simulations):
         bad_state = batch.state[robot].copy()
         batch.state[robot] = self._good_states[robot]
         mujoco.mj_setState(model, data, batch.state[robot], COMPLETE_STATE)
-        watch = DivergenceWatch(model, data, placed.physics, self._steps)
+        watch = DivergenceWatch(model, data, placed.physics, self._steps)  # stores the good state of `data`
         mujoco.mj_setState(model, data, bad_state, COMPLETE_STATE)
         data.qacc[:] = self._qacc[robot]
         data.warning.number[:] = batch.warning[robot, :, 1]
@@ -205,15 +206,15 @@ class BatchedSimulations(Simulations):
             return str(error)
         raise AssertionError("a bad state raises")
 
-    def find_touches(self, robots: Mask) -> TouchArrays:
-        counts = np.where(robots, self._touch_counts, 0.0).astype(np.intp)
+    def find_obstacle_contacts(self, robots: Mask) -> ContactArrays:
+        counts = np.where(robots, self._obstacle_contact_counts, 0.0).astype(np.intp)
         if not counts.any():
-            return NO_TOUCHES
+            return NO_CONTACT_ARRAYS
         rows = np.repeat(np.arange(self._count), counts)
         numbers = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        touches = self._touches[rows, numbers]
-        links = touches[:, 0].astype(np.intp)
+        contacts = self._contact_records[rows, numbers]
+        links = contacts[:, 0].astype(np.intp)
         rotations = self._rotations[:, self._links][rows, links]
         if self._is_at_start.any():
             rotations = np.where(self._is_at_start[rows, None], self._start_rotations[rows, links], rotations)
-        return TouchArrays(rows, links, touches[:, 1:], rotations)
+        return ContactArrays(rows, links, contacts[:, 1:], rotations)

@@ -26,7 +26,7 @@ class HeatArrays:
         self._approach = np.zeros(shape)  # fraction of the way to the settled temperature, in a control period
         self._derate_from_c = np.ones(shape)
         self._stop_at_c = np.full(shape, 2.0)
-        self._derated = set[int]()  # robots with a hot motor when `find_changed` was called
+        self._derated = set[int]()  # robots with a hot motor when `find_robots_to_derate` was called
 
     def restart(self, robot: int, joints: Sequence[Joint]) -> None:
         """Start a robot with every winding at the ambient temperature."""
@@ -39,7 +39,7 @@ class HeatArrays:
         self.winding_c[robot] = self._ambient_c[robot]
         self._derated.discard(robot)
 
-    def pass_period(self, torque_nm: Floats) -> None:
+    def advance_period(self, torque_nm: Floats) -> None:
         """Heat and cool the windings for a control period under these torques, (robots, joints)."""
         change_c = np.square(torque_nm)
         change_c *= self._rise
@@ -48,7 +48,7 @@ class HeatArrays:
         change_c *= self._approach
         self.winding_c += change_c
 
-    def find_changed(self) -> list[int]:
+    def find_robots_to_derate(self) -> list[int]:
         """Return the robots whose motors are to be derated anew: those that are hot, or were so at the last call."""
         hot = self.winding_c > self._derate_from_c
         if not np.count_nonzero(hot) and not self._derated:

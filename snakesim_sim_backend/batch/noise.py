@@ -16,7 +16,7 @@ class NoiseStreams:
         """Make streams; `restart` gives them seeds.
 
         Args:
-            all_robots: the mask of all robots.
+            all_robots: The mask of all robots.
         """
         robots = len(all_robots)
         self._all_robots = all_robots

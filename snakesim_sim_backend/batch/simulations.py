@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
-from snakesim_native.libraries import LAWS
-from snakesim_native.load import load
-from snakesim_sim_backend.actuators import INPUTS, Motors
-from snakesim_sim_backend.batch.placed import PlacedRobot, read_rotations
+from snakesim_native.libraries import LAWS_LIBRARY
+from snakesim_native.load import load_shared_library
+from snakesim_sim_backend.actuators import INPUTS_PER_MOTOR, Motors
+from snakesim_sim_backend.batch.placed import PlacedRobot, view_link_rotations
 from snakesim_sim_backend.laws.version import choose_laws
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
 from snakesim_sim_backend.state.divergence import DivergenceWatch
@@ -25,12 +25,15 @@ def describe_loop_cost() -> str:
     """Return what it costs that simulations are stepped in a loop here; empty if they are not."""
     if choose_laws() == "c":
         return ""
-    loaded = load(LAWS)
-    return f"many environments are stepped in a loop on one thread, and {LAWS.python_cost}. Reason: {loaded.problem}"
+    loaded = load_shared_library(LAWS_LIBRARY)
+    return (
+        f"many environments are stepped in a loop on one thread, and {LAWS_LIBRARY.python_cost}. "
+        f"Reason: {loaded.problem}"
+    )
 
 
 @dataclass(frozen=True)
-class TouchArrays:
+class ContactArrays:
     """Contacts of links with obstacles, in the order of robots, and of MuJoCo within a robot."""
 
     robot: NDArray[np.intp]  # (n,), row of the robot
@@ -39,7 +42,7 @@ class TouchArrays:
     rotation: Floats  # (n, 9), world_from_link, row by row
 
 
-NO_TOUCHES = TouchArrays(np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 9)))
+NO_CONTACT_ARRAYS = ContactArrays(np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 9)))
 
 
 class Simulations(ABC):
@@ -53,7 +56,7 @@ class Simulations(ABC):
         torque_nm: (robots, joints), of the motors over the last physics step.
         motor_state: (robots, n), what the motors remember; n is 0 for motors without lag.
         motor_inputs: (robots, 3 * joints), position, velocity and feed-forward torque of each motor.
-        motors: the motors of each robot, for what happens seldom: other modes and other limits.
+        motors: The motors of each robot, for what happens seldom: other modes and other limits.
     """
 
     base_pose: Floats
@@ -67,10 +70,15 @@ class Simulations(ABC):
 
     @abstractmethod
     def load(self, robot: int, placed: PlacedRobot) -> bool:
-        """Make a placed robot the simulation of this row.
+        """Replace the simulation of a row.
+
+        Args:
+            robot: Row of the robot.
+            placed: New simulation, at the start of an episode.
 
         Returns:
-            False if it does not fit: its arrays have other sizes than those of the other rows.
+            False if the arrays of the new simulation have other sizes than those of the other rows. Then nothing is
+            changed.
         """
 
     @abstractmethod
@@ -78,15 +86,15 @@ class Simulations(ABC):
         """Step simulations through one control period.
 
         Args:
-            robots: their rows.
-            ticks: for every row, number of the control cycle, for messages.
+            robots: Rows of the robots.
+            ticks: For every row, number of the control cycle, for messages.
 
         Returns:
-            Why a simulation has diverged, by its row.
+            The reason of the divergence by row, for each simulation that has diverged.
         """
 
     @abstractmethod
-    def find_touches(self, robots: Mask) -> TouchArrays:
+    def find_obstacle_contacts(self, robots: Mask) -> ContactArrays:
         """Return the contacts of these robots with obstacles over the last physics step."""
 
 
@@ -119,7 +127,7 @@ class LoopedSimulations(Simulations):
         self.velocity_rad_s = np.zeros((robots, joints))
         self.torque_nm = np.zeros((robots, joints))
         self.motor_state = np.zeros((robots, 0))
-        self.motor_inputs = np.zeros((robots, INPUTS * joints))
+        self.motor_inputs = np.zeros((robots, INPUTS_PER_MOTOR * joints))
 
     def load(self, robot: int, placed: PlacedRobot) -> bool:
         data = placed.data
@@ -131,46 +139,47 @@ class LoopedSimulations(Simulations):
         self.motors[robot] = placed.motors
         self._watches[robot] = DivergenceWatch(placed.sim.model, data, placed.physics, placed.sim.steps_per_tick)
         if len(self._placed) == 1:
-            self._view(data)
+            self._bind_views(data)
             return True
-        placed.motors.use_state(MotorArrays(self, robot))
+        placed.motors.bind_state(MotorArrays(self, robot))
         self.motor_state[robot] = data.act
-        self._copy_from(data, robot)
+        self._copy_state(data, robot)
         return True
 
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
         """Step the physics of some robots through one control period, one after the other.
 
         Args:
-            robots: rows of the robots.
-            ticks: for every row, number of the control cycle that ends with this step, for messages.
+            robots: Rows of the robots.
+            ticks: For every row, number of the control cycle that ends with this step, for messages.
 
         Returns:
-            Why a simulation has diverged, by its row.
+            The reason of the divergence by row, for each simulation that has diverged. The state of such a simulation
+            is its last good one.
         """
-        diverged: dict[int, str] = {}
-        is_view = len(self._placed) == 1
+        divergence_reasons: dict[int, str] = {}
+        is_view = len(self._placed) == 1  # the arrays of a single robot are views of MuJoCo's: nothing is copied
         for robot in robots:
             tick = ticks[robot]
             placed = self._placed[robot]
             watch = self._watches[robot]
             assert placed is not None and watch is not None
             if not is_view:
-                placed.data.ctrl[: INPUTS * self._joints] = self.motor_inputs[robot]
+                placed.data.ctrl[: INPUTS_PER_MOTOR * self._joints] = self.motor_inputs[robot]
                 placed.data.act[:] = self.motor_state[robot]
             try:
                 placed.physics.step(placed.sim.steps_per_tick)
                 watch.check(tick)
             except mujoco.FatalError as error:
-                diverged[robot] = f"MuJoCo cannot go on at tick {tick}: {error}"
+                divergence_reasons[robot] = f"MuJoCo cannot go on at tick {tick}: {error}"
             except BackendError as error:
-                diverged[robot] = str(error)
+                divergence_reasons[robot] = str(error)
             if not is_view:
                 self.motor_state[robot] = placed.data.act
-                self._copy_from(placed.data, robot)
-        return diverged
+                self._copy_state(placed.data, robot)
+        return divergence_reasons
 
-    def find_touches(self, robots: Mask) -> TouchArrays:
+    def find_obstacle_contacts(self, robots: Mask) -> ContactArrays:
         rows: list[int] = []
         links: list[int] = []
         forces_w: list[list[float]] = []
@@ -178,17 +187,17 @@ class LoopedSimulations(Simulations):
         for robot, placed in enumerate(self._placed):
             if placed is None or not robots[robot]:
                 continue
-            for number, *force_w in placed.read_touches():
+            for number, *force_w in placed.read_obstacle_contacts():
                 link = int(number)
                 rows.append(robot)
                 links.append(link)
                 forces_w.append(force_w)
-                rotations.append(read_rotations(placed)[link].copy())
+                rotations.append(view_link_rotations(placed)[link].copy())
         if not rows:
-            return NO_TOUCHES
-        return TouchArrays(np.array(rows), np.array(links), np.array(forces_w), np.array(rotations))
+            return NO_CONTACT_ARRAYS
+        return ContactArrays(np.array(rows), np.array(links), np.array(forces_w), np.array(rotations))
 
-    def _copy_from(self, data: mujoco.MjData, robot: int) -> None:
+    def _copy_state(self, data: mujoco.MjData, robot: int) -> None:
         """Copy what a step has changed into the row of a robot."""
         joints = self._joints
         self.base_pose[robot] = data.qpos[:FREE_QPOS]
@@ -197,7 +206,7 @@ class LoopedSimulations(Simulations):
         self.velocity_rad_s[robot] = data.qvel[FREE_DOFS : FREE_DOFS + joints]
         self.torque_nm[robot] = data.actuator_force[:joints]
 
-    def _view(self, data: mujoco.MjData) -> None:
+    def _bind_views(self, data: mujoco.MjData) -> None:
         """Make the arrays of a single robot views of MuJoCo's."""
         joints = self._joints
         self.base_pose = data.qpos[None, :FREE_QPOS]
@@ -206,4 +215,4 @@ class LoopedSimulations(Simulations):
         self.velocity_rad_s = data.qvel[None, FREE_DOFS : FREE_DOFS + joints]
         self.torque_nm = data.actuator_force[None, :joints]
         self.motor_state = data.act[None, :]
-        self.motor_inputs = data.ctrl[None, : INPUTS * joints]
+        self.motor_inputs = data.ctrl[None, : INPUTS_PER_MOTOR * joints]

@@ -51,9 +51,9 @@ class Chain:
             sums[start + 3] += fx
             sums[start + 4] += fy
             sums[start + 5] += fz
-        self.push_links(np.array(sums).reshape(-1, 6).T)
+        self.add_link_wrenches(np.array(sums).reshape(-1, 6).T)
 
-    def push_links(self, wrenches: Floats) -> None:
+    def add_link_wrenches(self, wrenches: Floats) -> None:
         """Collect one wrench per link, (6, n_links)."""
         if self._wrenches is None:
             self._wrenches = wrenches

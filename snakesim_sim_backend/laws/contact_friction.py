@@ -33,8 +33,8 @@ from snakesim_sim_backend.laws.directional import (
     VISCOUS_ALONG,
     Coefficients,
     Underside,
+    apply_directional_friction,
     combine_coefficients,
-    direct_force,
 )
 from snakesim_sim_backend.laws.laws import find_normal_forces_n
 
@@ -42,7 +42,7 @@ from snakesim_sim_backend.laws.laws import find_normal_forces_n
 # kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, the contact point in the frame of the link
 # (3) and of the other body (3), the coefficients forward, backward and sideways divided by mu, and viscous friction
 # along and across the link in N·s/m.
-NUMBERS_PER_CONTACT = 22
+VALUES_PER_CONTACT = 22
 CONTACTS_PER_LINK = 16  # on average; the contacts beyond that number have no friction
 CONTACTS_PER_PAIR = 64  # of two geoms: more than MuJoCo makes, so that keys are unique
 END_MOBILITY = 4.0  # how many times as easily a rod moves at its end as in its middle
@@ -53,12 +53,12 @@ NO_TORQUE = np.zeros(3)
 NO_STRETCH = (0.0, 0.0, 0.0)
 
 
-def count_numbers(links: int) -> int:
+def count_contact_values(links: int) -> int:
     """Return how many numbers in `userdata` the contacts of a snake need."""
-    return 1 + NUMBERS_PER_CONTACT * CONTACTS_PER_LINK * links
+    return 1 + VALUES_PER_CONTACT * CONTACTS_PER_LINK * links
 
 
-class _RoughContact(NamedTuple):
+class _FrictionContact(NamedTuple):
     """A contact of the last step that has friction."""
 
     number: int  # in MuJoCo's contacts
@@ -81,10 +81,10 @@ class ContactFriction:
     On surfaces on which links slide more easily in one direction, `directional` changes F.
 
     Attributes:
-        min_friction: lowest coefficient that is used; above 0 only while a robot settles.
-        geom_pairs: geoms of all contacts of the last step, in MuJoCo's order.
-        normal_force_n: normal force of each of these contacts.
-        friction_force_w: index of a contact -> friction force on the link, in N; only contacts that have friction.
+        min_friction: Lowest coefficient that is used; above 0 only while a robot settles.
+        geom_pairs: Geoms of all contacts of the last step, in MuJoCo's order.
+        normal_force_n: Normal force of each of these contacts.
+        friction_force_w: Index of a contact -> friction force on the link, in N; only contacts that have friction.
     """
 
     def __init__(
@@ -99,12 +99,12 @@ class ContactFriction:
         """Prepare the law for a compiled model.
 
         Args:
-            model: the compiled model.
-            data: its state.
-            chain: collects the forces on the links.
-            link_geoms: numbers of the links' geoms.
-            memory: (count_numbers(n_links),), a view of `userdata`: the number of contacts, then those.
-            underside: of the links.
+            model: Compiled model.
+            data: State of the simulation.
+            chain: Links on which the friction forces act.
+            link_geoms: Numbers of the links' geoms.
+            memory: (count_contact_values(n_links),), a view of `userdata`: the number of contacts, then their values.
+            underside: Undersides of the links, for friction that depends on the direction.
         """
         step_s = float(model.opt.timestep)
         self._model = model
@@ -120,7 +120,7 @@ class ContactFriction:
         self._underside = underside
         self._link_geoms = frozenset(link_geoms)
         self._body_of_geom: list[int] = model.geom_bodyid.tolist()
-        self._mobility = [_end_mobility(mass_kg) for mass_kg in model.body_mass.tolist()]  # 1/kg
+        self._mobility = [_compute_end_mobility(mass_kg) for mass_kg in model.body_mass.tolist()]  # 1/kg
         self._stiffness_per_kg = (PHASE_RAD / step_s) * (PHASE_RAD / step_s)  # N/m for each kg
         self._damping_per_kg = 2.0 * DAMPING_RATIO * PHASE_RAD / (step_s * step_s)  # N per m in one step, for each kg
         self._damping_per_viscous = 1.0 / step_s  # 1/s
@@ -136,7 +136,7 @@ class ContactFriction:
         self.friction_force_w: dict[int, Vector] = {}
 
     def begin(self) -> None:
-        """Forget all contacts."""
+        """Remove all contacts."""
         self._memory[0] = 0.0
         self._stretch_and_force = {}
 
@@ -146,19 +146,20 @@ class ContactFriction:
         count = int(self._memory[0])
         if count == 0:
             return
-        numbers = self._memory[1 : 1 + NUMBERS_PER_CONTACT * count].tolist()
+        values = self._memory[1 : 1 + VALUES_PER_CONTACT * count].tolist()
         forces_w: list[Vector] = []
         points_w: list[Vector] = []
         link_bodies: list[int] = []
-        for start in range(0, NUMBERS_PER_CONTACT * count, NUMBERS_PER_CONTACT):
-            key, link_body, other_body, m, mu_n, nx, ny, nz, sx, sy, sz, *points = numbers[
-                start : start + NUMBERS_PER_CONTACT
+        for start in range(0, VALUES_PER_CONTACT * count, VALUES_PER_CONTACT):
+            # `remaining` has the contact point in both bodies (6 values) and the coefficients (5 values).
+            key, link_body, other_body, m, mu_n, nx, ny, nz, sx, sy, sz, *remaining = values[
+                start : start + VALUES_PER_CONTACT
             ]
             link_body = int(link_body)
             other_body = int(other_body)
-            point_w = self._to_world(link_body, *points[:3])
+            point_w = self._to_world(link_body, *remaining[:3])
             x, y, z = point_w
-            ox, oy, oz = self._to_world(other_body, *points[3:6])
+            ox, oy, oz = self._to_world(other_body, *remaining[3:6])
 
             # ds, and s + ds
             dx, dy, dz = _project_to_tangent(x - ox, y - oy, z - oz, nx, ny, nz)
@@ -167,30 +168,32 @@ class ContactFriction:
             # s = (s + ds) min(1, mu N / (k |s + ds|))
             k = self._stiffness_per_kg * m
             d = self._damping_per_kg * m
-            scale = _limit_scale(mu_n, k * math.sqrt(sx * sx + sy * sy + sz * sz))
+            scale = _compute_limit_scale(mu_n, k * math.sqrt(sx * sx + sy * sy + sz * sz))
             sx, sy, sz = scale * sx, scale * sy, scale * sz
 
             # F = -(k s + d ds), limited to mu N
             fx = k * sx + d * dx
             fy = k * sy + d * dy
             fz = k * sz + d * dz
-            scale = -_limit_scale(mu_n, math.sqrt(fx * fx + fy * fy + fz * fz))
+            scale = -_compute_limit_scale(mu_n, math.sqrt(fx * fx + fy * fy + fz * fz))
             force_w = (scale * fx, scale * fy, scale * fz)
-            coefficients = Coefficients(mu_n, *points[6:])
+            coefficients = Coefficients(mu_n, *remaining[6:])
             if coefficients.is_directional:
-                neighbor, weight = self._underside.find_neighbor(link_body, points[0])
+                neighbor, weight = self._underside.find_neighbor(link_body, remaining[0])
                 axis_w = self._underside.find_axis(link_body, neighbor, weight, (nx, ny, nz))
-                force_w = direct_force(force_w, (dx, dy, dz), axis_w, coefficients, self._damping_per_viscous)
+                force_w = apply_directional_friction(
+                    force_w, (dx, dy, dz), axis_w, coefficients, self._damping_per_viscous
+                )
 
             self._stretch_and_force[key] = (sx, sy, sz), force_w
             forces_w.append(force_w)
             points_w.append(point_w)
             link_bodies.append(link_body)
             if other_body != WORLD_BODY:
-                self._push_other_body(other_body, force_w, point_w)
+                self._apply_reaction_force(other_body, force_w, point_w)
         self._chain.push(forces_w, points_w, link_bodies)
 
-    def _push_other_body(self, body: int, force_w: Vector, point_w: Vector) -> None:
+    def _apply_reaction_force(self, body: int, force_w: Vector, point_w: Vector) -> None:
         """Apply the opposite of a link's friction force to the body that it touches."""
         passive = self._data.qfrc_passive
         mujoco.mj_applyFT(self._model, self._data, -np.array(force_w), NO_TORQUE, np.array(point_w), body, passive)
@@ -208,77 +211,83 @@ class ContactFriction:
         self.friction_force_w = {}
         self.geom_pairs = self._contact.geom.tolist()
         self.normal_force_n = find_normal_forces_n(self._data.efc_force, self._contact.efc_address)
-        rough = self._find_rough_contacts()
-        if rough:
-            self._store_contacts(rough)
+        friction_contacts = self._find_friction_contacts()
+        if friction_contacts:
+            self._write_contacts(friction_contacts)
 
-    def _find_rough_contacts(self) -> list[_RoughContact]:
-        """Return the contacts of links that press and have friction, as many as there is memory for."""
+    def _find_friction_contacts(self) -> list[_FrictionContact]:
+        """Return the contacts of links that have a normal force and friction, as many as there is memory for."""
         link_geoms = self._link_geoms
         friction = self._friction
-        rough: list[_RoughContact] = []
-        for i, (first, second) in enumerate(self.geom_pairs):
-            if first in link_geoms:
-                link, other, sign = first, second, -1.0
+        friction_contacts: list[_FrictionContact] = []
+        for i, (first_geom, second_geom) in enumerate(self.geom_pairs):
+            if first_geom in link_geoms:
+                link_geom, other_geom, sign = first_geom, second_geom, -1.0
             else:
-                link, other, sign = second, first, 1.0
-            presses = self.normal_force_n[i] > 0.0 and link in link_geoms
-            has_friction = friction[other] > 0.0 or max(self._directions[other][FORWARD:]) > 0.0
-            if presses and (has_friction or self.min_friction > 0.0):
-                rough.append(_RoughContact(i, link, other, sign))
-        capacity = (len(self._memory) - 1) // NUMBERS_PER_CONTACT
-        del rough[capacity:]
-        return rough
+                link_geom, other_geom, sign = second_geom, first_geom, 1.0
+            is_pressed = self.normal_force_n[i] > 0.0 and link_geom in link_geoms
+            has_friction = friction[other_geom] > 0.0 or max(self._directions[other_geom][FORWARD:]) > 0.0
+            if is_pressed and (has_friction or self.min_friction > 0.0):
+                friction_contacts.append(_FrictionContact(i, link_geom, other_geom, sign))
+        capacity = (len(self._memory) - 1) // VALUES_PER_CONTACT
+        del friction_contacts[capacity:]
+        return friction_contacts
 
-    def _store_contacts(self, rough: list[_RoughContact]) -> None:
-        """Write contacts into the memory. A contact that was there before keeps its stretch."""
+    def _write_contacts(self, friction_contacts: list[_FrictionContact]) -> None:
+        """Write contacts into `userdata`. A contact that existed in the last step keeps the stretch of its spring.
+
+        The layout of the values is described at VALUES_PER_CONTACT.
+        """
         frames = self._contact.frame.tolist()
         points_w = self._contact.pos.tolist()
         bodies = self._body_of_geom
         mobility = self._mobility
-        link_bodies = [bodies[contact.link_geom] for contact in rough]
-        contacts_of_pair: dict[int, int] = {}
-        numbers: list[float] = []
-        for i, link_geom, other_geom, sign in rough:
+        link_bodies = [bodies[contact.link_geom] for contact in friction_contacts]
+        last_number_of_pair: dict[int, int] = {}
+        values: list[float] = []
+        for i, link_geom, other_geom, sign in friction_contacts:
             link_body = bodies[link_geom]
             other_body = bodies[other_geom]
 
             # Contacts of one pair of geoms are distinguished by their order.
             pair = link_geom * len(bodies) + other_geom
-            nth = contacts_of_pair.get(pair, -1) + 1
-            contacts_of_pair[pair] = nth
-            key = float(CONTACTS_PER_PAIR * pair + nth)
+            number_in_pair = last_number_of_pair.get(pair, -1) + 1
+            last_number_of_pair[pair] = number_in_pair
+            key = float(CONTACTS_PER_PAIR * pair + number_in_pair)
             stretch = NO_STRETCH
-            before = self._stretch_and_force.get(key)
-            if before is not None:
-                stretch, self.friction_force_w[i] = before
+            stretch_and_force = self._stretch_and_force.get(key)
+            if stretch_and_force is not None:
+                stretch, self.friction_force_w[i] = stretch_and_force
 
-            normal_w = [sign * along for along in frames[i][:3]]  # MuJoCo's is from the first geom to the second
+            normal_w = [sign * component for component in frames[i][:3]]  # from the other body into the link
+            # All contacts of a link share its mass.
             mass_kg = 1.0 / (link_bodies.count(link_body) * (mobility[link_body] + mobility[other_body]))
             nx, ny, nz = normal_w
             link_point = self._to_body(link_body, *points_w[i])
             coefficients = self._find_coefficients(link_geom, other_geom, link_point[0], (nx, ny, nz))
             normal_force_n = self.normal_force_n[i]
             mu_n = coefficients.largest * normal_force_n
-            numbers += (key, link_body, other_body, mass_kg, mu_n, *normal_w, *stretch)
-            numbers += link_point
-            numbers += self._to_body(other_body, *points_w[i])
-            numbers += (coefficients.forward, coefficients.backward, coefficients.sideways)
-            numbers += (
+            values += (key, link_body, other_body, mass_kg, mu_n, *normal_w, *stretch)
+            values += link_point
+            values += self._to_body(other_body, *points_w[i])
+            values += (coefficients.forward, coefficients.backward, coefficients.sideways)
+            values += (
                 coefficients.viscous_along * normal_force_n,
                 coefficients.viscous_across * normal_force_n,
             )
-        self._memory[1 : 1 + len(numbers)] = numbers
-        self._memory[0] = len(rough)
+        self._memory[1 : 1 + len(values)] = values
+        self._memory[0] = len(friction_contacts)
 
     def _find_coefficients(self, link_geom: int, other_geom: int, along_m: float, normal_w: Vector) -> Coefficients:
-        """Return the coefficients of a contact.
+        """Return the friction coefficients of a contact, which depend on the side of the link and on its neighbor.
+
+        The underside of a link rubs with the coefficients of each direction, and all other sides with one coefficient.
 
         Args:
-            link_geom: of the link.
-            other_geom: what it touches.
-            along_m: distance of the contact from the link's rear joint.
-            normal_w: normal of the surface, which points into the link.
+            link_geom: Number of the link's geom.
+            other_geom: Number of the geom that the link touches.
+            along_m: Distance of the contact from the link's rear joint, in m.
+            normal_w: Unit normal of the surface, which points into the link.
         """
         friction = self._friction[other_geom]
         forward = backward = sideways = friction
@@ -316,7 +325,7 @@ class ContactFriction:
         return a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
 
 
-def _end_mobility(mass_kg: float) -> float:
+def _compute_end_mobility(mass_kg: float) -> float:
     """Return by how much a force of 1 N accelerates the end of a rod of this mass, in 1/kg; 0 for the world."""
     if mass_kg > 0.0:
         return END_MOBILITY / mass_kg
@@ -329,7 +338,7 @@ def _project_to_tangent(x: float, y: float, z: float, nx: float, ny: float, nz: 
     return x - along * nx, y - along * ny, z - along * nz
 
 
-def _limit_scale(limit: float, size: float) -> float:
+def _compute_limit_scale(limit: float, size: float) -> float:
     """Return the factor that brings a vector of this size down to the limit; 1 if it is within."""
     if size > limit:
         return limit / size

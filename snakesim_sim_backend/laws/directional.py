@@ -34,7 +34,7 @@ from snakesim_hal.wire.quantities import Vector
 # Numbers of a geom in its user data, after the mark of a foot. For a foot and a surface they are coefficients with the
 # underside of a link, and viscous ones in s/m; for a link they are factors on the coefficients of a surface.
 FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS = range(6)
-USER_NUMBERS_OF_GEOM = 6
+USER_VALUES_PER_GEOM = 6
 
 UNDERSIDE_COSINE = 0.7  # of the angle between a surface's normal and a link's z axis: within 45 degrees
 MIN_AXIS = 0.1  # length of the mean of two directions; below it the body is folded, and has none
@@ -82,7 +82,13 @@ class Underside:
     """The undersides of the links of one simulation."""
 
     def __init__(self, data: mujoco.MjData, first_body: int, lengths_m: list[float]) -> None:
-        """Prepare views. lengths_m: of the links, tail to head."""
+        """Prepare views of MuJoCo's arrays.
+
+        Args:
+            data: State of the simulation.
+            first_body: MuJoCo's number of the tail link's body.
+            lengths_m: Lengths of the links, tail to head.
+        """
         self._rotations = data.xmat  # world_from_body, row by row
         self._first_body = first_body
         self._last_body = first_body + len(lengths_m) - 1
@@ -93,7 +99,7 @@ class Underside:
 
         Args:
             body: MuJoCo's number of the link's body.
-            along_m: distance of the point from the link's rear joint.
+            along_m: Distance of the point from the link's rear joint.
 
         Returns:
             MuJoCo's number of the neighbor's body, and its weight: 0 in the middle of the link, 0.5 at a joint.
@@ -108,13 +114,13 @@ class Underside:
     def faces(self, body: int, neighbor: int, weight: float, normal_w: Vector) -> bool:
         """Return whether a surface with this normal, which points into the link, touches the underside."""
         nx, ny, nz = normal_w
-        ux, uy, uz = self._mix(body, neighbor, weight, 2)
+        ux, uy, uz = self._average_axes(body, neighbor, weight, 2)
         return ux * nx + uy * ny + uz * nz > UNDERSIDE_COSINE
 
     def find_axis(self, body: int, neighbor: int, weight: float, normal_w: Vector) -> Vector:
         """Return the direction of the underside in the plane of contact, a unit vector, or `NO_AXIS`."""
         nx, ny, nz = normal_w
-        x, y, z = self._mix(body, neighbor, weight, 0)
+        x, y, z = self._average_axes(body, neighbor, weight, 0)
         along = x * nx + y * ny + z * nz
         x, y, z = x - along * nx, y - along * ny, z - along * nz
         length = math.sqrt(x * x + y * y + z * z)
@@ -122,45 +128,49 @@ class Underside:
             return NO_AXIS
         return x / length, y / length, z / length
 
-    def _mix(self, body: int, neighbor: int, weight: float, column: int) -> Vector:
-        """Return the weighted mean of one axis of two links."""
+    def _average_axes(self, body: int, neighbor: int, weight: float, column: int) -> Vector:
+        """Return the weighted mean of one axis of two links. `column` is 0 for the x axis, and 2 for the z axis."""
         x, y, z = _read_axis(self._rotations, body, column)
         ox, oy, oz = _read_axis(self._rotations, neighbor, column)
-        own = 1.0 - weight
-        return own * x + weight * ox, own * y + weight * oy, own * z + weight * oz
+        own_weight = 1.0 - weight
+        return own_weight * x + weight * ox, own_weight * y + weight * oy, own_weight * z + weight * oz
 
 
-def direct_force(
+def apply_directional_friction(
     force_w: Vector,
     slip_w: Vector,
     axis_w: Vector,
     coefficients: Coefficients,
     damping_per_viscous: float,
 ) -> Vector:
-    """Return the friction force on a link, made from isotropic friction with the largest coefficient.
+    """Reduce an isotropic friction force along and across the link, and add viscous friction.
 
     Args:
-        force_w: isotropic friction force on the link, -u, in N.
-        slip_w: slip of the link in the last step, ds, in m.
-        axis_w: direction of the link in the plane of contact; `NO_AXIS`: sideways in all directions.
-        coefficients: of this contact.
-        damping_per_viscous: normal force divided by the time step, in N/s.
+        force_w: Isotropic friction force on the link with the largest coefficient, -u, in N.
+        slip_w: Slip of the link in the last step, ds, in m.
+        axis_w: Direction of the link in the plane of contact. `NO_AXIS` applies the sideways coefficient in all
+            directions.
+        coefficients: Friction coefficients of this contact.
+        damping_per_viscous: Normal force divided by the time step, in N/s.
+
+    Returns:
+        The friction force on the link in N, in the world frame.
     """
     ax, ay, az = axis_w
     fx, fy, fz = force_w
     sx, sy, sz = slip_w
-    along = fx * ax + fy * ay + fz * az
+    force_along = fx * ax + fy * ay + fz * az
     slip_along = sx * ax + sy * ay + sz * az
     # A force that points backward brakes a link that slides forward.
-    ratio = coefficients.forward if along < 0.0 else coefficients.backward
+    ratio = coefficients.forward if force_along < 0.0 else coefficients.backward
     sideways = coefficients.sideways
     damping_along = damping_per_viscous * coefficients.viscous_along
     damping_across = damping_per_viscous * coefficients.viscous_across
-    result_along = ratio * along - damping_along * slip_along
+    result_along = ratio * force_along - damping_along * slip_along
     return (
-        result_along * ax + sideways * (fx - along * ax) - damping_across * (sx - slip_along * ax),
-        result_along * ay + sideways * (fy - along * ay) - damping_across * (sy - slip_along * ay),
-        result_along * az + sideways * (fz - along * az) - damping_across * (sz - slip_along * az),
+        result_along * ax + sideways * (fx - force_along * ax) - damping_across * (sx - slip_along * ax),
+        result_along * ay + sideways * (fy - force_along * ay) - damping_across * (sy - slip_along * ay),
+        result_along * az + sideways * (fz - force_along * az) - damping_across * (sz - slip_along * az),
     )
 
 

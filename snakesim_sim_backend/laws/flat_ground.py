@@ -32,14 +32,14 @@ from snakesim_sim_backend.laws.directional import (
     VISCOUS_ALONG,
     Coefficients,
     Underside,
+    apply_directional_friction,
     combine_coefficients,
-    direct_force,
 )
 
 SINK_M = 2e-4  # how deep a foot sinks in under its share of the weight
 MAX_PHASE_RAD = 0.7  # the normal spring vibrates by at most this in one step; long steps get softer ground
 DAMPING_RATIO = 0.5  # of critical damping
-NUMBERS_PER_FOOT = 5  # in `userdata`: two of its slip, three of its position
+VALUES_PER_FOOT = 5  # in `userdata`: two of its slip, three of its position
 FOOT = 1.0  # first number of a geom's user data, if the geom is a foot that flat ground carries
 UP = (0.0, 0.0, 1.0)  # normal of the ground
 MIN_DIVISOR = 1e-12  # keeps 0 / 0 out of the friction of a foot without load
@@ -93,19 +93,27 @@ class FlatGround:
     first foot, then of the next: viewed as complex numbers, each foot has one number, whose absolute value is a length.
 
     Attributes:
-        min_friction: lowest coefficient that is used; above 0 only while a robot settles.
+        min_friction: Lowest coefficient that is used; above 0 only while a robot settles.
         normal_force_n: (n_feet,), normal force on each foot in the last step.
     """
 
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, feet: Feet, underside: Underside
     ) -> None:
-        """Prepare the law for a compiled model, its feet and the undersides of its links."""
+        """Prepare the law for a compiled model: compute stiffness and damping, and allocate all buffers.
+
+        Args:
+            model: Compiled model.
+            data: State of the simulation.
+            chain: Links on which the forces of the ground act.
+            feet: Feet of the model.
+            underside: Undersides of the links, for friction that depends on the direction.
+        """
         count = len(feet.geoms)
         gravity = -float(model.opt.gravity[2])
         step_s = float(model.opt.timestep)
-        slow = step_s / MAX_PHASE_RAD
-        sink_m = max(SINK_M, gravity * (slow * slow))
+        min_time_constant_s = step_s / MAX_PHASE_RAD  # of the normal spring
+        sink_m = max(SINK_M, gravity * (min_time_constant_s * min_time_constant_s))
         stiffness = feet.carried_kg * gravity / sink_m  # N/m
         damping = 2.0 * DAMPING_RATIO * feet.carried_kg * math.sqrt(gravity / sink_m) / step_s  # N per m in one step
         self._chain = chain
@@ -128,41 +136,53 @@ class FlatGround:
         self._zeros = np.full(count, 0.0)
         self._min_divisor = np.full(count, MIN_DIVISOR)
 
-        self._find_inputs(data, feet)
-        self._allocate(count)
+        self._bind_mujoco_arrays(data, feet)
+        self._allocate_buffers(count)
 
-    def _find_inputs(self, data: mujoco.MjData, feet: Feet) -> None:
-        """Make the views of MuJoCo's arrays that a step reads, and the indices of the feet in them."""
-        first = feet.first_body
+    def _bind_mujoco_arrays(self, data: mujoco.MjData, feet: Feet) -> None:
+        """Create the views of MuJoCo's arrays that a step reads, and find the indices of the feet in them."""
+        first_body = feet.first_body
         count = len(feet.geoms)
-        both = 2 * count
-        bodies = np.minimum(np.arange(count) + first, first + count - 2)  # the head's link has two feet
+        xy_count = 2 * count
+        # Foot i belongs to link i; only the last foot belongs to the head link, too, which has two feet.
+        bodies = np.minimum(np.arange(count) + first_body, first_body + count - 2)
         self._bodies: list[int] = bodies.tolist()
-        # A foot at a joint has as much of the link behind as of its own.
-        self._neighbors = [(first, 0.0), *((body - 1, 0.5) for body in self._bodies[1:-1]), (self._bodies[-1], 0.0)]
-        xy = np.add.outer(3 * feet.geoms, [0, 1]).ravel()
-        z = 3 * feet.geoms + 2
+        # Neighbor link and its weight: a foot at a joint belongs equally to the link behind, one at an end to no other.
+        self._neighbors = [
+            (first_body, 0.0),
+            *((body - 1, 0.5) for body in self._bodies[1:-1]),
+            (self._bodies[-1], 0.0),
+        ]
+        xy_indices = np.add.outer(3 * feet.geoms, [0, 1]).ravel()
+        z_indices = 3 * feet.geoms + 2
         self._positions = data.geom_xpos.reshape(-1)
-        self._position_indices = np.concatenate((xy, z))
+        self._position_indices = np.concatenate((xy_indices, z_indices))
         self._twists = data.cvel.reshape(-1)  # per body: angular velocity, then linear velocity
         self._angular_yx_indices = np.add.outer(6 * bodies, [1, 0]).ravel()
-        self._reference_xy = data.subtree_com[first, :2, None]  # the point about which MuJoCo takes moments
-        self._reference_z = data.subtree_com[first, 2:]
-        self._stretch_xy = data.userdata[:both]
+        # The point about which MuJoCo takes moments.
+        self._reference_xy = data.subtree_com[first_body, :2, None]
+        self._reference_z = data.subtree_com[first_body, 2:]
+        self._stretch_xy = data.userdata[:xy_count]
         self._stretch = self._stretch_xy.view(np.complex128)
-        self._last_position = data.userdata[both : NUMBERS_PER_FOOT * count]
+        self._last_position = data.userdata[xy_count : VALUES_PER_FOOT * count]
 
-    def _allocate(self, count: int) -> None:
-        """Allocate the arrays that every step reuses. Positions are x and y of all feet, then z of all feet."""
-        both = 2 * count
+    def _allocate_buffers(self, count: int) -> None:
+        """Allocate the arrays that every step reuses.
+
+        Positions and motions have x and y of all feet, then z of all feet.
+
+        Args:
+            count: Number of feet.
+        """
+        xy_count = 2 * count
         self._position = np.empty(3 * count)
-        self._height = self._position[both:]
-        self._position_by_axis = self._position[:both].reshape(count, 2).T
+        self._height = self._position[xy_count:]
+        self._position_by_axis = self._position[:xy_count].reshape(count, 2).T
         self._motion = np.empty(3 * count)
-        self._motion_xy = self._motion[:both]
-        self._rise = self._motion[both:]
-        self._slip_xy = np.empty(both)
-        self._pull_xy = np.empty(both)
+        self._motion_xy = self._motion[:xy_count]
+        self._rise = self._motion[xy_count:]
+        self._slip_xy = np.empty(xy_count)
+        self._pull_xy = np.empty(xy_count)
         self._pull = self._pull_xy.view(np.complex128)
         self._pull_by_axis = self._pull_xy.reshape(count, 2).T
         # The cyclic order x, y, z, x, y makes each cross product two multiplications of whole blocks of rows.
@@ -173,7 +193,7 @@ class FlatGround:
         self._wrenches = rows[:6]
 
     def begin(self) -> None:
-        """Take the feet as sticking where they are now, without stretch."""
+        """Let all feet stick where they are now, without stretch of their springs."""
         self._stretch_xy[:] = 0.0
         self._last_position[:] = self._positions[self._position_indices]
 
@@ -219,10 +239,10 @@ class FlatGround:
         forces = self._forces
         np.multiply(self._pull_by_axis, max_friction_n / np.maximum(np.abs(self._pull), divisor), forces[:2])
         if self._is_directional:
-            self._direct_forces(coefficients, slips)
+            self._apply_directional_friction(coefficients, slips)
         forces[2] = self.normal_force_n
         forces[3:] = forces[:2]
-        self._push_links()
+        self._add_link_wrenches()
 
     def _find_coefficients(self, foot: int) -> Coefficients:
         """Return the coefficients of a foot, by how its links lie on the ground now."""
@@ -241,7 +261,7 @@ class FlatGround:
             self.min_friction,
         )
 
-    def _direct_forces(self, coefficients: list[Coefficients], slips: list[list[float]]) -> None:
+    def _apply_directional_friction(self, coefficients: list[Coefficients], slips: list[list[float]]) -> None:
         """Change the friction forces of the feet by the direction in which they slide."""
         for foot, of_foot in enumerate(coefficients):
             if of_foot.is_directional:
@@ -250,12 +270,12 @@ class FlatGround:
                 force_x, force_y = self._forces[:2, foot].tolist()
                 slip_x, slip_y = slips[foot]
                 damping_per_viscous = float(self.normal_force_n[foot]) / self._step_s
-                force_x, force_y, _ = direct_force(
+                force_x, force_y, _ = apply_directional_friction(
                     (force_x, force_y, 0.0), (slip_x, slip_y, 0.0), axis_w, of_foot, damping_per_viscous
                 )
                 self._forces[:2, foot] = force_x, force_y
 
-    def _push_links(self) -> None:
+    def _add_link_wrenches(self) -> None:
         """Add the forces, and their moments about MuJoCo's reference point, to the links of the chain."""
         arms = self._arms
         moments = self._moments
@@ -267,4 +287,4 @@ class FlatGround:
         np.multiply(arms[1:4], self._forces[2:], moments)
         moments -= arms[2:] * self._forces[1:4]
         self._wrenches[:, -2] += self._wrenches[:, -1]  # both feet of the head's link
-        self._chain.push_links(self._wrenches[:, :-1])
+        self._chain.add_link_wrenches(self._wrenches[:, :-1])

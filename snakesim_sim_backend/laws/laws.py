@@ -54,7 +54,7 @@ class Laws(ABC):
     """Computes ground, friction and yielding obstacles of one simulation.
 
     Attributes:
-        contacts: forces of the contacts that MuJoCo finds.
+        contacts: Forces of the contacts that MuJoCo finds.
     """
 
     contacts: ContactForces
@@ -69,7 +69,7 @@ class Laws(ABC):
         """Use at least this friction coefficient in every contact."""
 
     @abstractmethod
-    def begin(self) -> None:
+    def reset(self) -> None:
         """Take the feet as sticking where they are in the next `forward`, and forget all contacts."""
 
     @abstractmethod
@@ -77,7 +77,7 @@ class Laws(ABC):
         """Compute all quantities of the present state, and remember the contacts."""
 
     @abstractmethod
-    def measure_force(self) -> MeasuredContactForce:
+    def start_force_measurement(self) -> MeasuredContactForce:
         """Begin to measure the force between links and obstacles in every step. Earlier steps are forgotten."""
 
     @abstractmethod
@@ -85,5 +85,5 @@ class Laws(ABC):
         """Make physics steps.
 
         Args:
-            count: how many.
+            count: Number of physics steps.
         """

@@ -30,7 +30,7 @@ FOOT_NORMAL_FORCE = 5
 FOOT_NUMBERS = 6
 # Then for each contact with friction.
 CONTACT_FORCE = slice(17, 20)
-CONTACT_NUMBER = 20
+CONTACT_INDEX = 20
 CONTACT_IS_NEW = 21
 CONTACT_NUMBERS = 27
 # Numbers in the memory of the measured force.
@@ -44,8 +44,8 @@ class NativeContacts:
         """Prepare views.
 
         Args:
-            data: the simulation's data.
-            memory: the memory of the plugin instance.
+            data: The simulation's data.
+            memory: The memory of the plugin instance.
             records: (capacity, CONTACT_NUMBERS), the part of it with contacts.
         """
         self._data = data
@@ -72,9 +72,7 @@ class NativeContacts:
             return {}
         records = self._records[:count].tolist()
         return {
-            int(record[CONTACT_NUMBER]): tuple(record[CONTACT_FORCE])
-            for record in records
-            if not record[CONTACT_IS_NEW]
+            int(record[CONTACT_INDEX]): tuple(record[CONTACT_FORCE]) for record in records if not record[CONTACT_IS_NEW]
         }
 
 
@@ -85,7 +83,7 @@ class NativeMeasuredForce:
         """Begin to measure.
 
         Args:
-            memory: the memory of the plugin instance.
+            memory: The memory of the plugin instance.
         """
         self._memory = memory
         self._memory[:] = 0.0
@@ -124,7 +122,7 @@ class NativeLaws(Laws):
     def set_min_friction(self, min_friction: float) -> None:
         self._memory[MIN_FRICTION] = min_friction
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         self._memory[PLACED] = 0.0
         self._memory[CONTACT_COUNT] = 0.0
 
@@ -132,7 +130,7 @@ class NativeLaws(Laws):
         mujoco.mj_forward(self._model, self._data)
         self._advance(self._model._address, self._data._address)
 
-    def measure_force(self) -> NativeMeasuredForce:
+    def start_force_measurement(self) -> NativeMeasuredForce:
         return NativeMeasuredForce(self._view_memory(MEASURED_FORCE_INSTANCE))
 
     def step(self, count: int) -> None:
@@ -142,7 +140,7 @@ class NativeLaws(Laws):
         """Return a view of the memory of a plugin instance.
 
         Raises:
-            ValueError: the model was built without the instance.
+            ValueError: The model was built without the instance.
         """
         instance = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_PLUGIN, instance_name)
         if instance < 0:

@@ -7,32 +7,37 @@ import mujoco
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_sim_backend.laws.chain import Chain
-from snakesim_sim_backend.laws.contact_friction import ContactFriction, count_numbers
+from snakesim_sim_backend.laws.contact_friction import ContactFriction, count_contact_values
 from snakesim_sim_backend.laws.directional import Underside
-from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT, FlatGround
+from snakesim_sim_backend.laws.flat_ground import VALUES_PER_FOOT, FlatGround
 from snakesim_sim_backend.laws.laws import Laws
 from snakesim_sim_backend.laws.yielding import Yielding
 from snakesim_sim_backend.model.build import SimModel
-from snakesim_sim_backend.state.contacts import TouchReader
+from snakesim_sim_backend.state.contacts import ObstacleContactReader
 
-AFTER_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
+VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class PythonLaws(Laws):
     """Computes the forces in Python, in every physics step."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
-        """Prepare the laws of a simulation."""
+        """Prepare the laws of a simulation whose model was built for the Python version.
+
+        Args:
+            sim: Compiled model.
+            data: State of the simulation.
+        """
         model = sim.model
-        links = len(sim.link_geoms)
+        link_count = len(sim.link_geoms)
         self._model = model
         self._data = data
-        chain = Chain(data, sim.first_link_body, links)
+        chain = Chain(data, sim.first_link_body, link_count)
         half_lengths_m = model.geom_size[sim.link_geoms, 1]
         underside = Underside(data, sim.first_link_body, (2.0 * half_lengths_m).tolist())
 
-        start = NUMBERS_PER_FOOT * (links + 1)
-        memory = data.userdata[start : start + count_numbers(links)]
+        contacts_start = VALUES_PER_FOOT * (link_count + 1)  # the values of the feet come first in `userdata`
+        memory = data.userdata[contacts_start : contacts_start + count_contact_values(link_count)]
         self._friction = ContactFriction(model, data, chain, sim.link_geoms, memory, underside)
         self.contacts = self._friction
         self._force_laws: list[Callable[[], None]] = [self._friction.apply]
@@ -43,10 +48,10 @@ class PythonLaws(Laws):
             self._force_laws.append(self._ground.apply)
         if sim.yielding:
             self._force_laws.append(Yielding(model, data, len(sim.yielding)).apply)
-        self._force_laws.append(chain.apply)  # last: it adds what the others have collected
+        self._force_laws.append(chain.apply)  # last, because it applies the forces that the other laws have collected
 
-        self._touches = TouchReader(sim, data, self.contacts)
-        self._measured_force: MeasuredForce | None = None  # None: nothing measures it
+        self._contact_reader = ObstacleContactReader(sim, data, self.contacts)
+        self._measured_force: MeasuredForce | None = None  # None until the measurement is started
 
     @property
     def foot_forces_n(self) -> Floats | None:
@@ -59,7 +64,7 @@ class PythonLaws(Laws):
         if self._ground is not None:
             self._ground.min_friction = min_friction
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         if self._ground is not None:
             mujoco.mj_kinematics(self._model, self._data)
             self._ground.begin()
@@ -69,10 +74,10 @@ class PythonLaws(Laws):
         mujoco.mj_forward(self._model, self._data)
         for apply in self._force_laws:
             apply()
-        mujoco.mj_forwardSkip(self._model, self._data, AFTER_VELOCITIES, 0)
+        mujoco.mj_forwardSkip(self._model, self._data, VELOCITY_STAGE, 0)
         self._friction.update_contacts()
 
-    def measure_force(self) -> MeasuredForce:
+    def start_force_measurement(self) -> MeasuredForce:
         self._measured_force = MeasuredForce(self._model.opt.timestep)
         return self._measured_force
 
@@ -84,4 +89,4 @@ class PythonLaws(Laws):
             mujoco.mj_step2(self._model, self._data)
             self._friction.update_contacts()
             if self._measured_force is not None:
-                self._measured_force.add(self._touches.sum_forces_n())
+                self._measured_force.add_sample(self._contact_reader.sum_forces_n())

@@ -9,12 +9,12 @@ from typing import Literal
 
 import mujoco
 
-from snakesim_native.libraries import LAWS
-from snakesim_native.load import load
-from snakesim_sim_backend.laws.contact_friction import count_numbers
-from snakesim_sim_backend.laws.directional import USER_NUMBERS_OF_GEOM
-from snakesim_sim_backend.laws.flat_ground import NUMBERS_PER_FOOT
-from snakesim_sim_backend.laws.yielding import DOFS, SPRING_NUMBERS
+from snakesim_native.libraries import LAWS_LIBRARY
+from snakesim_native.load import load_shared_library
+from snakesim_sim_backend.laws.contact_friction import count_contact_values
+from snakesim_sim_backend.laws.directional import USER_VALUES_PER_GEOM
+from snakesim_sim_backend.laws.flat_ground import VALUES_PER_FOOT
+from snakesim_sim_backend.laws.yielding import DOFS, VALUES_PER_SPRING
 
 LawsVersion = Literal["c", "python"]
 
@@ -30,7 +30,7 @@ MEASURED_FORCE_INSTANCE = "measured_force"
 
 def choose_laws() -> LawsVersion:
     """Return the version that this process uses: the C version, if it can be loaded."""
-    if load(LAWS).handle is None:
+    if load_shared_library(LAWS_LIBRARY).library is None:
         return "python"
     return "c"
 
@@ -39,12 +39,12 @@ def load_library() -> ctypes.CDLL:
     """Return the library with the C version, whose plugins MuJoCo knows from then on.
 
     Raises:
-        RuntimeError: it cannot be loaded.
+        RuntimeError: The library cannot be loaded.
     """
-    loaded = load(LAWS)
-    if loaded.handle is None:
+    loaded = load_shared_library(LAWS_LIBRARY)
+    if loaded.library is None:
         raise RuntimeError(f"the C version of the laws cannot be loaded: {loaded.problem}")
-    return loaded.handle
+    return loaded.library
 
 
 def add_laws(
@@ -59,18 +59,18 @@ def add_laws(
     """Add the laws' parameters and memory to a model that is otherwise complete.
 
     Args:
-        spec: the model.
-        laws: which version computes the forces.
-        links: number of links.
-        yielding_bodies: names of the bodies of obstacles that yield.
-        keeps_touches: whether the C version writes the forces between links and obstacles into the state.
-        measures_force: whether `Laws.measure_force` is possible.
+        spec: Model, which is changed.
+        laws: Version of the laws that computes the forces.
+        links: Number of links.
+        yielding_bodies: Names of the bodies of obstacles that yield.
+        keeps_touches: Whether the C version writes the forces between links and obstacles into MuJoCo's state.
+        measures_force: Whether the force between links and obstacles can be measured.
     """
-    spec.nuser_geom = USER_NUMBERS_OF_GEOM
-    spec.nuser_body = SPRING_NUMBERS
+    spec.nuser_geom = USER_VALUES_PER_GEOM
+    spec.nuser_body = VALUES_PER_SPRING
     match laws:
         case "python":
-            spec.nuserdata = NUMBERS_PER_FOOT * (links + 1) + count_numbers(links) + DOFS * len(yielding_bodies)
+            spec.nuserdata = VALUES_PER_FOOT * (links + 1) + count_contact_values(links) + DOFS * len(yielding_bodies)
         case "c":
             load_library()
             _add_plugin(spec, FRICTION_PLUGIN, FRICTION_INSTANCE, ["link_0"])

@@ -18,17 +18,17 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.placement import Placed
+from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_sim_backend.laws.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
 
-JOINT_OF_AXIS = {
+JOINT_TYPE_BY_AXIS = {
     "x": mujoco.mjtJoint.mjJNT_SLIDE,
     "y": mujoco.mjtJoint.mjJNT_SLIDE,
     "z": mujoco.mjtJoint.mjJNT_HINGE,
 }
-DOFS = len(JOINT_OF_AXIS)  # degrees of freedom of one obstacle, and its numbers in `userdata`
-SPRING_NUMBERS = 4  # parameters of one obstacle's spring, in the user data of its body
+DOFS = len(JOINT_TYPE_BY_AXIS)  # degrees of freedom of one obstacle, and its numbers in `userdata`
+VALUES_PER_SPRING = 4  # parameters of one obstacle's spring, in the user data of its body
 RIGID_STRETCH_M = 1e-4  # how far a rigid one moves under as much force as friction holds
 WOOD_KG_M3 = 500.0  # density of an obstacle whose mass is not given
 MAX_OBSTACLES = 128  # the solver works on all their degrees of freedom together with the snake's
@@ -47,7 +47,7 @@ def measure_foot(obstacle: Obstacle) -> tuple[float, float]:
     return length * width, float(distances_m.mean())
 
 
-def compute_mass_kg(placed: Placed) -> float:
+def compute_mass_kg(placed: PlacedObstacle) -> float:
     """Return the mass of an obstacle that yields: the given one, or that of wood."""
     if placed.mass_kg is not None:
         return placed.mass_kg
@@ -55,16 +55,21 @@ def compute_mass_kg(placed: Placed) -> float:
     return WOOD_KG_M3 * area_m2 * placed.obstacle.height_m
 
 
-def max_stiffness_n_per_m(placed: Placed, step_s: float) -> float:
+def compute_max_stiffness_n_per_m(placed: PlacedObstacle, step_s: float) -> float:
     """Return the stiffness of the stiffest spring that physics steps of this length can follow."""
     return compute_mass_kg(placed) * (MAX_PHASE_RAD / step_s) ** 2
 
 
-def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
-    """Check that the springs of these obstacles can be computed.
+def validate_yielding_obstacles(placed: Sequence[PlacedObstacle], scene: str, step_s: float) -> None:
+    """Check that the springs of obstacles that yield can be simulated.
+
+    Args:
+        placed: Obstacles that yield.
+        scene: Name of the scene, for messages.
+        step_s: Duration of a physics step in s.
 
     Raises:
-        ConfigError: there are too many of them, or a spring is too stiff for its mass and the physics step.
+        ConfigError: Too many obstacles yield, or a spring is too stiff for its mass and the physics step.
     """
     if len(placed) > MAX_OBSTACLES:
         raise ConfigError(
@@ -73,7 +78,7 @@ def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
             code="scene/invalid",
         )
     for item in placed:
-        max_stiffness = max_stiffness_n_per_m(item, step_s)
+        max_stiffness = compute_max_stiffness_n_per_m(item, step_s)
         if item.stiffness_n_per_m is not None and item.stiffness_n_per_m > max_stiffness:
             raise ConfigError(
                 f"scene {scene!r}: obstacle {item.obstacle.name!r}: `stiffness_n_per_m` = {item.stiffness_n_per_m:g} "
@@ -84,16 +89,16 @@ def check_yielding(placed: Sequence[Placed], scene: str, step_s: float) -> None:
             )
 
 
-def compute_spring(placed: Placed, step_s: float) -> list[float]:
+def compute_spring(placed: PlacedObstacle, step_s: float) -> list[float]:
     """Return the parameters of an obstacle's spring, which are the user data of its body.
 
     Returns:
         Stiffness in N/m, damping in N·s/m, largest force in N, and mean radius of the foot in m.
     """
     mass_kg = compute_mass_kg(placed)
-    max_force_n = _friction_n(placed)
+    max_force_n = _compute_max_friction_n(placed)
     # A rigid obstacle is as stiff as needed to hardly move, or as the physics step allows.
-    stiffness = min(max_stiffness_n_per_m(placed, step_s), max_force_n / RIGID_STRETCH_M)
+    stiffness = min(compute_max_stiffness_n_per_m(placed, step_s), max_force_n / RIGID_STRETCH_M)
     if placed.stiffness_n_per_m is not None:
         stiffness = placed.stiffness_n_per_m
     damping = 2.0 * DAMPING_RATIO * math.sqrt(stiffness * mass_kg)
@@ -144,8 +149,8 @@ class Yielding:
         self._passive_forces -= lengths * force * scale[:, None]
 
 
-def _friction_n(placed: Placed) -> float:
+def _compute_max_friction_n(placed: PlacedObstacle) -> float:
     """Return the force above which an obstacle slides on the ground."""
-    if placed.slides_at_n is None:
+    if placed.sliding_force_n is None:
         return UNLIMITED_N
-    return placed.slides_at_n
+    return placed.sliding_force_n

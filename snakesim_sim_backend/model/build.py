@@ -16,21 +16,21 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.links import Link
-from snakesim_hal.model.placement import Placed
+from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
-from snakesim_hal.physics.motor import check_gains
+from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
 from snakesim_sim_backend.laws.chain import FREE_DOFS
 from snakesim_sim_backend.laws.flat_ground import FOOT, Feet, find_feet
 from snakesim_sim_backend.laws.version import LawsVersion, add_laws, choose_laws
-from snakesim_sim_backend.laws.yielding import check_yielding
+from snakesim_sim_backend.laws.yielding import validate_yielding_obstacles
 from snakesim_sim_backend.model.friction import set_friction
 from snakesim_sim_backend.model.ground import add_ground
 from snakesim_sim_backend.model.imu import add_imus
-from snakesim_sim_backend.model.obstacles import OBSTACLE, add_obstacle, geom_name
-from snakesim_sim_backend.model.surface import ContactParameters, contact_parameters
+from snakesim_sim_backend.model.obstacles import OBSTACLE, add_obstacle, make_geom_name
+from snakesim_sim_backend.model.surface import ContactParameters, make_contact_parameters
 from snakesim_sim_backend.model.tether import add_tether
 from snakesim_sim_backend.settings import SimSettings
 
@@ -54,7 +54,7 @@ class SimModel:
     feet: Feet | None  # None: the ground is not flat, and MuJoCo finds the contacts with it
     link_geoms: list[int]  # (n_links,), tail to head
     suspended: bool  # the tail link is clamped
-    yielding: list[Placed]  # obstacles that move when they are pushed; their bodies come after the robot's
+    yielding: list[PlacedObstacle]  # obstacles that move when they are pushed; their bodies come after the robot's
     laws: LawsVersion  # which version of the laws the model is made for
 
 
@@ -64,68 +64,73 @@ class Blueprint:
 
     spec: mujoco.MjSpec
     steps_per_tick: int
-    yielding: list[Placed]  # obstacles that move when they are pushed
+    yielding: list[PlacedObstacle]  # obstacles that move when they are pushed
     laws: LawsVersion
 
 
-def of_joints(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
+def view_joint_states(data: mujoco.MjData, count: int) -> tuple[Floats, Floats]:
     """Return views of the joints' angles in rad and velocities in rad/s, (count,) each, tail to head."""
     angles_rad = data.qpos[FREE_QPOS : FREE_QPOS + count]
     velocities_rad_s = data.qvel[FREE_DOFS : FREE_DOFS + count]
     return angles_rad, velocities_rad_s
 
 
-def build(
+def build_sim_model(
     config: RunConfig,
     settings: SimSettings,
     *,
     motors: bool = True,
     laws: LawsVersion | None = None,
-    keeps_touches: bool = False,
+    stores_contacts_in_state: bool = False,
     measures_force: bool = False,
 ) -> SimModel:
     """Compile the MuJoCo model of a run: robot, obstacles, ground, motors, sensors and friction.
 
     Args:
-        config: the run, with its robot and its scene.
-        settings: parameters of the physics.
-        motors: False leaves the motors out. The joints are then hinges with the inertia and the friction of the motors'
-            rotors, for torques that are applied from outside.
-        laws: which version of the laws computes ground and friction; None: the C version, if it can be loaded.
-        keeps_touches: whether the C version writes the forces between links and obstacles into MuJoCo's state, for
-            programs that see only the state.
-        measures_force: whether the simulation has a contact sensor, which `Physics.measure_force` is for.
+        config: Configuration of the run, with its robot and its scene.
+        settings: Parameters of the physics.
+        motors: Whether the joints have motors. Otherwise they are hinges with the inertia and the friction of the
+            motors' rotors, for torques that are applied from outside.
+        laws: Version of the laws that computes ground and friction. None for the C version if it can be loaded.
+        stores_contacts_in_state: Whether the C version writes the forces between links and obstacles into
+            MuJoCo's state, for programs that see only the state.
+        measures_force: Whether the simulation has a contact sensor, which `Physics.measure_force` is for.
 
     Returns:
         The model, with the indices by which other modules find links, feet and obstacles in it.
 
     Raises:
-        ConfigError: the settings do not match the robot or the scene, or MuJoCo cannot build the model.
+        ConfigError: The settings do not match the robot or the scene, or MuJoCo cannot build the model.
     """
     laws = laws or choose_laws()
-    blueprint = make_blueprint(
-        config, settings, motors=motors, laws=laws, keeps_touches=keeps_touches, measures_force=measures_force
+    blueprint = assemble_model_blueprint(
+        config,
+        settings,
+        motors=motors,
+        laws=laws,
+        keeps_touches=stores_contacts_in_state,
+        measures_force=measures_force,
     )
     model = _compile(blueprint.spec, config.robot.name)
-    links = config.robot.chain.modules + 1
+    link_count = config.robot.chain.modules + 1
     first_link_body = model.body("link_0").id
     feet = None
     if config.scene.ground.heightfield is None:
-        feet = find_feet(model, first_link_body, links, config.robot.module.radius_m)
+        feet = find_feet(model, first_link_body, link_count, config.robot.module.radius_m)
     return SimModel(
         model=model,
         steps_per_tick=blueprint.steps_per_tick,
         first_link_body=first_link_body,
-        obstacle_of_geom=[_obstacle_name(model.geom(i).name) for i in range(model.ngeom)],
+        obstacle_of_geom=[_parse_obstacle_name(model.geom(i).name) for i in range(model.ngeom)],
         feet=feet,
-        link_geoms=[model.geom(f"link_{i}").id for i in range(links)],
+        link_geoms=[model.geom(f"link_{i}").id for i in range(link_count)],
         suspended=settings.suspended,
         yielding=blueprint.yielding,
         laws=blueprint.laws,
     )
 
 
-def make_blueprint(
+def assemble_model_blueprint(
     config: RunConfig,
     settings: SimSettings,
     *,
@@ -137,40 +142,41 @@ def make_blueprint(
     """Assemble the model of a run before it is compiled: bodies, geoms, motors, and the friction of each geom.
 
     Args:
-        config: the run, with its robot and its scene.
-        settings: parameters of the physics.
-        motors: whether the joints have motors.
-        laws: which version of the laws computes ground and friction.
-        keeps_touches: whether the laws write the forces between links and obstacles into MuJoCo's state.
+        config: Configuration of the run, with its robot and its scene.
+        settings: Parameters of the physics.
+        motors: Whether the joints have motors.
+        laws: Version of the laws that computes ground and friction.
+        keeps_touches: Whether the laws write the forces between links and obstacles into MuJoCo's state.
 
     Returns:
-        The specification, with the number of physics steps in a control period and the obstacles that yield.
+        The model before it is compiled, with the number of physics steps in a control period and the obstacles that
+        yield.
 
     Raises:
-        ConfigError: the settings do not match the robot or the scene.
+        ConfigError: The settings do not match the robot or the scene.
     """
     steps_per_tick = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
     step_s = config.period_ns * 1e-9 / steps_per_tick
     _check_contact_time(settings, step_s)
     placed = place_obstacles(config)
-    yielding = [item for item in placed if item.yields]
-    check_yielding(yielding, config.scene.name, step_s)
+    yielding = [item for item in placed if item.can_move]
+    validate_yielding_obstacles(yielding, config.scene.name, step_s)
 
     # The order decides the numbers of bodies: fixed obstacles, the robot, obstacles that yield.
     spec = mujoco.MjSpec()
     _set_options(spec, step_s)
-    contact = contact_parameters(settings)
+    contact = make_contact_parameters(settings)
     rough_ground_geoms = add_ground(spec, config.scene.ground, contact)
-    fixed = [item for item in placed if not item.yields]
+    fixed = [item for item in placed if not item.can_move]
     _add_obstacles(spec, fixed, config, contact, collide=bool(yielding), step_s=step_s)
     _add_snake(spec, config, settings, contact)
     _add_obstacles(spec, yielding, config, contact, collide=bool(yielding), step_s=step_s)
-    _add_devices(spec, config.robot, settings, step_s, motors=motors)
+    _add_motors_and_sensors(spec, config.robot, settings, step_s, motors=motors)
 
     # Friction and the other laws.
     links = config.robot.chain.modules + 1
     set_friction(spec, config, placed, rough_ground_geoms, settings.self_friction)
-    yielding_bodies = [geom_name(item) for item in yielding]
+    yielding_bodies = [make_geom_name(item) for item in yielding]
     add_laws(spec, laws, links, yielding_bodies, keeps_touches=keeps_touches, measures_force=measures_force)
     return Blueprint(spec, steps_per_tick, yielding, laws)
 
@@ -198,42 +204,44 @@ def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
 
 def _add_obstacles(
     spec: mujoco.MjSpec,
-    placed: list[Placed],
+    placed: list[PlacedObstacle],
     config: RunConfig,
     contact: ContactParameters,
     *,
     collide: bool,
     step_s: float,
 ) -> None:
-    """Add obstacles to the model; on hills they reach further down, so that no gap is left below them.
+    """Add obstacles to the model. On hills they reach further down, so that no gap is left below them.
 
     Args:
-        spec: the model, which is changed.
-        placed: obstacles with their places.
-        config: the run, for the robot's radius and the heights of the ground.
-        contact: parameters of MuJoCo's contacts.
-        collide: whether obstacles also collide with each other, because some of them move.
-        step_s: duration of a physics step.
+        spec: Model, which is changed.
+        placed: Obstacles with their places.
+        config: Configuration of the run, for the robot's radius and the heights of the ground.
+        contact: Parameters of MuJoCo's contacts.
+        collide: Whether obstacles also collide with each other, because some of them move.
+        step_s: Duration of a physics step in s.
     """
-    hills_m = 0.0
+    ground_relief_m = 0.0  # height of the highest ground above the lowest
     if config.scene.ground.heightfield is not None:
-        hills_m = config.scene.ground.heightfield.height_m
+        ground_relief_m = config.scene.ground.heightfield.height_m
     for item in placed:
         add_obstacle(
             spec,
             item,
             contact,
             body_radius_m=config.robot.module.radius_m,
-            hills_m=hills_m,
+            ground_relief_m=ground_relief_m,
             collide=collide,
             step_s=step_s,
         )
 
 
-def _add_devices(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, step_s: float, *, motors: bool) -> None:
+def _add_motors_and_sensors(
+    spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings, step_s: float, *, motors: bool
+) -> None:
     """Add motors, IMUs and the tether to a model whose links are complete."""
     if motors:
-        check_gains(robot)
+        validate_position_gains(robot)
         for joint in robot.joint_table:
             add_motor(spec, joint, robot.module, step_s)
     if robot.sensors.imu is not None:
@@ -251,7 +259,7 @@ def _compile(spec: mujoco.MjSpec, robot_name: str) -> mujoco.MjModel:
         ) from error
 
 
-def _obstacle_name(name: str) -> str | None:
+def _parse_obstacle_name(name: str) -> str | None:
     """Return the scene's name of the obstacle with this geom; None for geoms of other things."""
     if name.startswith(OBSTACLE):
         return name.removeprefix(OBSTACLE)
@@ -265,10 +273,10 @@ def _add_snake(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, co
     capsules would make two contacts.
 
     Args:
-        spec: the model, which is changed.
-        config: the run, with the robot and the ground.
-        settings: parameters of the physics, such as a factor on all masses.
-        contact: parameters of MuJoCo's contacts.
+        spec: Model, which is changed.
+        config: Configuration of the run, with the robot and the ground.
+        settings: Parameters of the physics, with a factor on all masses.
+        contact: Parameters of MuJoCo's contacts.
     """
     robot = config.robot
     is_flat = config.scene.ground.heightfield is None
@@ -293,8 +301,8 @@ def _add_snake(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, co
             rgba=ORANGE,
             **contact,
         )
-        _add_foot(body, f"foot_{i}", 0.0, radius_m, stands=is_flat)
-    _add_foot(body, f"foot_{len(lengths_m)}", lengths_m[-1], radius_m, stands=is_flat)
+        _add_foot(body, f"foot_{i}", 0.0, radius_m, is_on_flat_ground=is_flat)
+    _add_foot(body, f"foot_{len(lengths_m)}", lengths_m[-1], radius_m, is_on_flat_ground=is_flat)
     _exclude_near_links(spec, robot)
 
 
@@ -328,17 +336,17 @@ def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float, scale: float
     body.fullinertia = [scale * value for value in link.inertia(radius_m)]
 
 
-def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, *, stands: bool) -> None:
-    """Add a massless sphere of the body's radius at a joint or an end, on which flat ground carries the body.
+def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, *, is_on_flat_ground: bool) -> None:
+    """Add a massless sphere at a joint or an end of the robot, on which flat ground carries the body.
 
-    MuJoCo itself finds no contacts of it; the law of flat ground computes them.
+    MuJoCo itself finds no contacts of the sphere. The law of flat ground computes them.
 
     Args:
-        body: the link's body.
-        name: name of the geom.
-        along_m: distance from the link's rear joint.
-        radius_m: radius of the body.
-        stands: whether flat ground carries the foot.
+        body: Body of the link.
+        name: Name of the geom.
+        along_m: Distance in m from the link's rear joint.
+        radius_m: Radius of the robot's body in m.
+        is_on_flat_ground: Whether the ground is flat and carries the foot.
     """
     body.add_geom(
         name=name,
@@ -349,7 +357,7 @@ def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, 
         contype=0,
         conaffinity=0,
         group=FOOT_GROUP,
-        userdata=[FOOT if stands else 0.0],  # `set_friction` adds to it
+        userdata=[FOOT if is_on_flat_ground else 0.0],  # `set_friction` appends the coefficients
     )
 
 

@@ -18,12 +18,13 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, contact: ContactParameters) 
     """Add the ground to a model: a plane, and hills above it if the scene has a heightfield.
 
     Args:
-        spec: the model, which is changed.
-        ground: the ground of the scene.
-        contact: parameters of MuJoCo's contacts with hills.
+        spec: Model, which is changed.
+        ground: Ground of the scene.
+        contact: Parameters of MuJoCo's contacts with hills.
 
     Returns:
-        The names of the geoms of which MuJoCo finds contacts; none for flat ground, see flat_ground.py.
+        The names of the geoms of which MuJoCo finds contacts. The list is empty for flat ground, whose contacts
+        flat_ground.py computes.
     """
     if ground.heightfield is None:
         plane = _add_plane(spec, height_m=0.0)
@@ -54,19 +55,19 @@ def _add_hills(spec: mujoco.MjSpec, field: Heightfield, lowest_m: float, contact
     """Add a heightfield with the heights of the scene's hills.
 
     Args:
-        spec: the model, which is changed.
-        field: size, height, wavelength and seed of the hills.
-        lowest_m: height of the lowest point of the hills.
-        contact: parameters of MuJoCo's contacts.
+        spec: Model, which is changed.
+        field: Size, height, wavelength and seed of the hills.
+        lowest_m: Height of the lowest point of the hills in m.
+        contact: Parameters of MuJoCo's contacts.
     """
     heights_m = make_heights(field)
-    rows = len(heights_m)
+    row_count = len(heights_m)
     spec.add_hfield(
         name=HILLS,
-        nrow=rows,
-        ncol=rows,
+        nrow=row_count,
+        ncol=row_count,
         size=[field.area_m / 2, field.area_m / 2, field.height_m, DEPTH_M],
-        userdata=((heights_m - lowest_m) / field.height_m).ravel().tolist(),
+        userdata=((heights_m - lowest_m) / field.height_m).ravel().tolist(),  # 0 to 1
     )
     spec.worldbody.add_geom(
         name=HILLS,

@@ -19,6 +19,6 @@ class ContactParameters(TypedDict):
     solimp: list[float]
 
 
-def contact_parameters(settings: SimSettings) -> ContactParameters:
+def make_contact_parameters(settings: SimSettings) -> ContactParameters:
     """Return the contact parameters of every geom that can touch another."""
     return ContactParameters(condim=FRICTIONLESS_DIMENSION, solref=[settings.contact_time_s, 1.0], solimp=IMPEDANCE)

@@ -4,15 +4,15 @@ import math
 
 import mujoco
 
-from snakesim_hal.model.kinematics import tangents
+from snakesim_hal.model.kinematics import compute_contact_tangents
 from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import Physics
-from snakesim_sim_backend.sensors.frames import rotate_into
+from snakesim_sim_backend.sensors.frames import rotate_into_frame
 from snakesim_sim_backend.sensors.scope import Normal
-from snakesim_sim_backend.state.contacts import Touch, TouchReader
+from snakesim_sim_backend.state.contacts import ObstacleContact, ObstacleContactReader
 
 MAX_FORCE_N = 1e7  # that a message may carry
 NO_TORQUE = (0.0, 0.0, 0.0)  # a point contact carries no moment about its own point
@@ -25,7 +25,7 @@ class ContactReader:
         self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
     ) -> None:
         first = sim.first_link_body
-        self._touches = TouchReader(sim, data, physics.contacts)
+        self._contact_reader = ObstacleContactReader(sim, data, physics.contacts)
         self._origins = data.xpos[first:]  # of links, and of the bodies behind them
         self._rotations = data.xmat[first:]
         self._threshold_n = sensor.threshold_n
@@ -34,13 +34,13 @@ class ContactReader:
         self._noise: Normal | None = None
         if self._sigma_m or self._sigma_n:
             self._noise = noise
-        self._measured_force = physics.measure_force()
+        self._measured_force = physics.start_force_measurement()
 
     def read(self, tick: int, timestamp_ns: int) -> Contacts:
         """Return all contacts above the threshold, and the largest force since the last reading."""
         contacts = [
             self._measure_contact(touch)
-            for touch in self._touches.read()
+            for touch in self._contact_reader.read()
             if math.hypot(*touch.force_w) >= self._threshold_n
         ]
         max_force_n = self._measured_force.max_n
@@ -53,18 +53,18 @@ class ContactReader:
             measured_force_n=max_force_n,
         )
 
-    def _measure_contact(self, touch: Touch) -> Contact:
+    def _measure_contact(self, touch: ObstacleContact) -> Contact:
         """Return a contact in the frame of its link, with noise on its position and its force.
 
         Args:
-            touch: place, normal and force of the contact in the world, without noise.
+            touch: Contact in the world frame, without noise.
         """
         rotation = self._rotations[touch.link].tolist()  # world_from_link, row by row
         ox, oy, oz = self._origins[touch.link].tolist()
         x, y, z = touch.position_w
-        px, py, pz = rotate_into(rotation, (x - ox, y - oy, z - oz))
-        fx, fy, fz = rotate_into(rotation, touch.force_w)
-        normal = rotate_into(rotation, touch.normal_w)
+        px, py, pz = rotate_into_frame(rotation, (x - ox, y - oy, z - oz))
+        fx, fy, fz = rotate_into_frame(rotation, touch.force_w)
+        normal = rotate_into_frame(rotation, touch.normal_w)
         if self._noise is not None:
             noise_px, noise_py, noise_pz, noise_fx, noise_fy, noise_fz = self._noise(6).tolist()
             px = px + self._sigma_m * noise_px
@@ -73,7 +73,7 @@ class ContactReader:
             fx = fx + self._sigma_n * noise_fx
             fy = fy + self._sigma_n * noise_fy
             fz = fz + self._sigma_n * noise_fz
-        tangent_1, tangent_2 = tangents(normal)
+        tangent_1, tangent_2 = compute_contact_tangents(normal)
         return Contact(
             link=touch.link,
             obstacle=touch.obstacle,

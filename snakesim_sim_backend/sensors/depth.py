@@ -34,21 +34,21 @@ class RayCamera(SensorModel):
 
     def read(self, tick: int, timestamp_ns: int) -> DepthImage:
         """Return an image from the present place of the link."""
-        return depth_image(self._camera, self._mount, tick, timestamp_ns, self._rays.cast(), self._noise)
+        return make_depth_image(self._camera, self._mount, tick, timestamp_ns, self._rays.cast(), self._noise)
 
 
-def depth_image(
+def make_depth_image(
     camera: DepthCamera, mount: Mount, tick: int, timestamp_ns: int, depth_m: Floats, noise: np.random.Generator
 ) -> DepthImage:
-    """Make the message of a depth image from distances, with the noise and the range of a camera.
+    """Make the message of a depth image from exact distances, with the noise, dropouts and range of a camera.
 
     Args:
-        camera: the entry of the robot file.
-        mount: place of the camera on its link.
-        tick: tick of the image.
-        timestamp_ns: robot time of the image.
+        camera: Entry of the camera in the robot file.
+        mount: Place of the camera on its link.
+        tick: Tick of the image.
+        timestamp_ns: Robot time of the image in ns.
         depth_m: (height * width,) distances along the optical axis, row by row, without noise.
-        noise: the camera's noise generator.
+        noise: Random generator of the camera.
     """
     return DepthImage(
         **mount.camera_fields(camera),
@@ -57,18 +57,18 @@ def depth_image(
         range_min_m=camera.range_min_m,
         range_max_m=camera.range_max_m,
         scale_m=SCALE_M,
-        depth=_measure_counts(camera, depth_m, noise).tobytes(),
+        depth=_apply_sensor_errors(camera, depth_m, noise).tobytes(),
     )
 
 
-def _measure_counts(camera: DepthCamera, depth_m: Floats, noise: np.random.Generator) -> NDArray[np.uint16]:
-    """Apply noise, dropouts and range; return (n,) uint16, 0 where nothing is measured."""
-    measured = (depth_m >= camera.range_min_m) & (depth_m <= camera.range_max_m)
-    measured_m = np.where(measured, depth_m, 0.0).astype(np.float32)
+def _apply_sensor_errors(camera: DepthCamera, depth_m: Floats, noise: np.random.Generator) -> NDArray[np.uint16]:
+    """Return distances in counts of SCALE_M with noise and dropouts, (n,) uint16; 0 where nothing is measured."""
+    is_measured = (depth_m >= camera.range_min_m) & (depth_m <= camera.range_max_m)
+    measured_m = np.where(is_measured, depth_m, 0.0).astype(np.float32)
     if camera.noise_m or camera.noise_m_per_m2:
         sigma_m = np.float32(camera.noise_m) + np.float32(camera.noise_m_per_m2) * np.square(measured_m)
         measured_m += sigma_m * noise.standard_normal(len(measured_m), dtype=np.float32)
     if camera.dropout:
-        measured &= noise.random(len(measured_m), dtype=np.float32) >= camera.dropout
+        is_measured &= noise.random(len(measured_m), dtype=np.float32) >= camera.dropout
     counts = np.clip(np.rint(measured_m / np.float32(SCALE_M)), 1, MAX_COUNT)
-    return np.where(measured, counts, 0).astype("<u2")
+    return np.where(is_measured, counts, 0).astype("<u2")

@@ -3,7 +3,7 @@
 from snakesim_hal.wire.quantities import Quaternion, Vector
 
 
-def rotate_into(rotation: list[float], v: Vector) -> Vector:
+def rotate_into_frame(rotation: list[float], v: Vector) -> Vector:
     """Return a world vector's coordinates in the frame whose world_from_frame is `rotation`, (9,) row by row."""
     a, b, c, d, e, f, g, h, i = rotation
     x, y, z = v

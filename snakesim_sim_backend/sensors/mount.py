@@ -24,7 +24,7 @@ class Mount:
         self.body = scope.sim.first_link_body + self.link
         nose_m = robot.link_lengths_m[self.link] + robot.module.radius_m
         self.position_l: Vector = sensor.position_m or (nose_m, 0.0, 0.0)
-        self.orientation_l_wxyz = _orientation(sensor.yaw_rad, sensor.pitch_rad)
+        self.orientation_l_wxyz = _compute_orientation(sensor.yaw_rad, sensor.pitch_rad)
         self.link_from_sensor: Floats = rotation_from_quaternion(self.orientation_l_wxyz)
         self._origin = scope.data.xpos[self.body]
         self._rotation = scope.data.xmat[self.body]
@@ -49,7 +49,7 @@ class Mount:
         }
 
 
-def _orientation(yaw_rad: float, pitch_rad: float) -> Quaternion:
+def _compute_orientation(yaw_rad: float, pitch_rad: float) -> Quaternion:
     """Return the orientation after a yaw about z and then a pitch about the new y."""
     cy = math.cos(yaw_rad / 2)
     sy = math.sin(yaw_rad / 2)

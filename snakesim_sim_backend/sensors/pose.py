@@ -27,8 +27,8 @@ class PoseReader:
         """Return the pose and velocity of the base as motion capture measures them. Velocities have no noise.
 
         Args:
-            tick: tick of the message.
-            timestamp_ns: robot time of the tick.
+            tick: Tick of the message.
+            timestamp_ns: Robot time of the tick in ns.
         """
         px, py, pz, w, x, y, z = self._qpos.tolist()
         vx, vy, vz, ox, oy, oz = self._qvel.tolist()
@@ -39,7 +39,7 @@ class PoseReader:
             px = px + error_x
             py = py + error_y
             pz = pz + error_z
-            w, x, y, z = _add_rotation((w, x, y, z), half_roll, half_pitch, half_yaw)
+            w, x, y, z = _perturb_orientation((w, x, y, z), half_roll, half_pitch, half_yaw)
         return Pose(
             tick=tick,
             timestamp_ns=timestamp_ns,
@@ -50,7 +50,7 @@ class PoseReader:
         )
 
 
-def _add_rotation(wxyz: Quaternion, a: float, b: float, c: float) -> Quaternion:
+def _perturb_orientation(wxyz: Quaternion, a: float, b: float, c: float) -> Quaternion:
     """Return the unit quaternion along wxyz * (1, a, b, c): a small rotation about axes of the base is added."""
     w, x, y, z = wxyz
     w, x, y, z = (

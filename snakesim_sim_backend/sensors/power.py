@@ -9,15 +9,15 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Power
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.model.build import of_joints
+from snakesim_sim_backend.model.build import view_joint_states
 
 
 class PowerReader:
     """Supply, current and temperatures of the joint modules, without noise and without a leak."""
 
     def __init__(self, data: mujoco.MjData, motors: Motors, windings: Thermal, joints: Sequence[Joint]) -> None:
-        _, self._velocities = of_joints(data, motors.count)
-        self._torques = motors.applied_nm()
+        _, self._velocities = view_joint_states(data, motors.count)
+        self._torques = motors.get_applied_torque_nm()
         self._windings = windings
         self._count = len(joints)
         self._supply_v = np.array([joint.supply.voltage_v for joint in joints])
@@ -25,14 +25,14 @@ class PowerReader:
 
     def read(self, tick: int, timestamp_ns: int) -> Power:
         """Return the present values of the joint modules."""
-        power_w = self._windings.power_w(self._torques, self._velocities)
+        power_w = self._windings.compute_power_w(self._torques, self._velocities)
         return Power(
             tick=tick,
             timestamp_ns=timestamp_ns,
             voltage_v=self._supply_v.tolist(),
             current_a=(self._idle_a + power_w / self._supply_v).tolist(),
-            motor_c=self._windings.winding_c.tolist(),
-            board_c=self._windings.board_c().tolist(),
+            motor_c=self._windings.winding_temperature_c.tolist(),
+            board_c=self._windings.compute_board_temperatures_c().tolist(),
             leak=[False] * self._count,
             valid=[True] * self._count,
         )

@@ -27,23 +27,25 @@ class RayBeams(SensorModel):
         self._rays = Rays(self._mount, scope, rays_s, sensor.range_max_m)
 
     def read(self, tick: int, timestamp_ns: int) -> Ranges:
-        """Measure the distances along all beams at the present place of the sensor's link.
+        """Measure the distances along all beams, from the current place of the sensor.
 
-        Distances get noise. A beam without a hit within the sensor's range, or that drops out at random, is None.
+        Distances have noise. The distance of a beam is None if it hits nothing within the sensor's range, or drops out
+        at random.
 
         Args:
-            tick: tick of the message.
-            timestamp_ns: robot time of the tick.
+            tick: Tick of the message.
+            timestamp_ns: Robot time of the tick in ns.
         """
         sensor = self._sensor
         distances_m = self._rays.cast()
-        measured = (distances_m >= sensor.range_min_m) & (distances_m <= sensor.range_max_m)
+        is_measured = (distances_m >= sensor.range_min_m) & (distances_m <= sensor.range_max_m)
         if sensor.noise_m:
             distances_m = np.maximum(distances_m + sensor.noise_m * self._noise.standard_normal(sensor.beams), 0.0)
         if sensor.dropout:
-            measured &= self._noise.random(sensor.beams) >= sensor.dropout
+            is_measured &= self._noise.random(sensor.beams) >= sensor.dropout
         ranges_m = [
-            distance_m if hit else None for distance_m, hit in zip(distances_m.tolist(), measured.tolist(), strict=True)
+            distance_m if is_valid else None
+            for distance_m, is_valid in zip(distances_m.tolist(), is_measured.tolist(), strict=True)
         ]
         return Ranges(
             tick=tick,

@@ -11,9 +11,11 @@ from snakesim_sim_backend.model.ground import GROUND, PLANE_GROUP
 from snakesim_sim_backend.sensors.mount import Mount
 from snakesim_sim_backend.sensors.scope import Floats, Scope
 
-SEEN = np.ones(mujoco.mjNGROUP, np.uint8)
-SEEN[FOOT_GROUP] = 0  # spheres inside of the links' capsules
-SEEN[PLANE_GROUP] = 0  # mj_multiRay of MuJoCo 4.0.0 overlooks it where rays leave the box around the obstacles
+VISIBLE_GROUPS = np.ones(mujoco.mjNGROUP, np.uint8)
+VISIBLE_GROUPS[FOOT_GROUP] = 0  # spheres inside of the links' capsules
+VISIBLE_GROUPS[PLANE_GROUP] = (
+    0  # mj_multiRay of MuJoCo 4.0.0 overlooks it where rays leave the box around the obstacles
+)
 
 
 class Rays:
@@ -26,10 +28,10 @@ class Rays:
         """Prepare a bundle of rays.
 
         Args:
-            mount: where the rays begin.
-            scope: the model and its state.
+            mount: Place of the sensor, where all rays start.
+            scope: The model and its state.
             rays_s: (n, 3), directions in the sensor's frame, of any length.
-            max_lengths: how far to look for a surface, in lengths of a ray.
+            max_lengths: Range of the search for a surface, in lengths of a ray.
         """
         self._model = scope.sim.model
         self._data = scope.data
@@ -41,22 +43,25 @@ class Rays:
         self._lengths = np.zeros(len(rays_s))
 
     def cast(self) -> Floats:
-        """Find the nearest surface along each ray from the present place of the sensor, flat ground included.
+        """Find the nearest surface along each ray from the current place of the sensor.
+
+        The distance to flat ground is computed here, because MuJoCo overlooks it for some rays: see VISIBLE_GROUPS.
 
         Returns:
-            (n,) distances in lengths of the ray; inf for a ray that reaches no surface.
+            (n,) distances in lengths of the ray; infinity for a ray that hits nothing.
         """
         origin_w, world_from_sensor = self._mount.place()
         rays_w = self._rays_s @ world_from_sensor.T
-        below_m = origin_w[2] - self._ground_z_m
-        to_ground = np.full(len(rays_w), np.inf)
-        np.divide(-below_m, rays_w[:, 2], out=to_ground, where=rays_w[:, 2] * below_m < 0)
+        height_m = origin_w[2] - self._ground_z_m
+        ground_distances = np.full(len(rays_w), np.inf)
+        is_towards_ground = rays_w[:, 2] * height_m < 0
+        np.divide(-height_m, rays_w[:, 2], out=ground_distances, where=is_towards_ground)
         mujoco.mj_multiRay(
             self._model,
             self._data,
             origin_w,
             rays_w.ravel(),
-            SEEN,
+            VISIBLE_GROUPS,
             True,
             self._mount.body,
             self._hit_geoms,
@@ -65,4 +70,5 @@ class Rays:
             len(rays_w),
             self._cutoff_m,
         )
-        return np.where(self._lengths < 0, to_ground, np.minimum(self._lengths, to_ground))
+        # MuJoCo returns a negative length for a ray that hits nothing.
+        return np.where(self._lengths < 0, ground_distances, np.minimum(self._lengths, ground_distances))

@@ -38,7 +38,7 @@ class RecordedDepth(SensorModel):
         """Read the recording.
 
         Raises:
-            ConfigError: the file cannot be read, or cannot be played.
+            ConfigError: The file cannot be read, or cannot be played.
         """
         self._images = _read_images(settings.file, camera)
         self._link = scope.config.robot.link_index(camera.link)
@@ -59,22 +59,22 @@ def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
     """Read the recorded images of a depth camera, one JSON message for each line.
 
     Args:
-        file: path of the recording.
-        camera: the entry of the robot file, for messages.
+        file: Path of the recording.
+        camera: Entry of the camera in the robot file, for messages.
 
     Returns:
         The images in their order.
 
     Raises:
-        ConfigError: the file cannot be read, is too large, or has images that cannot be used.
+        ConfigError: The file cannot be read, is too large, or has images that cannot be used.
     """
     path = expand_home(file)
     decoder = msgspec.json.Decoder(Line)
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
+        byte_count = path.stat().st_size
+        if byte_count > MAX_BYTES:
             raise ConfigError(
-                f"{file}: {size} bytes, at most {MAX_BYTES}; record for a shorter time", code="file/too-large"
+                f"{file}: {byte_count} bytes, at most {MAX_BYTES}; record for a shorter time", code="file/too-large"
             )
         images = [decoder.decode(line).message for line in path.read_bytes().splitlines()]
     except (OSError, msgspec.DecodeError) as error:
@@ -83,16 +83,17 @@ def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
             f"make one with `snakesim topic echo sensor/depth/{camera.name} > {file}`",
             code="recording/not-readable",
         ) from error
-    flaw = _find_flaw(images)
-    if flaw is not None:
+    problem = _find_problem(images)
+    if problem is not None:
         raise ConfigError(
-            f"the recording of camera {camera.name!r}, {file}, cannot be used: {flaw}", code="recording/not-readable"
+            f"the recording of camera {camera.name!r}, {file}, cannot be used: {problem}",
+            code="recording/not-readable",
         )
     return images
 
 
-def _find_flaw(images: list[DepthImage]) -> str | None:
-    """Return why images cannot be played; None if they can."""
+def _find_problem(images: list[DepthImage]) -> str | None:
+    """Return a text about why images cannot be played, or None if they can."""
     if any(2 * image.width * image.height != len(image.depth) for image in images):
         return "some images are not whole"
     if not all(image.timestamp_ns < later.timestamp_ns for image, later in pairwise(images)):

@@ -12,7 +12,13 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings, require_base_class
+from snakesim_hal.model.plugins import (
+    SENSORS,
+    decode_plugin_settings,
+    load_plugin,
+    load_plugin_unless_file,
+    require_base_class,
+)
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import AnyMounted, BodySensor, ContactSensor, ImuSensor, PoseSensor, PowerSensor
@@ -29,7 +35,7 @@ from snakesim_sim_backend.sensors.rendered import RenderedColor, RenderedDepth
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
 # Sensors that look around: the model's name in the robot file -> its classes, each with a message of its own.
-MODELS: dict[str, tuple[type[SensorModel], ...]] = {
+SENSOR_MODELS: dict[str, tuple[type[SensorModel], ...]] = {
     "rays": (RayCamera, RayBeams),
     "rendered": (RenderedDepth,),
     "recorded": (RecordedDepth,),
@@ -40,8 +46,8 @@ def make_body_reader(sensor: BodySensor, scope: BodyScope) -> Reader:
     """Make the reader of a sensor that measures the body itself, such as contacts, IMUs or the pose.
 
     Args:
-        sensor: The entry of the robot file.
-        scope: Model, state and noise generator that the reader may use.
+        sensor: Entry of the sensor in the robot file.
+        scope: Model, state and random generator that the reader may use.
     """
     draw_normal = scope.noise.standard_normal
     match sensor:
@@ -56,28 +62,28 @@ def make_body_reader(sensor: BodySensor, scope: BodyScope) -> Reader:
             return PowerReader(scope.data, scope.motors, scope.windings, scope.config.robot.joint_table)
 
 
-def own_noise(key: str, seed: int) -> np.random.Generator:
-    """Return the noise generator of one sensor that looks around. Its numbers depend on its key and the seed alone."""
+def make_sensor_rng(key: str, seed: int) -> np.random.Generator:
+    """Return the random generator of one mounted sensor. Its numbers depend only on the sensor's key and the seed."""
     return np.random.default_rng((seed, crc32(key.encode())))
 
 
-def check_models(robot: RobotFile) -> None:
+def check_sensor_models(robot: RobotFile) -> None:
     """Check that all sensors that are mounted on links can be made, without running the file of a plugin.
 
     Raises:
-        ConfigError: a model is unknown, makes another message, or has wrong settings.
+        ConfigError: A model is unknown, makes another message, or has wrong settings.
     """
-    for key, sensor in robot.sensors.mounted():
-        _find_model(key, sensor, find_installed)
+    for key, sensor in robot.sensors.iterate_mounted():
+        _find_model(key, sensor, load_plugin_unless_file)
 
 
-def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
+def make_mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
     """Make the reader of a sensor that is mounted on a link.
 
     Raises:
-        ConfigError: its model is unknown, makes another message, or has wrong settings.
+        ConfigError: The sensor's model is unknown, makes another message, or has wrong settings.
     """
-    found = _find_model(key, sensor, find_plugin)
+    found = _find_model(key, sensor, load_plugin)
     assert found is not None
     model, settings = found
     return model(sensor, scope, settings)
@@ -89,12 +95,12 @@ def _find_model(
     """Return the class that simulates a mounted sensor, and its checked settings.
 
     Args:
-        key: The key on which the sensor publishes.
-        sensor: The entry of the robot file, with the name of the model.
-        find: Loads a plug-in by group and name; it may return None if the plug-in is not needed here.
+        key: Key on which the sensor publishes.
+        sensor: Entry of the sensor in the robot file, with the name of the model.
+        find: Function that loads a plugin by group and name. It may return None instead of loading a file.
 
     Returns:
-        The class and its settings; None if `find` does not load the model.
+        The class and its settings, or None if `find` returns None.
 
     Raises:
         ConfigError: The model has the wrong base class, makes another message, or does not accept the settings.
@@ -103,25 +109,28 @@ def _find_model(
     if message is ColorImage:
         return RenderedColor, RenderedColor.Settings()
     assert message is not None
-    model = _find_shipped_model(message, sensor.model)
-    if model is None:
-        model = find(SENSORS, sensor.model)
-        if model is None:
+    model_class = _find_bundled_model(message, sensor.model)
+    if model_class is None:
+        model_class = find(SENSORS, sensor.model)
+        if model_class is None:
             return None
-        require_base_class(model, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}")
+        require_base_class(model_class, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}")
     # A sensor with a custom message has a schema, which is checked instead.
-    if message is not CustomSample and model.message is not message:
+    if message is not CustomSample and model_class.message is not message:
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {message.__name__}, which {key} carries; "
             f"set `message` of its class to what it makes",
             code="plugin/not-loadable",
         )
-    return model, plugin_settings(model, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings")
+    settings = decode_plugin_settings(
+        model_class, sensor.settings, f"sensor {sensor.name!r} of the robot file", "settings"
+    )
+    return model_class, settings
 
 
-def _find_shipped_model(message: type[Message], name: str) -> type[SensorModel] | None:
+def _find_bundled_model(message: type[Message], name: str) -> type[SensorModel] | None:
     """Return the class of this package that makes a message by the model of this name; None without one."""
-    for model in MODELS.get(name, ()):
+    for model in SENSOR_MODELS.get(name, ()):
         if model.message is message:
             return model
     return None

@@ -12,13 +12,13 @@ from snakesim_hal.model.sensor_model import NoSettings, SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_sim_backend.model.ground import PLANE_GROUP
-from snakesim_sim_backend.sensors.depth import depth_image
+from snakesim_sim_backend.sensors.depth import make_depth_image
 from snakesim_sim_backend.sensors.mount import Mount
-from snakesim_sim_backend.sensors.rays import SEEN
+from snakesim_sim_backend.sensors.rays import VISIBLE_GROUPS
 from snakesim_sim_backend.sensors.scope import Scope
 
-PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6"}  # of Debian
-NEAR_M = 0.01  # distances between which things are drawn
+DEBIAN_PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6"}
+NEAR_M = 0.01  # minimum and maximum distance of what is drawn
 FAR_M = 100.0
 AMBIENT = 0.4  # light
 SAMPLES_PER_PIXEL = 4  # of a smooth picture
@@ -40,7 +40,7 @@ class RenderedDepth(SensorModel):
         """Return an image from the present place of the link."""
         _, depth_m = self._renderer.draw()
         flat_depth_m = depth_m.ravel().astype(np.float64)
-        return depth_image(self._camera, self._renderer.mount, tick, timestamp_ns, flat_depth_m, self._noise)
+        return make_depth_image(self._camera, self._renderer.mount, tick, timestamp_ns, flat_depth_m, self._noise)
 
 
 class RenderedColor(SensorModel):
@@ -67,12 +67,13 @@ class CameraRenderer:
         """Prepare a renderer for one camera of the robot. It must be made and used in one thread.
 
         Args:
-            camera: the entry of the robot file.
-            scope: the model and the state that is drawn.
-            smooth: several samples a pixel. Depth is then that of one of them, up to 0.4 pixels from the middle.
+            camera: Entry of the camera in the robot file.
+            scope: Model and state to draw.
+            smooth: Whether to use several samples for each pixel. The depth is then that of one sample, which is up to
+                0.4 pixels from the middle.
 
         Raises:
-            ConfigError: there is no OpenGL.
+            ConfigError: OpenGL is not available.
         """
         model = scope.sim.model
         self.mount = Mount(camera, scope)
@@ -88,7 +89,7 @@ class CameraRenderer:
         model.vis.quality.offsamples = SAMPLES_PER_PIXEL if smooth else 0
 
         # Renderer.
-        self._gl = opened_context(camera.width, camera.height, f"camera {camera.name!r}")
+        self._gl = open_gl_context(camera.width, camera.height, f"camera {camera.name!r}")
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
@@ -96,7 +97,7 @@ class CameraRenderer:
         self._scene = mujoco.MjvScene(model, model.ngeom + SPARE_GEOMS)
         self._free_camera = mujoco.MjvCamera()
         self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = SEEN
+        self._option.geomgroup[:] = VISIBLE_GROUPS
         self._option.geomgroup[PLANE_GROUP] = 1
 
         # Buffers.
@@ -143,28 +144,29 @@ class CameraRenderer:
                 geom.size[:] = 0.0
 
 
-def opened_context(width: int, height: int, what: str) -> Any:
+def open_gl_context(width: int, height: int, what: str) -> Any:
     """Open an OpenGL context without a screen: EGL, or OSMesa if the environment has MUJOCO_GL=osmesa.
 
     Args:
-        width: width of the pictures in pixels.
-        height: height of the pictures in pixels.
-        what: subject of the pictures, for the error message.
+        width: Width of the images in pixels.
+        height: Height of the images in pixels.
+        what: What is rendered, such as "camera 'head'", for the error message.
 
     Raises:
-        ConfigError: there is no OpenGL.
+        ConfigError: OpenGL is not available.
     """
-    kind = "osmesa" if os.environ.get("MUJOCO_GL") == "osmesa" else "egl"
+    gl_library = "osmesa" if os.environ.get("MUJOCO_GL") == "osmesa" else "egl"
     try:
-        if kind == "osmesa":
+        if gl_library == "osmesa":
             from mujoco.osmesa import GLContext
         else:
             from mujoco.egl import GLContext
         return GLContext(width, height)
     except Exception as error:
         raise ConfigError(
-            f"{what} is rendered, which needs OpenGL by {kind.upper()}, and that does not work here: "
-            f"{type(error).__name__}: {error}. Install the Debian packages {PACKAGES[kind]} and libgl1-mesa-dri; or "
+            f"{what} is rendered, which needs OpenGL by {gl_library.upper()}, and that does not work here: "
+            f"{type(error).__name__}: {error}. Install the Debian packages {DEBIAN_PACKAGES[gl_library]} and "
+            f"libgl1-mesa-dri; or "
             f'leave out `color` and take `model = "rays"`, which need no OpenGL',
             code="simulator/no-opengl",
         ) from error

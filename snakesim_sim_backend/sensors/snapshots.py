@@ -27,7 +27,7 @@ class Snapshots:
         """Run a function in the thread, and wait for its result. All that uses OpenGL must run in one thread."""
         return self._thread.submit(work).result()
 
-    def begin(
+    def start_sample(
         self, read: Callable[[int, int], Message], tick: int, timestamp_ns: int, qpos: NDArray[np.float64]
     ) -> Future[Message]:
         """Begin a sample of the state `qpos`, which is copied. Samples are made in the order of these calls."""

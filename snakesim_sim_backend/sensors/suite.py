@@ -16,7 +16,7 @@ from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.sensors.joints import JointReader
-from snakesim_sim_backend.sensors.registry import make_body_reader, mounted_reader, own_noise
+from snakesim_sim_backend.sensors.registry import make_body_reader, make_mounted_reader, make_sensor_rng
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 from snakesim_sim_backend.sensors.snapshots import Snapshots
 from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, round_to_ticks
@@ -44,15 +44,15 @@ class Sensors:
         snapshots of the state.
 
         Args:
-            sim: the compiled model, with the indices of links and obstacles.
-            data: its state.
-            config: configuration of the run, with the robot's sensors and the seed of their noise.
-            motors: the motors, whose torques and currents are measured.
-            physics: gives the forces of contacts.
-            windings: temperatures of the motors' windings.
+            sim: Compiled model, with the indices of links and obstacles.
+            data: State of the simulation.
+            config: Configuration of the run, with the robot's sensors and the seed of their noise.
+            motors: Motors, whose torques and currents are measured.
+            physics: Physics with the forces of contacts.
+            windings: Temperatures of the motors' windings.
 
         Raises:
-            ConfigError: a sensor cannot be made.
+            ConfigError: A sensor cannot be made.
         """
         sensors = config.robot.sensors
         scope = BodyScope(config, sim, data, np.random.default_rng(config.seed), motors, physics, windings)
@@ -60,32 +60,32 @@ class Sensors:
         self._channels: list[tuple[str, SynchronousSensor | ThreadedSensor]] = []
 
         # Samples that were dropped because they were not ready in time, and how many of them were reported, by key.
-        self.late: Counter[str] = Counter()
+        self.dropped_counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
 
         self._snapshots: Snapshots | None = None
-        if any(True for _ in sensors.mounted()):
+        if any(True for _ in sensors.iterate_mounted()):
             self._snapshots = Snapshots(sim.model)
-        for key, sensor in sensors.published():
+        for key, sensor in sensors.iterate_published():
             if isinstance(sensor, Mounted):
-                channel = self._make_threaded(key, sensor, scope)
+                channel = self._make_threaded_sensor(key, sensor, scope)
             else:
                 channel = SynchronousSensor(make_body_reader(sensor, scope), sensor, config)
             self._channels.append((key, channel))
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Return the samples that are delivered at this tick. Ticks must come in order, each once."""
-        others: dict[str, Message] = {}
+        sample_by_key: dict[str, Message] = {}
         for key, channel in self._channels:
             sample = channel.sample(tick, timestamp_ns)
             if sample is not None:
-                others[key] = sample
-        return Samples(self._joints.read(tick, timestamp_ns), others)
+                sample_by_key[key] = sample
+        return Samples(self._joints.read(tick, timestamp_ns), sample_by_key)
 
-    def lateness(self) -> list[str]:
-        """Return what to report of dropped samples since the last call: the first one, and each doubling."""
+    def describe_dropped_samples(self) -> list[str]:
+        """Return a text for each sensor whose number of dropped samples has doubled since its last text."""
         lines: list[str] = []
-        for key, count in self.late.items():
+        for key, count in self.dropped_counts.items():
             if count >= max(2 * self._reported[key], 1):
                 self._reported[key] = count
                 lines.append(f"{key}: {count} samples so far were not ready in time, and were dropped")
@@ -96,13 +96,13 @@ class Sensors:
         if self._snapshots is not None:
             self._snapshots.close()
 
-    def _make_threaded(self, key: str, sensor: AnyMounted, scope: Scope) -> "ThreadedSensor":
+    def _make_threaded_sensor(self, key: str, sensor: AnyMounted, scope: Scope) -> "ThreadedSensor":
         """Make a sensor whose samples another thread makes. Its reader is made in that thread, too, for OpenGL."""
         snapshots = self._snapshots
         assert snapshots is not None
-        own_scope = Scope(scope.config, scope.sim, snapshots.data, own_noise(key, scope.config.seed))
-        reader = snapshots.run(lambda: mounted_reader(key, sensor, own_scope))
-        return ThreadedSensor(key, reader, sensor, scope, snapshots, self.late)
+        own_scope = Scope(scope.config, scope.sim, snapshots.data, make_sensor_rng(key, scope.config.seed))
+        reader = snapshots.run(lambda: make_mounted_reader(key, sensor, own_scope))
+        return ThreadedSensor(key, reader, sensor, scope, snapshots, self.dropped_counts)
 
 
 class SynchronousSensor:
@@ -137,7 +137,7 @@ class ThreadedSensor:
         self._snapshots = snapshots
         self._late = late
         self._qpos = scope.data.qpos
-        self._waits = config.clock_mode != "realtime"
+        self._waits_for_samples = config.clock_mode != "realtime"
         self._schedule = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
         self._delay_ticks = max(round_to_ticks(sensor.delay_s, config.period_ns), 1)
         self._waiting: deque[tuple[int, Future[Message]]] = deque()  # with the tick of delivery
@@ -145,15 +145,15 @@ class ThreadedSensor:
     def sample(self, tick: int, timestamp_ns: int) -> Message | None:
         """Begin a sample if one is due, and return the one that is delivered at this tick."""
         if self._schedule.is_due(timestamp_ns):
-            begun = self._snapshots.begin(self._read, tick, timestamp_ns, self._qpos)
-            self._waiting.append((tick + self._delay_ticks, begun))
+            pending_sample = self._snapshots.start_sample(self._read, tick, timestamp_ns, self._qpos)
+            self._waiting.append((tick + self._delay_ticks, pending_sample))
         if not self._waiting:
             return None
         delivery_tick, oldest = self._waiting[0]
         if delivery_tick > tick:
             return None
         self._waiting.popleft()
-        if self._waits or oldest.done():
+        if self._waits_for_samples or oldest.done():
             return msgspec.structs.replace(oldest.result(), tick=tick)
         oldest.cancel()
         self._late[self._key] += 1

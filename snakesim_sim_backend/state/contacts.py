@@ -19,7 +19,7 @@ GeomPair = tuple[int, int]  # in MuJoCo's order
 NO_FORCE = (0.0, 0.0, 0.0)
 
 
-class Touch(NamedTuple):
+class ObstacleContact(NamedTuple):
     """One contact of a link with an obstacle over the last physics step; world frame."""
 
     link: int  # 0 at the tail
@@ -29,7 +29,7 @@ class Touch(NamedTuple):
     force_w: Vector  # N, on the body
 
 
-class TouchReader:
+class ObstacleContactReader:
     """Finds the contacts with obstacles in a simulation's data."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData, forces: ContactForces) -> None:
@@ -39,68 +39,72 @@ class TouchReader:
         self._obstacle_geoms = frozenset(i for i, name in enumerate(sim.obstacle_of_geom) if name is not None)
         self._link_of_geom: list[int] = (sim.model.geom_bodyid - sim.first_link_body).tolist()
 
-    def read(self) -> Iterator[Touch]:
-        """Yield all contacts of links with obstacles, with their places and forces in the world, in MuJoCo's order."""
+    def read(self) -> Iterator[ObstacleContact]:
+        """Yield all contacts of links with obstacles, in MuJoCo's order, with positions and forces in the world."""
         obstacle_geoms = self._obstacle_geoms
         pairs = self._forces.geom_pairs
-        touching = self._find_touching(pairs)
-        if not touching:
+        contact_indices = self._find_obstacle_contacts(pairs)
+        if not contact_indices:
             return
         normal_force_n = self._forces.normal_force_n
         friction_force_w = self._forces.friction_force_w
         # Whole columns are converted at once: a view of each contact would cost more.
         frames = self._contact.frame.tolist()
         points_w = self._contact.pos.tolist()
-        for i in touching:
-            first, second = pairs[i]
-            if first in obstacle_geoms:
-                obstacle = first
-                link = second
+        for i in contact_indices:
+            first_geom, second_geom = pairs[i]
+            # MuJoCo's normal points from the first geom to the second; here it points from the obstacle into the link.
+            if first_geom in obstacle_geoms:
+                obstacle_geom = first_geom
+                link_geom = second_geom
                 sign = 1.0
             else:
-                obstacle = second
-                link = first
+                obstacle_geom = second_geom
+                link_geom = first_geom
                 sign = -1.0
-            # MuJoCo's normal leads from the first geom to the second.
             x, y, z = (sign * component for component in frames[i][:3])
             normal_n = normal_force_n[i]
             fx, fy, fz = friction_force_w.get(i, NO_FORCE)
-            yield Touch(
-                link=self._link_of_geom[link],
-                obstacle=self._obstacle_of_geom[obstacle] or "",
+            yield ObstacleContact(
+                link=self._link_of_geom[link_geom],
+                obstacle=self._obstacle_of_geom[obstacle_geom] or "",
                 position_w=tuple(points_w[i]),
                 normal_w=(x, y, z),
                 force_w=(fx + normal_n * x, fy + normal_n * y, fz + normal_n * z),
             )
 
     def sum_forces_n(self) -> dict[GeomPair, float]:
-        """Return the summed force between each link and each obstacle that it touches, in N, by their geoms.
+        """Return the sum of the contact forces between each link and each obstacle that it touches, in N.
 
-        It runs in every physics step, so it computes no vectors: friction is at right angles to the normal force.
+        This runs in every physics step, so it computes the magnitude of each force from normal force and friction,
+        which are at right angles, and adds the magnitudes instead of vectors.
+
+        Returns:
+            The sums by pairs of geoms, in MuJoCo's order. Contacts without a normal force are left out.
         """
         pairs = self._forces.geom_pairs
-        touching = self._find_touching(pairs)
-        if not touching:
+        contact_indices = self._find_obstacle_contacts(pairs)
+        if not contact_indices:
             return {}
         normal_force_n = self._forces.normal_force_n
         friction_force_w = self._forces.friction_force_w
         sums_n: dict[GeomPair, float] = {}
-        for i in touching:
+        for i in contact_indices:
             normal_n = normal_force_n[i]
             if normal_n > 0.0:
-                first, second = pairs[i]
+                first_geom, second_geom = pairs[i]
                 force_n = normal_n
                 if i in friction_force_w:
                     fx, fy, fz = friction_force_w[i]
                     force_n = math.sqrt(normal_n * normal_n + fx * fx + fy * fy + fz * fz)
-                sums_n[first, second] = sums_n.get((first, second), 0.0) + force_n
+                sums_n[first_geom, second_geom] = sums_n.get((first_geom, second_geom), 0.0) + force_n
         return sums_n
 
-    def _find_touching(self, pairs: Sequence[Sequence[int]]) -> list[int]:
-        """Return the numbers of the contacts of one obstacle with something else, so with a link."""
+    def _find_obstacle_contacts(self, pairs: Sequence[Sequence[int]]) -> list[int]:
+        """Return the indices of the contacts of which exactly one geom is an obstacle; the other one is a link."""
         obstacle_geoms = self._obstacle_geoms
-        touching: list[int] = []
-        for i, (first, second) in enumerate(pairs):
-            if (first in obstacle_geoms) != (second in obstacle_geoms):
-                touching.append(i)
-        return touching
+        contact_indices: list[int] = []
+        for i, (first_geom, second_geom) in enumerate(pairs):
+            if (first_geom in obstacle_geoms) != (second_geom in obstacle_geoms):
+                contact_indices.append(i)
+        return contact_indices

@@ -17,10 +17,12 @@ MAX_ACCELERATION = 1e9  # m/s² or rad/s²
 BASE_DOFS = ["the base along x", "the base along y", "the base along z"] + ["the base, turning,"] * 3
 # Parts of MuJoCo's state, as plain numbers: the binding would convert an enumeration at every call.
 COMPLETE_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-INPUTS = int(mujoco.mjtState.mjSTATE_USER) & ~int(mujoco.mjtState.mjSTATE_USERDATA)  # what the feet store is no input
+USER_INPUTS = int(mujoco.mjtState.mjSTATE_USER) & ~int(
+    mujoco.mjtState.mjSTATE_USERDATA
+)  # what the feet store is no input
 
 
-def log_warnings() -> None:
+def log_mujoco_warnings() -> None:
     """Log MuJoCo's warnings; by default it writes them into a file in the working directory."""
     mujoco.set_mju_user_warning(_log.warning)
 
@@ -31,20 +33,20 @@ class DivergenceWatch:
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, physics: Physics, steps: int, counted: str = "tick"
     ) -> None:
-        """Store the present state as the last good one, to which a diverged simulation returns.
+        """Store the current state as the last good one, to which a diverged simulation returns.
 
         Args:
-            model: the compiled model.
-            data: its state.
-            physics: repeats steps to find the cause of a divergence.
-            steps: physics steps from one check to the next, under the same inputs.
-            counted: unit of a check's number, for messages.
+            model: Compiled model.
+            data: State of the simulation.
+            physics: Physics that repeats steps to find the cause of a divergence.
+            steps: Number of physics steps from one check to the next, under the same inputs.
+            counted: Unit in which checks are counted, such as "tick", for messages.
         """
         self._model = model
         self._data = data
         self._physics = physics
-        self._steps = steps
-        self._counted = counted
+        self._steps_per_check = steps
+        self._check_unit = counted
         self._good_state = np.empty(mujoco.mj_stateSize(model, COMPLETE_STATE))
         self._error: str | None = None  # the message about the divergence
 
@@ -53,17 +55,20 @@ class DivergenceWatch:
         self._qvel = data.qvel
         self._qacc = data.qacc
         self._warnings = data.warning.number
-        self._keep_state()
+        self._store_state()
 
     def check(self, number: int) -> None:
-        """Keep a good state. For a bad one, restore the last good one.
+        """Check the current state. A good state is stored; for a bad one the last good state is restored.
+
+        Args:
+            number: Number of the tick or step, for the message.
 
         Raises:
-            BackendError: the state is bad, or was bad in an earlier check.
+            BackendError: The state is bad, or was bad in an earlier check.
         """
         if self._error is None:
             if self._is_good():
-                self._keep_state()
+                self._store_state()
                 return
             self._error = self._describe_divergence(number)
             self._restore_state()
@@ -74,7 +79,7 @@ class DivergenceWatch:
         warnings = [mujoco.mjtWarning(i).name for i in self._warnings.nonzero()[0].tolist()]
         from_mujoco = f" MuJoCo reports {', '.join(warnings)}." if warnings else ""
         return (
-            f"the simulation diverged at {self._counted} {number}: {self._find_cause()}.{from_mujoco} Lower "
+            f"the simulation diverged at {self._check_unit} {number}: {self._find_cause()}.{from_mujoco} Lower "
             f"`timestep_s` or the gains in [motor]; stiff gains need armature"
         )
 
@@ -88,7 +93,7 @@ class DivergenceWatch:
             and warnings.dot(warnings) == 0
         )
 
-    def _keep_state(self) -> None:
+    def _store_state(self) -> None:
         mujoco.mj_getState(self._model, self._data, self._good_state, COMPLETE_STATE)
 
     def _restore_state(self) -> None:
@@ -96,15 +101,18 @@ class DivergenceWatch:
         self._warnings[:] = 0
 
     def _find_cause(self) -> str:
-        """Return where the divergence began. A diverged state is bad everywhere, so the steps are repeated singly."""
+        """Return a text about the coordinate in which the divergence started.
+
+        A diverged state is bad everywhere, so the steps since the last good state are repeated one by one.
+        """
         model = self._model
         data = self._data
-        inputs = np.empty(mujoco.mj_stateSize(model, INPUTS))
-        mujoco.mj_getState(model, data, inputs, INPUTS)
+        inputs = np.empty(mujoco.mj_stateSize(model, USER_INPUTS))
+        mujoco.mj_getState(model, data, inputs, USER_INPUTS)
         cause = self._describe_fastest() or "all values are NaN"
         self._restore_state()
-        mujoco.mj_setState(model, data, inputs, INPUTS)
-        for _ in range(self._steps):
+        mujoco.mj_setState(model, data, inputs, USER_INPUTS)
+        for _ in range(self._steps_per_check):
             self._physics.step(1)
             cause = self._describe_fastest() or cause
             if not self._is_good():
@@ -112,7 +120,7 @@ class DivergenceWatch:
         return "not by its own physics: its state was modified from outside"
 
     def _describe_fastest(self) -> str | None:
-        """Return which coordinate's speed or acceleration is nearest to its bound; None when they are NaN."""
+        """Return a text about the coordinate that is nearest to its speed or acceleration bound; None if any is NaN."""
         speed_fraction = np.abs(self._qvel) / MAX_SPEED
         acceleration_fraction = np.abs(self._qacc) / MAX_ACCELERATION
         fraction = np.maximum(speed_fraction, acceleration_fraction)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.state.contacts import Touch
+from snakesim_sim_backend.state.contacts import ObstacleContact
 
 
 @dataclass(frozen=True)
@@ -17,4 +17,4 @@ class TrueState:
     angles_rad: Floats  # (n_joints,), tail to head
     velocities_rad_s: Floats  # (n_joints,)
     torques_nm: Floats  # (n_joints,), of the motors over the last physics step
-    contacts: list[Touch]
+    contacts: list[ObstacleContact]

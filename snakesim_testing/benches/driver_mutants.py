@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from snakesim_drivers.kit.bus import BusSpec
-from snakesim_drivers.kit.drive_type import DriverTypeContext, group_by_port
+from snakesim_drivers.kit.drive_type import DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.drives import BusCommand
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.readings import DriveReadings
@@ -15,7 +15,7 @@ from snakesim_drivers.template.minimal_driver import (
     MinimalEmulator,
     Report,
 )
-from snakesim_testing.benches.mutant import Mutant, name_clauses
+from snakesim_testing.benches.mutant import Mutant, make_test_names
 from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
 
 DRIVER_MUTANTS: list[Mutant] = []
@@ -31,12 +31,12 @@ SUPPLY = "supply_and_temperatures_are_in_volts_and_degrees"
 SAGGING = "a_sagging_supply_is_reported_at_its_joint"
 
 
-def breaks(*clauses: str, declares_watchdog: bool = True) -> Callable[[Any], Any]:
-    """Register broken drives, or a broken emulator, with the clauses that must fail on them.
+def register_driver_mutant(*clauses: str, declares_watchdog: bool = True) -> Callable[[Any], Any]:
+    """Return a decorator that registers a broken driver, or broken emulated drives, with the tests that must fail.
 
     Args:
-        clauses: names of the contract tests that must fail.
-        declares_watchdog: False: the driver type declares that its drives have no watchdog.
+        clauses: Names of the contract tests that must fail, without `test_`.
+        declares_watchdog: Whether the driver type declares that its drives have a watchdog.
     """
 
     def register(broken: Any) -> Any:
@@ -56,11 +56,15 @@ def breaks(*clauses: str, declares_watchdog: bool = True) -> Callable[[Any], Any
                     joints = [context.joints[j] for j in joint_indices]
                     return drives_type(emulator, joints, readings, clock_ns, context.config.period_ns)
 
-                return group_by_port(context.joints, context.settings, ["memory"], open_drives)
+                return make_bus_specs_by_port(context.joints, context.settings, ["memory"], open_drives)
 
         DRIVER_MUTANTS.append(
             Mutant(
-                name=broken.__name__, backend=Broken, breaks=name_clauses(clauses), mute=mute_joint, drives=KitDrives
+                name=broken.__name__,
+                backend=Broken,
+                breaks=make_test_names(clauses),
+                mute_joint=mute_joint,
+                make_emulated_drives=KitDrives,
             )
         )
         return broken
@@ -68,7 +72,7 @@ def breaks(*clauses: str, declares_watchdog: bool = True) -> Callable[[Any], Any
     return register
 
 
-@breaks(SUPPLY)
+@register_driver_mutant(SUPPLY)
 class VoltsInTensOfMillivolts(MinimalDrives):
     """The supply has another unit than the driver believes."""
 
@@ -76,7 +80,7 @@ class VoltsInTensOfMillivolts(MinimalDrives):
         super()._store_report(i, report._replace(voltage_v=report.voltage_v * 1.5))
 
 
-@breaks(SUPPLY)
+@register_driver_mutant(SUPPLY)
 class FahrenheitTemperatures(MinimalDrives):
     """The temperatures are in another unit."""
 
@@ -84,7 +88,7 @@ class FahrenheitTemperatures(MinimalDrives):
         super()._store_report(i, report._replace(motor_c=report.motor_c * 1.8 + 64.0))
 
 
-@breaks(SAGGING)
+@register_driver_mutant(SAGGING)
 class SupplyReadOnce(MinimalDrives):
     """The supply is read in bring-up alone."""
 
@@ -96,40 +100,40 @@ class SupplyReadOnce(MinimalDrives):
         super()._store_report(i, report._replace(voltage_v=self.first_v))
 
 
-@breaks(IN_TIME)
+@register_driver_mutant(IN_TIME)
 class SwitchesOffLate(MinimalDrives):
     """Drives are switched off some cycles after the command."""
 
     late_cycles = 0
 
     def send_setpoints(self, command: BusCommand) -> None:
-        if command.following:
+        if command.enabled_drives:
             self.late_cycles = 0
             super().send_setpoints(command)
             return
         self.late_cycles += 1
         still_following = frozenset(i for i in self.all_drives if self.emulator.drives[i].enabled)
         if self.late_cycles < LATE_CYCLES:
-            command = command._replace(following=still_following)
+            command = command._replace(enabled_drives=still_following)
         super().send_setpoints(command)
 
 
-@breaks(AFTER_WATCHDOG, BUS_LOST)
+@register_driver_mutant(AFTER_WATCHDOG, BUS_LOST)
 class HasNoWatchdogAtAll(MinimalEmulator):
     """Drives follow their last setpoint for ever."""
 
     def on_step(self, now_us: float) -> None:
         for drive in self.drives:
-            drive.fed_us = now_us
+            drive.watchdog_fed_us = now_us
         super().on_step(now_us)
 
 
-@breaks(UNGUARDED, declares_watchdog=False)
+@register_driver_mutant(UNGUARDED, declares_watchdog=False)
 class HoldsAfterAPause(HasNoWatchdogAtAll):
     """Drives without a watchdog, whose driver does not notice that its host has done nothing for a while."""
 
 
-@breaks(AFTER_WATCHDOG)
+@register_driver_mutant(AFTER_WATCHDOG)
 class HasASlowWatchdog(MinimalEmulator):
     """Drives switch off, but later than after their watchdog's time."""
 
@@ -148,20 +152,20 @@ class AnswersForSilentDrives(MinimalDrives):
             self.readings.set_torque(i, float(self.readings.torque_nm[i]))
 
 
-@breaks(RESTARTED)
+@register_driver_mutant(RESTARTED)
 class EnablesRestartedDrives(AnswersForSilentDrives):
     """A drive that should follow is enabled in every cycle."""
 
     def send_setpoints(self, command: BusCommand) -> None:
         super().send_setpoints(command)
-        for i in command.following:
+        for i in command.enabled_drives:
             self.emulator.handle_message(i, "enable")
 
     def findings(self) -> list[Finding]:
         return [finding for finding in super().findings() if finding.what != "drive_not_armed"]
 
 
-@breaks(DUPLICATE)
+@register_driver_mutant(DUPLICATE)
 class TakesTheLastAnswer(MinimalDrives):
     """A second drive with one id goes unnoticed."""
 
@@ -169,7 +173,7 @@ class TakesTheLastAnswer(MinimalDrives):
         return [finding for finding in super().findings() if finding.what != "duplicate_node"]
 
 
-@breaks(DUPLICATE)
+@register_driver_mutant(DUPLICATE)
 class ForgetsTheSecondDrive(MinimalDrives):
     """A reset ends the fault for good, although the second drive is still there."""
 
@@ -184,7 +188,7 @@ class ForgetsTheSecondDrive(MinimalDrives):
         return [finding for finding in findings if not (self.is_forgotten and finding.what == "duplicate_node")]
 
 
-@breaks(BUS_LOST)
+@register_driver_mutant(BUS_LOST)
 class EnablesWhatTheBusHasLost(MinimalDrives):
     """After the bus is back, the driver clears errors and continues, whatever the robot's state."""
 

@@ -18,7 +18,7 @@ from snakesim_testing.contract.bench import TorqueSwitch
 from snakesim_testing.contract.kit_drives import KitDrives
 
 
-class DrivesOfAnyFamily(KitDrives):
+class DrivesOfAnyType(KitDrives):
     """Drives of the driver types that are part of SnakeSIM."""
 
     def find_emulator(self, drives: Any) -> Any:
@@ -26,11 +26,11 @@ class DrivesOfAnyFamily(KitDrives):
             return drives.emulator
         return drives._emulator
 
-    def list_enabled(self, emulator: Any) -> list[bool]:
-        return enabled_drives(emulator)
+    def list_enabled_of_bus(self, emulator: Any) -> list[bool]:
+        return list_enabled_drives(emulator)
 
 
-class DrivesOfModules:
+class ModuleDrives:
     """Joint modules on a virtual bus."""
 
     DRIVEN = (ModuleState.ARMED, ModuleState.STOPPING)
@@ -38,35 +38,35 @@ class DrivesOfModules:
     def __init__(self, backend: Any) -> None:
         """Begin to log, whenever modules have been polled, which of them are driven."""
         self._chain = chain_of(backend)
-        self._is_on = self.enabled()
+        self._is_on = self.list_enabled()
         self._log: list[TorqueSwitch] = []
-        follow_module = self._chain._follow_module
+        follow_module = self._chain._apply_module_outputs
 
         def follow_and_log(slot: Any) -> None:
             follow_module(slot)
             is_on = slot.module.state in self.DRIVEN
             if slot.drives and is_on != self._is_on[slot.joint]:
                 self._is_on[slot.joint] = is_on
-                self._log.append(TorqueSwitch(self.now_s(), slot.joint, on=is_on))
+                self._log.append(TorqueSwitch(self.read_time_s(), slot.joint, is_on=is_on))
 
-        self._chain._follow_module = follow_and_log
+        self._chain._apply_module_outputs = follow_and_log
 
-    def enabled(self) -> list[bool]:
+    def list_enabled(self) -> list[bool]:
         return [slot.module.state in self.DRIVEN for slot in self._chain.slots if slot.drives]
 
     def freeze_driver(self, seconds: float, sleep: Any) -> None:
         sleep(seconds)
-        assert self._chain._sync_time is not None
-        self._chain._step_to(self._chain._sync_time + round(seconds * 1e6))
+        assert self._chain._last_sync_time is not None
+        self._chain._advance_to_sync(self._chain._last_sync_time + round(seconds * 1e6))
 
-    def now_s(self) -> float:
+    def read_time_s(self) -> float:
         return self._chain.now_us * 1e-6
 
-    def torque_log(self) -> list[TorqueSwitch]:
+    def list_torque_switches(self) -> list[TorqueSwitch]:
         return list(self._log)
 
 
-def enabled_drives(emulator: Any) -> list[bool]:
+def list_enabled_drives(emulator: Any) -> list[bool]:
     """Of the emulated drives of one driver type, those that would follow a setpoint."""
     match emulator:
         case EmulatedOdrive():
@@ -76,10 +76,10 @@ def enabled_drives(emulator: Any) -> list[bool]:
         case EmulatedMoteus():
             return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
         case EmulatedDynamixel():
-            return [servo.on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in emulator.servos]
+            return [servo.is_torque_on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in emulator.servos]
         case MinimalEmulator():
             return emulator.list_enabled()
         case EmulatedFeetech():
-            return [servo.on for servo in emulator.servos]
+            return [servo.is_torque_on for servo in emulator.servos]
         case _:
             raise TypeError(f"drives of an unknown driver type: {emulator}")

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_settings import DriveSettings
-from snakesim_drivers.kit.drive_type import DriverTypeContext, group_by_port
+from snakesim_drivers.kit.drive_type import DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.drives import BusCommand
 from snakesim_drivers.kit.findings import Finding
 from snakesim_drivers.kit.holding_brakes import HoldingBrakes
@@ -38,7 +38,7 @@ class HomingSettings(DriveSettings, frozen=True, kw_only=True):
 
 
 class Inputs(NamedTuple):
-    """What a drive reports beside its motion."""
+    """Inputs of a drive, which it reports besides its motion."""
 
     homed: bool
     homing_failed: bool
@@ -49,12 +49,12 @@ class Inputs(NamedTuple):
 
 @dataclass
 class Extras:
-    """What a drive has beside a minimal one."""
+    """State of a drive that a minimal drive does not have: homing and holding brake."""
 
     homed: bool = False
     homing_until_us: float | None = None  # None: it does not home
     brake_open: bool = False
-    brake_closed_us: float = -1e9  # when it was told to close
+    brake_closed_us: float = -1e9  # time of the last command to close
 
 
 class HomingEmulator(MinimalEmulator):
@@ -86,7 +86,12 @@ class HomingEmulator(MinimalEmulator):
         return [report._replace(angle_rad=0.0) for report in reports]
 
     def handle_extra(self, i: int, message: Literal["home", "stop_homing", "open_brake", "close_brake"]) -> None:
-        """Let a drive act on a message that a minimal drive does not have."""
+        """Carry out a message about homing or the brake, which a minimal drive does not have.
+
+        Args:
+            i: Index of the drive.
+            message: The message. It is ignored while the bus is cut or the drive restarts.
+        """
         if self.is_cut or self.body.is_booting(i):
             return
         extras = self.extras[i]
@@ -113,7 +118,7 @@ class HomingEmulator(MinimalEmulator):
                 extras.homed = i not in self.without_index
                 self._drive_motor(i)
             if i in self.torque_off and self.drives[i].enabled:
-                self._stop(i, "")
+                self._latch_error(i, "")
 
     def restart(self, i: int) -> None:
         super().restart(i)
@@ -160,11 +165,11 @@ class HomingDrives(MinimalDrives):
         self.brakes = HoldingBrakes(len(joints), release_s=RELEASE_S, engage_s=ENGAGE_S, clock_ns=clock_ns)
         homing = StartUpStep(
             "homing",
-            limit_s=settings.homing_s + HOMING_MARGIN_S,
-            begin=lambda i: emulator.handle_extra(i, "home"),
+            timeout_s=settings.homing_s + HOMING_MARGIN_S,
+            start=lambda i: emulator.handle_extra(i, "home"),
             is_done=self.is_homed,
             abort=lambda i: emulator.handle_extra(i, "stop_homing"),
-            moves=True,
+            moves_joint=True,
         )
         self.homing = StartUp(self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start)
         self.start_up: StartUp | None = self.homing
@@ -185,15 +190,15 @@ class HomingDrives(MinimalDrives):
             self.inputs[i] = inputs
             if inputs is None:
                 continue
-            self.switches.note(i, lower=inputs.at_lower, upper=inputs.at_upper)
+            self.switches.record_switches(i, lower=inputs.at_lower, upper=inputs.at_upper)
             self.states.drives[i].safe_torque_off = inputs.safe_torque_off
             if self.homing.is_ready(i) and not inputs.homed:
-                self.homing.lose(i, "position unknown: the drive has restarted")
+                self.homing.invalidate(i, "position unknown: the drive has restarted")
 
     def send_setpoints(self, command: BusCommand) -> None:
         enabled = [i for i in self.all_drives if self.states.drives[i].enabled]
-        restricted = self.switches.restrict(command, self.readings.angle_rad)
-        plan = self.brakes.plan(restricted, enabled, self.readings.angle_rad)
+        restricted = self.switches.restrict_command(command, self.readings.angle_rad)
+        plan = self.brakes.update_brakes(restricted, enabled, self.readings.angle_rad)
         for i in self.all_drives:
             self.emulator.handle_extra(i, "open_brake" if i in plan.released else "close_brake")
         super().send_setpoints(plan.command)
@@ -223,4 +228,4 @@ class HomingBackend(MinimalBackend):
             emulator.homing_us = context.settings.homing_s * 1e6
             return HomingDrives(emulator, joints, readings, clock_ns, period_ns, settings=context.settings)
 
-        return group_by_port(context.joints, context.settings, ["memory"], open_drives)
+        return make_bus_specs_by_port(context.joints, context.settings, ["memory"], open_drives)

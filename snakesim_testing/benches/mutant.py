@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from snakesim_testing.contract.bench import DrivesOf, Mute
+from snakesim_testing.contract.bench import MakeEmulatedDrives, MuteJoint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,11 +13,11 @@ class Mutant:
 
     name: str
     backend: Any
-    breaks: tuple[str, ...]  # names of the clauses
-    mute: Mute
-    drives: DrivesOf
+    breaks: tuple[str, ...]  # names of the contract tests that must fail
+    mute_joint: MuteJoint
+    make_emulated_drives: MakeEmulatedDrives
 
 
-def name_clauses(clauses: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of test functions from those of clauses."""
+def make_test_names(clauses: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of contract test functions from their names without `test_`."""
     return tuple(f"test_{clause}" for clause in clauses)

@@ -19,16 +19,19 @@ from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
 from snakesim_testing.benches.driver_mutants import DRIVER_MUTANTS
-from snakesim_testing.benches.mutant import Mutant, name_clauses
+from snakesim_testing.benches.mutant import Mutant, make_test_names
 from snakesim_testing.benches.workbench import DrivesWorkbench, Workbench, WorkbenchDrives, mute
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.hal.small_robots import pose
+from snakesim_testing.hal.small_robots import make_pose
 
 MUTANTS: list[Mutant] = [*DRIVER_MUTANTS]
 
 
-class Liar(Workbench):
-    """A workbench with one error, made by one of three functions: in description, measurements or setpoints."""
+class FaultyWorkbench(Workbench):
+    """A correct backend with one error, in its description, its measurements or its setpoints.
+
+    A mutant replaces one of the methods `describes`, `reads` and `alters`.
+    """
 
     def __init__(self, config: Any, settings: Any) -> None:
         super().__init__(config, settings)
@@ -50,17 +53,24 @@ class Liar(Workbench):
         return points
 
 
-def breaks(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
-    """Register a broken backend with the clauses that must fail on it.
+def register_mutant(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
+    """Return a decorator that registers a broken backend with the contract tests that must fail on it.
 
-    lie: a function of `Liar`; then no backend is registered, but what is to stand in place of that.
+    Args:
+        clauses: Names of the contract tests that must fail, without `test_`.
+        lie: Name of a method of `FaultyWorkbench`. The decorated object is then not a backend, but the function that
+            replaces this method. If empty, the decorated object is the backend itself.
     """
 
     def register(broken: Any) -> Any:
-        backend = type(broken.__name__, (Liar,), {lie: staticmethod(broken)}) if lie else broken
+        backend = type(broken.__name__, (FaultyWorkbench,), {lie: staticmethod(broken)}) if lie else broken
         MUTANTS.append(
             Mutant(
-                name=backend.__name__, backend=backend, breaks=name_clauses(clauses), mute=mute, drives=WorkbenchDrives
+                name=backend.__name__,
+                backend=backend,
+                breaks=make_test_names(clauses),
+                mute_joint=mute,
+                make_emulated_drives=WorkbenchDrives,
             )
         )
         return broken
@@ -68,14 +78,14 @@ def breaks(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
     return register
 
 
-describes, reads, alters = (partial(breaks, lie=lie) for lie in ("describes", "reads", "alters"))
+describes, reads, alters = (partial(register_mutant, lie=lie) for lie in ("describes", "reads", "alters"))
 
 
 # --- the description -------------------------------------------------------------------------------------------
 
 
 def listing(robot: Description, key: str, rate_hz: float = 50.0) -> Description:
-    """With one sensor more."""
+    """Return a description that lists one more sensor."""
     return replace(robot, sensors=[*robot.sensors, SensorDescription(key=key, rate_hz=rate_hz, delay_s=0.0)])
 
 
@@ -109,7 +119,7 @@ def lists_what_it_lacks(robot):
     return listing(robot, keys.IMU, rate_hz=25.0)
 
 
-@breaks("the_description_is_readable_at_once_and_stays")
+@register_mutant("the_description_is_readable_at_once_and_stays")
 class NoisyDescription(Workbench):
     calls = 0
 
@@ -136,8 +146,8 @@ def absurd_torque(joints):
     return replace(joints, torque_nm=[*joints.torque_nm[:-1], 1e6])
 
 
-@breaks("every_joint_is_valid_and_fresh_at_every_tick")
-class ReadsEveryThirdTick(Liar):
+@register_mutant("every_joint_is_valid_and_fresh_at_every_tick")
+class ReadsEveryThirdTick(FaultyWorkbench):
     def reads(self, joints):
         return replace(joints, age_ns=[joints.tick % 3 * self.description.period_ns] * len(joints.age_ns))
 
@@ -147,7 +157,7 @@ def zero_for_unknown(joints):
     return joints if joints.tick else replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
 
 
-@breaks("readings_follow_the_motion")
+@register_mutant("readings_follow_the_motion")
 class OldReadingsAsNew(Workbench):
     held: Any = None
 
@@ -157,22 +167,22 @@ class OldReadingsAsNew(Workbench):
         return Samples(replace(self.held.joints, tick=tick, timestamp_ns=timestamp_ns))
 
 
-class WithPose(Liar):
+class WithPose(FaultyWorkbench):
     """Sends a pose every tick."""
 
     ahead_ns = 0
 
     def sample(self, tick, timestamp_ns):
-        seen = pose(tick, timestamp_ns + self.ahead_ns)
+        seen = make_pose(tick, timestamp_ns + self.ahead_ns)
         return Samples(super().sample(tick, timestamp_ns).joints, {keys.POSE: seen})
 
 
-@breaks("nothing_comes_that_is_not_listed")
+@register_mutant("nothing_comes_that_is_not_listed")
 class Unlisted(WithPose):
     pass
 
 
-@breaks("other_sensors_are_stamped_when_they_were_read")
+@register_mutant("other_sensors_are_stamped_when_they_were_read")
 class FromTheFuture(WithPose):
     ahead_ns = 5_000_000
 
@@ -180,7 +190,7 @@ class FromTheFuture(WithPose):
         return listing(robot, keys.POSE)
 
 
-class WithSonar(Liar):
+class WithSonar(FaultyWorkbench):
     """Sends a range every tick."""
 
     link, found_m = 0, 1.0
@@ -204,12 +214,12 @@ class WithSonar(Liar):
         return Samples(super().sample(tick, timestamp_ns).joints, {keys.ranges_key("sonar"): sonar})
 
 
-@breaks("every_sample_fits_the_robot")
+@register_mutant("every_sample_fits_the_robot")
 class OnNoLink(WithSonar):
     link = 99
 
 
-@breaks("no_sample_contradicts_itself")
+@register_mutant("no_sample_contradicts_itself")
 class SaysTheFurthestForNothing(WithSonar):
     found_m = 65.535
 
@@ -218,7 +228,7 @@ class SaysTheFurthestForNothing(WithSonar):
 
 
 def let_go(points: SafeSetpoints) -> SafeSetpoints:
-    """With all joints passive."""
+    """Return the setpoints with all joints passive."""
     return dataclasses.replace(points, mode=[Mode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
 
 
@@ -260,8 +270,8 @@ def one_for_all(points):
     return let_go(points) if points.isolated else points
 
 
-@breaks("an_isolated_joint_is_passive_while_others_continue")
-class TakesNothingBack(Liar):
+@register_mutant("an_isolated_joint_is_passive_while_others_continue")
+class TakesNothingBack(FaultyWorkbench):
     lost: frozenset[int] = frozenset()
 
     def alters(self, points):
@@ -285,7 +295,7 @@ def no_torque_sensor(joints):
     return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
 
 
-@breaks("a_passive_joint_has_no_torque_and_stays", "nothing_moves_while_disarmed_whatever_is_commanded")
+@register_mutant("a_passive_joint_has_no_torque_and_stays", "nothing_moves_while_disarmed_whatever_is_commanded")
 class PassiveGoesToZero(Workbench):
     def step(self):
         passive = self.mode == Mode.PASSIVE
@@ -293,7 +303,7 @@ class PassiveGoesToZero(Workbench):
         super().step()
 
 
-@breaks("disarmed_joints_have_no_torque", "a_passive_joint_has_no_torque_and_stays")
+@register_mutant("disarmed_joints_have_no_torque", "a_passive_joint_has_no_torque_and_stays")
 class PassivePushes(Workbench):
     def step(self):
         passive = self.mode == Mode.PASSIVE
@@ -301,8 +311,8 @@ class PassivePushes(Workbench):
         super().step()
 
 
-@breaks("setpoints_hold_until_the_next_ones")
-class ForgetsWhatIsRepeated(Liar):
+@register_mutant("setpoints_hold_until_the_next_ones")
+class ForgetsWhatIsRepeated(FaultyWorkbench):
     last: Any = None
 
     def alters(self, points):
@@ -314,15 +324,15 @@ class ForgetsWhatIsRepeated(Liar):
         super().step()
 
 
-@breaks("setpoints_hold_without_being_handed_over_again")
+@register_mutant("setpoints_hold_without_being_handed_over_again")
 class ForgetsAfterAPeriod(Workbench):
     def advance(self):
         super().advance()
         self.mode[:] = Mode.PASSIVE
 
 
-@breaks("a_mode_that_a_joint_lacks_is_refused")
-class MovesAfterAll(Liar):
+@register_mutant("a_mode_that_a_joint_lacks_is_refused")
+class MovesAfterAll(FaultyWorkbench):
     """Has no torque mode, and moves without a setpoint."""
 
     def describes(self, robot):
@@ -347,14 +357,14 @@ def zero_is_no_limit(points):
     return dataclasses.replace(points, torque_limit_nm=[limit or 4.0 for limit in points.torque_limit_nm])
 
 
-@breaks("no_joint_goes_beyond_its_limits")
+@register_mutant("no_joint_goes_beyond_its_limits")
 class NoStops(Workbench):
     def __init__(self, config, settings):
         super().__init__(config, settings)
         self.lower_rad, self.upper_rad = np.full_like(self.angle, -3.0), np.full_like(self.angle, 3.0)
 
 
-@breaks("a_mode_switch_makes_no_jump")
+@register_mutant("a_mode_switch_makes_no_jump")
 class JumpsOnSwitch(Workbench):
     """A change of mode starts with full torque."""
 
@@ -372,7 +382,7 @@ class JumpsOnSwitch(Workbench):
 # --- lifecycle and faults --------------------------------------------------------------------------------------
 
 
-@breaks("a_robot_with_modules_stops_them_itself_when_not_armed")
+@register_mutant("a_robot_with_modules_stops_them_itself_when_not_armed")
 class RobotThatTrustsTheHost(Workbench):
     @staticmethod
     def check(config, settings):
@@ -382,7 +392,7 @@ class RobotThatTrustsTheHost(Workbench):
         super().enact(setpoints, "armed")
 
 
-@breaks(
+@register_mutant(
     "leaving_armed_brings_a_moving_joint_to_rest",
     "a_fault_of_the_backend_latches_and_stops_the_joints",
     "a_controller_that_falls_silent_stops_joints_within_lease",
@@ -393,7 +403,7 @@ class GoesOnAfterArmed(Workbench):
             super().enact(setpoints, lifecycle)
 
 
-@breaks("arming_again_goes_on_from_where_the_robot_is")
+@register_mutant("arming_again_goes_on_from_where_the_robot_is")
 class TakesUpTheOldTarget(Workbench):
     old: Any = None
     armed_for = 0
@@ -409,7 +419,7 @@ class TakesUpTheOldTarget(Workbench):
         self.was_armed = self.was_armed or (not armed and self.old is not None)
 
 
-@breaks("after_reset_and_arm_it_moves_again")
+@register_mutant("after_reset_and_arm_it_moves_again")
 class NeverWakesAgain(Workbench):
     stopped = False
 
@@ -418,7 +428,7 @@ class NeverWakesAgain(Workbench):
         super().enact(setpoints, "estop" if self.stopped else lifecycle)
 
 
-@breaks("a_healthy_robot_reports_no_fault")
+@register_mutant("a_healthy_robot_reports_no_fault")
 class CriesWolf(Workbench):
     reported = False
 
@@ -432,7 +442,7 @@ def never_old(joints):
     return replace(joints, age_ns=[0] * len(joints.age_ns))
 
 
-@breaks("a_silent_joint_grows_old_and_the_robot_stops")
+@register_mutant("a_silent_joint_grows_old_and_the_robot_stops")
 class RepeatsItsFaults(Workbench):
     def faults(self):
         return [Fault(tick=0, what="silent", cause=f"joint {i} is silent") for i in self.silent]
@@ -441,7 +451,7 @@ class RepeatsItsFaults(Workbench):
 FROZEN = "drives_that_stop_during_host_freeze_stay_off_until_reset"
 
 
-@breaks(FROZEN)
+@register_mutant(FROZEN)
 class EnablesWhatHasTripped(DrivesWorkbench):
     """Whatever it sends enables drives again."""
 
@@ -450,7 +460,7 @@ class EnablesWhatHasTripped(DrivesWorkbench):
         self.enabled |= self.tripped
 
 
-@breaks(FROZEN)
+@register_mutant(FROZEN)
 class ClearsATripBeforeItIsRead(DrivesWorkbench):
     """Any command that lets a drive go ends what its watchdog has latched."""
 
@@ -460,24 +470,24 @@ class ClearsATripBeforeItIsRead(DrivesWorkbench):
             self.tripped[:] = False
 
 
-@breaks(FROZEN)
+@register_mutant(FROZEN)
 class HasNoWatchdog(DrivesWorkbench):
     WATCHDOG_S = 3600.0
 
 
-@breaks("drives_brake_after_fault_and_are_off_after_watchdog")
+@register_mutant("drives_brake_after_fault_and_are_off_after_watchdog")
 class BrakesForEver(DrivesWorkbench):
     def still_brakes(self):
         return self.enabled
 
 
-@breaks("drives_brake_after_fault_and_are_off_after_watchdog")
+@register_mutant("drives_brake_after_fault_and_are_off_after_watchdog")
 class LetsGoAtOnce(DrivesWorkbench):
     def still_brakes(self):
         return self.enabled & False
 
 
-@breaks("bad_commands_are_refused_and_counted_and_move_nothing")
+@register_mutant("bad_commands_are_refused_and_counted_and_move_nothing")
 class Creeps(Workbench):
     crept = 0.0
 
@@ -490,13 +500,13 @@ class Creeps(Workbench):
 # --- closing ---------------------------------------------------------------------------------------------------
 
 
-@breaks("a_closed_backend_drives_nothing")
+@register_mutant("a_closed_backend_drives_nothing")
 class DrivesAfterClose(Workbench):
     def close(self):
         """Forgotten."""
 
 
-@breaks("closing_twice_does_no_harm")
+@register_mutant("closing_twice_does_no_harm")
 class ClosesOnce(Workbench):
     def close(self):
         if not self.open:
@@ -504,7 +514,7 @@ class ClosesOnce(Workbench):
         super().close()
 
 
-@breaks("a_backend_opens_again_after_it_was_closed")
+@register_mutant("a_backend_opens_again_after_it_was_closed")
 class KeepsItsBus(Workbench):
     taken: ClassVar[bool] = False
 
@@ -520,8 +530,8 @@ def own_dice(joints):
     return replace(joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm])
 
 
-@breaks("a_simulator_stands_still_on_request_and_a_robot_refuses")
-class ModulesThatTellThemselvesASimulator(Liar):
+@register_mutant("a_simulator_stands_still_on_request_and_a_robot_refuses")
+class ModulesThatTellThemselvesASimulator(FaultyWorkbench):
     """Their watchdog counts wall time."""
 
     stepped_s = 0.0
@@ -544,7 +554,12 @@ class ModulesThatTellThemselvesASimulator(Liar):
 
 def pytest_snakesim_benches() -> list[Bench]:
     """Every mutant on a bench of its own."""
-    return [Bench(mutant.name, mutant.backend, mute=mutant.mute, drives=mutant.drives) for mutant in MUTANTS]
+    return [
+        Bench(
+            mutant.name, mutant.backend, mute_joint=mutant.mute_joint, make_emulated_drives=mutant.make_emulated_drives
+        )
+        for mutant in MUTANTS
+    ]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from snakesim_drivers.kit.braking import AT_REST_RAD_S
+from snakesim_drivers.kit.braking import AT_REST_SPEED_RAD_S
 from snakesim_drivers.kit.drive_backend import LATCHED_STATES
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
@@ -25,8 +25,8 @@ TORQUE_LIMIT_DECIMALS = 2  # of N·m
 DOCS = Path(__file__).parents[2] / "docs" / "hardware" / "write-a-backend.md"
 
 
-def text_of_the_example() -> str:
-    """The Python file in the documentation."""
+def read_example_from_docs() -> str:
+    """Return the text of the Python file in the documentation."""
     found = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
     assert found is not None
     return found[1]
@@ -34,7 +34,7 @@ def text_of_the_example() -> str:
 
 example: Any = ModuleType("workbench_of_the_docs")
 sys.modules[example.__name__] = example  # where its annotations are looked up
-exec(compile(text_of_the_example(), str(DOCS), "exec"), example.__dict__)
+exec(compile(read_example_from_docs(), str(DOCS), "exec"), example.__dict__)
 Workbench: Any = example.Workbench
 mute: Any = example.mute
 
@@ -74,7 +74,7 @@ class DrivesWorkbench(Workbench):
         return ~self.tripped
 
     def still_brakes(self) -> Any:
-        moves = np.abs(self.velocity) > AT_REST_RAD_S
+        moves = np.abs(self.velocity) > AT_REST_SPEED_RAD_S
         return self.enabled & moves & (self.braked_s < self.WATCHDOG_S)
 
     def advance(self) -> None:
@@ -94,27 +94,27 @@ class WorkbenchDrives:
     def __init__(self, backend: Any) -> None:
         self._backend = backend
         self._steps = 0
-        self._is_on = self.enabled()
+        self._is_on = self.list_enabled()
         self._log: list[TorqueSwitch] = []
         step = backend.step
 
         def step_and_log() -> None:
             step()
             self._steps += 1
-            for joint, is_on in enumerate(self.enabled()):
+            for joint, is_on in enumerate(self.list_enabled()):
                 if is_on != self._is_on[joint]:
-                    self._log.append(TorqueSwitch(self.now_s(), joint, on=is_on))
-            self._is_on = self.enabled()
+                    self._log.append(TorqueSwitch(self.read_time_s(), joint, is_on=is_on))
+            self._is_on = self.list_enabled()
 
         backend.step = step_and_log
 
-    def now_s(self) -> float:
+    def read_time_s(self) -> float:
         return self._steps * example.STEP_S
 
-    def torque_log(self) -> list[TorqueSwitch]:
+    def list_torque_switches(self) -> list[TorqueSwitch]:
         return list(self._log)
 
-    def enabled(self) -> list[bool]:
+    def list_enabled(self) -> list[bool]:
         return self._backend.enabled.tolist()
 
     def freeze_driver(self, seconds: float, sleep: Any) -> None:
@@ -153,8 +153,8 @@ class BusWorkbench(DrivesWorkbench):
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Apply the commands that are on the bus, then measure. Joints with an odd index report one period late.
 
-        A late joint has the value of the period before and a higher age. At the first sample there is no period before:
-        then the joint has its present value, or is not valid.
+        A late joint has the value of the previous period and a higher age. At the first sample there is no previous
+        period: then the joint has its current value, or is not valid.
 
         Args:
             tick: Number of the control cycle.

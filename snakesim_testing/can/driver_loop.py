@@ -17,14 +17,14 @@ from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 
 JOINTS = 4
 
 
 def config(joints: int = JOINTS, **dotted: Any) -> RunConfig:
     """So many joints at 100 Hz, without an obstacle."""
-    return run_config(**{"backend": "can", "robot__chain__modules": joints, "rate_hz": 100, **dotted})
+    return make_run_config(**{"backend": "can", "robot__chain__modules": joints, "rate_hz": 100, **dotted})
 
 
 @dataclass
@@ -75,7 +75,7 @@ class Loop:
 
     def states(self) -> list[ModuleState]:
         """The states that the modules reported last."""
-        return [module.state for module in self.backend.modules.reading.modules]
+        return [module.state for module in self.backend.modules.module_reports.modules]
 
     @property
     def physics_model(self) -> PhysicsModel:

@@ -46,7 +46,7 @@ def corrupted(frame: Frame) -> Frame:
 
 def begin(reading: ModuleReports, *, contacts: bool = False, tail: bool = False) -> int:
     """The next Sync goes out; its number."""
-    reading.begin_sync(reading.sync + 1, contacts=contacts, tail=tail)
+    reading.start_sync(reading.sync + 1, contacts=contacts, tail=tail)
     return reading.sync
 
 

@@ -21,12 +21,12 @@ from snakesim_can_backend.protocol.definitions import (
     parse_node,
     parse_opcode,
 )
-from snakesim_hal.model.scenario import Override, RunConfig, load, write_config
+from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, write_config
 from snakesim_testing.can.interface import FRAME
-from snakesim_testing.hal.small_robots import write_files
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.hal.small_robots import write_scenario_files
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Ended, environment
+from snakesim_testing.runs.command import CompletedRun, make_environment
 from snakesim_testing.runs.in_process_command import snakesim
 
 JOINTS = 3
@@ -139,7 +139,7 @@ class Bench:
         log = self.running.enter_context((self.folder / f"{name}.log").open("a"))
         process = subprocess.Popen(
             [sys.executable, "-m", *module_and_arguments, "--parent", str(os.getpid())],
-            env=environment(self.folder),
+            env=make_environment(self.folder),
             stdout=log,
             stderr=subprocess.STDOUT,
         )
@@ -174,7 +174,7 @@ class Bench:
             logs = "\n".join(f"{log.name}: {log.read_text()}" for log in self.folder.glob("*.log"))
             raise AssertionError(f"{error}\n{logs}") from None
 
-    def tell(self, *arguments: str) -> Ended:
+    def tell(self, *arguments: str) -> CompletedRun:
         """Run one of the operator's tools with the endpoint of the robot."""
         return snakesim(*arguments, "--endpoint", self.endpoint, cwd=self.folder)
 
@@ -201,11 +201,11 @@ class Bench:
 
 @contextmanager
 def bench(folder: Path, channel: str) -> Iterator[Bench]:
-    scenario = write_files(folder, scenario=SCENARIO.replace("CHANNEL", channel))
-    config = load(scenario, [Override("robot.chain.modules", JOINTS, "test")]).config
+    scenario = write_scenario_files(folder, scenario=SCENARIO.replace("CHANNEL", channel))
+    config = load_scenario(scenario, [Override("robot.chain.modules", JOINTS, "test")]).config
     write_config(config, folder / "config.json")
     with ExitStack() as running, closing(Listener(channel)) as listener:
-        yield Bench(folder, config, free_endpoint(), listener, running)
+        yield Bench(folder, config, find_free_endpoint(), listener, running)
 
 
 def stop_commands(received: Sequence[ReceivedFrame]) -> list[ReceivedFrame]:

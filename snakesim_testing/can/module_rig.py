@@ -94,7 +94,7 @@ class Host:
 
     def __init__(self, made: ModuleChain) -> None:
         self.chain, self.count = made, -1
-        made.take_frames(0)
+        made.pop_frames(0)
 
     def arm(self) -> None:
         self.tick()
@@ -103,7 +103,7 @@ class Host:
     def tick(self, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
         self.count += 1
         self.chain.receive(0, make_sync(self.count, self.count * 10_000))
-        frames = self.chain.take_frames(0)
+        frames = self.chain.pop_frames(0)
         if target is not None:
             for node in range(1, self.chain.module_count + 1):
                 self.chain.receive(0, setpoint(self.count, mode, target, 4.0, node))
@@ -117,19 +117,21 @@ class Host:
         return [slot.module.state for slot in self.chain.slots[: self.chain.module_count]]
 
 
-def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], Traffic, Traffic, int]:
+def measure_bus_traffic(
+    joint_count: int, rate_hz: int, duration_s: float = 2.0
+) -> tuple[list[int], Traffic, Traffic, int]:
     """Run a whole bus of armed modules for some time, and measure its traffic.
 
     Args:
-        joints: Number of modules on the bus.
-        rate_hz: Rate of the Syncs.
-        seconds: Duration of the run after arming.
+        joint_count: Number of modules on the bus.
+        rate_hz: Rate of the Sync frames.
+        duration_s: Duration of the run after arming.
 
     Returns:
         The lateness of each joint state in periods, the traffic counts before and after the run, and the maximum
         number of frames that waited for the bus.
     """
-    emulators = chain(config(joints, rate_hz=rate_hz), stepped=False)
+    emulators = chain(config(joint_count, rate_hz=rate_hz), stepped=False)
     emulators.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     for slot in emulators.slots:
         slot.module.parameters.values |= {ModuleParameter.CONTACT_EVERY: 1.0, ModuleParameter.IMU_EVERY: 20.0}
@@ -139,15 +141,15 @@ def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], 
     period_us = 1e6 / rate_hz
     lateness_periods: list[int] = []
     max_waiting_frames = 0
-    for tick in range(round(seconds * rate_hz)):
+    for tick in range(round(duration_s * rate_hz)):
         emulators.advance_to(ARMED_AT_US + tick * period_us)
-        for answer in emulators.take_frames(0):
-            if parse_opcode(answer.id) == Opcode.JOINT_STATE:
-                sync_count = answer.data[6] & 0xF  # the number of the answered Sync, modulo 16
+        for frame in emulators.pop_frames(0):
+            if parse_opcode(frame.id) == Opcode.JOINT_STATE:
+                sync_count = frame.data[6] & 0xF  # the number of the answered Sync, modulo 16
                 lateness_periods.append(((tick - 1) - sync_count) % 16)
         emulators.receive(0, make_sync(tick, 0))
-        for node in range(1, joints + 1):
+        for node in range(1, joint_count + 1):
             emulators.receive(0, setpoint(tick, node=node, target=0.0))
-        waiting_frames = sum(map(len, emulators.buses[0]._waiting.values()))
+        waiting_frames = sum(map(len, emulators.buses[0]._waiting_frames.values()))
         max_waiting_frames = max(max_waiting_frames, waiting_frames)
     return lateness_periods, traffic_before, emulators.traffic()[0], max_waiting_frames

@@ -88,28 +88,28 @@ class SharedBus(Loop):
 
 
 @contextmanager
-def shared_bus(channel: str) -> Iterator[SharedBus]:
+def open_shared_bus(channel: str) -> Iterator[SharedBus]:
     """Open a driver and emulated modules on one kernel bus, with all joints armed and moving, until the end.
 
     Args:
-        channel: name of the CAN interface.
+        channel: Name of the CAN interface.
     """
-    run = config(clock_mode="realtime")
+    run_config = config(clock_mode="realtime")
     settings = CanSettings(channels=[channel], physics_model="inertia")
-    modules_end = SocketCanWire(channel, FROM_HOST)
+    module_wire = SocketCanWire(channel, FROM_HOST)
     server = EmulatorServer(
-        [modules_end],
-        ModuleChain(run, settings, make_physics_model(run, settings, "can"), stepped=False),
+        [module_wire],
+        ModuleChain(run_config, settings, make_physics_model(run_config, settings, "can"), stepped=False),
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "open_wire", lambda name, bit_rate: SharedWire(name, server))
-        patch.setattr(driver, "answer_limit_s", lambda *_: ANSWER_LIMIT_S)
+        patch.setattr(driver, "compute_response_timeout_s", lambda *_: ANSWER_LIMIT_S)
         patch.setattr(driver, "FIRST_STATE_PAUSE_S", ANSWER_LIMIT_S)
         try:
-            backend = CanBackend(run, settings)
+            backend = CanBackend(run_config, settings)
             try:
-                yield armed(SharedBus(backend, run))
+                yield armed(SharedBus(backend, run_config))
             finally:
                 backend.close()
         finally:
-            modules_end.close()
+            module_wire.close()

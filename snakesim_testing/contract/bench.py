@@ -1,4 +1,8 @@
-"""One backend with its settings, as the contract tests use it: opened by one user at a time, like a robot."""
+"""The bench of a backend: the fixture around one backend under test, which the contract tests open like a robot.
+
+A bench holds one backend with its settings. It opens the backend for one user at a time, and keeps what several tests
+share. In the table of results, each bench is a column.
+"""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -8,28 +12,28 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 
 from snakesim_hal.backend import Backend
-from snakesim_hal.model.scenario import Override, RunConfig, ServiceSchedule, load, parse_set
-from snakesim_hal.programs.preflight import backend_settings, find_backend, with_backend_modes
+from snakesim_hal.model.scenario import Override, RunConfig, ServiceSchedule, load_scenario, parse_set_option
+from snakesim_hal.programs.preflight import apply_backend_modes, decode_backend_settings, load_backend_class
 from snakesim_hal.wire.messages import ClockMode
-from snakesim_testing.contract.loopback import Hosted
-from snakesim_testing.contract.rig import HOLDER, Rig
+from snakesim_testing.contract.loopback import HostedBackend
+from snakesim_testing.contract.rig import LEASE_HOLDER, Rig
 
-SCENARIO = str(Path(__file__).parent / "scenario.toml")
-Mute = Callable[[Any, int], None]
+DEFAULT_SCENARIO = str(Path(__file__).parent / "scenario.toml")
+MuteJoint = Callable[[Any, int], None]
 
 
 class TorqueSwitch(NamedTuple):
-    """One entry of the drives' own log: a drive has switched its torque."""
+    """One entry of the drives' own log: a drive has switched its torque on or off."""
 
     time_s: float  # the drives' own time
     joint: int
-    on: bool
+    is_on: bool
 
 
 class EmulatedDrives(Protocol):
     """The emulated drives of an open backend, for clauses about what drives do while their driver does nothing."""
 
-    def enabled(self) -> list[bool]:
+    def list_enabled(self) -> list[bool]:
         """Return for each joint whether its drive would follow a setpoint now: in truth, not as the driver has it."""
         ...
 
@@ -40,55 +44,61 @@ class EmulatedDrives(Protocol):
         """
         ...
 
-    def now_s(self) -> float:
+    def read_time_s(self) -> float:
         """Return the drives' own time, which also passes while their driver does nothing."""
         ...
 
-    def torque_log(self) -> list[TorqueSwitch]:
+    def list_torque_switches(self) -> list[TorqueSwitch]:
         """Return when drives have switched their torque on and off since this object was made, by `now_s`."""
         ...
 
 
-DrivesOf = Callable[[Any], EmulatedDrives]
+MakeEmulatedDrives = Callable[[Any], EmulatedDrives]
 
 
 class Bench:
-    """A backend with its settings: a column of the contract's table."""
+    """The fixture around one backend under test: the backend with its settings, and what the contract tests share.
+
+    A bench opens its backend for one user at a time: a rig without a network, or a host. In the table of results, each
+    bench is a column.
+    """
 
     def __init__(
         self,
         name: str,
         backend: str | type[Backend],
         *,
-        scenario: str = SCENARIO,
-        sets: tuple[str, ...] = (),
-        mute: Mute | None = None,
-        drives: DrivesOf | None = None,
+        scenario: str = DEFAULT_SCENARIO,
+        overrides: tuple[str, ...] = (),
+        mute_joint: MuteJoint | None = None,
+        make_emulated_drives: MakeEmulatedDrives | None = None,
         unavailable: str | None = None,
     ) -> None:
         """Describe the backend without opening it.
 
         Args:
-            name: of the column.
-            backend: name of an installed backend, `./file.py:Class`, or the class itself.
-            scenario: name or path of the scenario.
-            sets: changes of the scenario, as `--set` of `snakesim run`.
-            mute: `mute(backend, joint)` silences one joint module, as a broken wire does; None: not possible.
-            drives: returns the emulated drives of an open backend; None: not possible.
-            unavailable: why the bench cannot be used on this machine; None: it can.
+            name: Name of the bench, and of its column in the table of results.
+            backend: Name of an installed backend, `./file.py:Class`, or the class itself.
+            scenario: Name or path of the scenario.
+            overrides: Changes of the scenario, as `--set KEY=VALUE` of `snakesim run` takes them.
+            mute_joint: Function `mute_joint(backend, joint)` that silences one joint module, as a broken wire does.
+                None if that is not possible.
+            make_emulated_drives: Function that returns the emulated drives of an open backend. None if the backend
+                has none.
+            unavailable: Reason why the bench cannot be used on this machine. None if it can.
         """
         self.name = name
         self.unavailable = unavailable
-        self.mute = mute
-        self.drives = drives
+        self.mute_joint = mute_joint
+        self.make_emulated_drives = make_emulated_drives
         self._backend = backend
         self._scenario = scenario
-        self._sets = sets
+        self._sets = overrides
         self._rig: Rig | None = None
-        self._looked_at: tuple[Backend, EmulatedDrives] | None = None  # an open backend with its drives
+        self._open_backend_and_drives: tuple[Backend, EmulatedDrives] | None = None  # an open backend with its drives
         self.was_opened = False  # since the bench was made
-        self._hosted: Hosted | None = None
-        self._recordings: dict[str, Any] = {}
+        self._hosted_backend: HostedBackend | None = None
+        self._recording_by_name: dict[str, Any] = {}
 
     # --- what it is ----------------------------------------------------------------------------------------
 
@@ -96,20 +106,20 @@ class Bench:
     def backend_type(self) -> type[Backend]:
         """The backend's class. Raises ConfigError when there is no such backend."""
         if isinstance(self._backend, str):
-            return find_backend(self._backend)
+            return load_backend_class(self._backend)
         return self._backend
 
     @cached_property
     def config(self) -> RunConfig:
         """The scenario with the backend, at the clock mode of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
-        overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
-        config = with_backend_modes(load(self._scenario, overrides).config, self.backend_type)
+        overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set_option, self._sets)]
+        config = apply_backend_modes(load_scenario(self._scenario, overrides).config, self.backend_type)
         # The tests' own controller is the only service.
-        clock_modes = self.backend_type.check(config, backend_settings(config, self.backend_type))
+        clock_modes = self.backend_type.check(config, decode_backend_settings(config, self.backend_type))
         # Lockstep is preferred: it is quick, and the same on every machine.
         clock_mode = "lockstep" if "lockstep" in clock_modes else "realtime"
-        return msgspec.structs.replace(config, clock_mode=clock_mode, services={HOLDER: ServiceSchedule()})
+        return msgspec.structs.replace(config, clock_mode=clock_mode, services={LEASE_HOLDER: ServiceSchedule()})
 
     @property
     def clock_mode(self) -> ClockMode:
@@ -118,14 +128,18 @@ class Bench:
 
     # --- opening and closing -------------------------------------------------------------------------------
 
+    def load_config(self) -> RunConfig:
+        """Load the scenario of the bench if it is not loaded yet, and return it. Raises ConfigError."""
+        return self.config
+
     def open(self) -> Backend:
-        """Open the backend, and return it. The one that is open is closed first."""
+        """Open the backend, and return it. A backend that is still open is closed first."""
         self.close()
         self.was_opened = True
-        return self.backend_type(self.config, backend_settings(self.config, self.backend_type))
+        return self.backend_type(self.config, decode_backend_settings(self.config, self.backend_type))
 
     def open_rig(self) -> Rig:
-        """Open the backend, and return a rig with it."""
+        """Open the backend, and return a rig that drives it without a network."""
         backend = self.open()
         try:
             self._rig = Rig(backend, self.clock_mode, self.config.period_ns)
@@ -134,25 +148,28 @@ class Bench:
             raise
         return self._rig
 
-    def shared_rig(self) -> Rig:
-        """Return the rig that tests share, because opening may be slow; a new one if it is not usable any more."""
-        if self._rig is None or self._rig.spoiled:
+    def get_shared_rig(self) -> Rig:
+        """Return the rig that tests share, because opening may be slow. It is replaced if it is not usable any more."""
+        if self._rig is None or self._rig.must_reopen:
             return self.open_rig()
         return self._rig
 
-    def look_at_drives(self, backend: Backend) -> EmulatedDrives | None:
-        """Return the emulated drives of an open backend, the same object each time; None if that is not possible."""
-        if self.drives is None:
-            return None
-        if self._looked_at is None or self._looked_at[0] is not backend:
-            self._looked_at = (backend, self.drives(backend))
-        return self._looked_at[1]
+    def find_emulated_drives(self, backend: Backend) -> EmulatedDrives | None:
+        """Return the emulated drives of an open backend, or None if the bench has no access to them.
 
-    def shared_host(self) -> Hosted:
+        For the same open backend, this returns the same object each time.
+        """
+        if self.make_emulated_drives is None:
+            return None
+        if self._open_backend_and_drives is None or self._open_backend_and_drives[0] is not backend:
+            self._open_backend_and_drives = (backend, self.make_emulated_drives(backend))
+        return self._open_backend_and_drives[1]
+
+    def get_shared_host(self) -> HostedBackend:
         """Return the backend behind a real host, which tests share."""
-        if self._hosted is None:
-            self._hosted = Hosted(self.open(), self.config)
-        return self._hosted
+        if self._hosted_backend is None:
+            self._hosted_backend = HostedBackend(self.open(), self.config)
+        return self._hosted_backend
 
     def reopen_for_next_test(self) -> None:
         """Close the backend, so that the next test opens it again: its state is unknown."""
@@ -161,16 +178,21 @@ class Bench:
     def close(self) -> None:
         """Close the open backend."""
         rig = self._rig
-        hosted = self._hosted
+        hosted = self._hosted_backend
         self._rig = None
-        self._hosted = None
+        self._hosted_backend = None
         if hosted is not None:
             hosted.close()
-        if rig is not None and not rig.closed:
+        if rig is not None and not rig.is_closed:
             rig.close()
 
-    def record_once(self, name: str, make: Callable[[], Any]) -> Any:
-        """Return a recording that several tests read; the first of them makes it."""
-        if name not in self._recordings:
-            self._recordings[name] = make()
-        return self._recordings[name]
+    def record_once(self, name: str, make_recording: Callable[[], Any]) -> Any:
+        """Return a recording that several tests share. It is made when it is first needed.
+
+        Args:
+            name: Name of the recording.
+            make_recording: Makes the recording.
+        """
+        if name not in self._recording_by_name:
+            self._recording_by_name[name] = make_recording()
+        return self._recording_by_name[name]

@@ -28,22 +28,22 @@ class KitDrives:
         self._log: list[TorqueSwitch] = []
         for bus in self._buses:
             emulator = self.find_emulator(bus.drives)
-            is_on = self.list_enabled(emulator)
+            is_on = self.list_enabled_of_bus(emulator)
             emulator.body.add_step_callback(partial(self._log_switches, emulator, bus.spec.joints, is_on))
 
     def find_emulator(self, drives: Any) -> Any:
         """Return the emulated drives of a bus."""
         return drives.emulator
 
-    def list_enabled(self, emulator: Any) -> list[bool]:
+    def list_enabled_of_bus(self, emulator: Any) -> list[bool]:
         """Return for each emulated drive of a bus whether it would follow a setpoint."""
         return emulator.list_enabled()
 
-    def enabled(self) -> list[bool]:
+    def list_enabled(self) -> list[bool]:
         """Return for each joint whether its drive would follow a setpoint now."""
         enabled: dict[int, bool] = {}
         for bus in self._buses:
-            enabled |= dict(zip(bus.spec.joints, self.list_enabled(self.find_emulator(bus.drives)), strict=True))
+            enabled |= dict(zip(bus.spec.joints, self.list_enabled_of_bus(self.find_emulator(bus.drives)), strict=True))
         return [enabled[joint] for joint in range(len(enabled))]
 
     def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
@@ -52,21 +52,21 @@ class KitDrives:
             for bus in self._buses:
                 if hasattr(bus, "_condition"):  # a bus in a thread: it can do nothing without this
                     held.enter_context(bus._condition)
-            self._backend._clock.robot_ns += round(seconds * 1e9)
+            self._backend._clock.robot_time_ns += round(seconds * 1e9)
             sleep(seconds)
             for bus in self._buses:
                 self.find_emulator(bus.drives)()
 
-    def now_s(self) -> float:
+    def read_time_s(self) -> float:
         """Return the drives' own time."""
         return self.find_emulator(self._buses[0].drives).body.now_us * 1e-6
 
-    def torque_log(self) -> list[TorqueSwitch]:
+    def list_torque_switches(self) -> list[TorqueSwitch]:
         """Return when each drive has switched its torque on and off, by the drives' own time."""
         return list(self._log)
 
     def _log_switches(self, emulator: Any, joints: tuple[int, ...], is_on: list[bool], now_us: float) -> None:
-        for i, enabled in enumerate(self.list_enabled(emulator)):
+        for i, enabled in enumerate(self.list_enabled_of_bus(emulator)):
             if enabled != is_on[i]:
                 is_on[i] = enabled
-                self._log.append(TorqueSwitch(now_us * 1e-6, joints[i], on=enabled))
+                self._log.append(TorqueSwitch(now_us * 1e-6, joints[i], is_on=enabled))

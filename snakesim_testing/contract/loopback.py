@@ -28,22 +28,27 @@ from snakesim_hal.wire.messages import (
     Mode,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
-from snakesim_testing.contract.rig import HOLDER, JointTargets
+from snakesim_testing.contract.rig import LEASE_HOLDER, JointTargets
 
-LIMIT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
+TIMEOUT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
 Plan = Callable[[int], "JointTargets | None"]  # ticks since arming -> commanded joints; None: send nothing
 
 
-def stay(_ticks: int) -> JointTargets:
-    """Command no joint: all hold their position."""
+def hold_all_joints(_ticks: int) -> JointTargets:
+    """Plan that commands no joint, so that all hold their position."""
     return {}
 
 
-def wait_until(happened: Callable[[], Any], what: str) -> None:
-    """Wait until a condition holds. Fails with a description of the condition after LIMIT_S."""
-    deadline = time.monotonic() + LIMIT_S
-    while not happened():
-        assert time.monotonic() < deadline, f"not within {LIMIT_S} s: {what}"
+def wait_until(condition: Callable[[], Any], description: str) -> None:
+    """Wait until a condition returns a true value. Fails after TIMEOUT_S.
+
+    Args:
+        condition: The condition.
+        description: Description of the condition, for the failure.
+    """
+    deadline = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {TIMEOUT_S} s: {description}"
         time.sleep(0.002)
 
 
@@ -51,32 +56,32 @@ class RecordingBackend(Backend):
     """Forwards all calls to a backend, records the joint states, and can report a planted fault."""
 
     def __init__(self, inner: Backend) -> None:
-        self._inner = inner
+        self._backend = inner
         self.joint_states: list[JointState] = []
         # For each tick, a fault to report besides those of the backend.
         self.planted_fault: Callable[[int], Fault | None] | None = None
 
     def describe(self) -> Description:
-        return self._inner.describe()
+        return self._backend.describe()
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         """Sample the backend, and record the joint states."""
-        samples = self._inner.sample(tick, timestamp_ns)
+        samples = self._backend.sample(tick, timestamp_ns)
         self.joint_states.append(samples.joints)
         return samples
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        self._inner.enact(setpoints, lifecycle)
+        self._backend.enact(setpoints, lifecycle)
 
     def advance(self) -> None:
-        self._inner.advance()
+        self._backend.advance()
 
     def close(self) -> None:
-        self._inner.close()
+        self._backend.close()
 
     def faults(self) -> list[Fault]:
         """Return the faults of the backend, and the planted one."""
-        faults = self._inner.faults()
+        faults = self._backend.faults()
         planted = None
         if self.planted_fault is not None and self.joint_states:
             planted = self.planted_fault(self.joint_states[-1].tick)
@@ -86,77 +91,77 @@ class RecordingBackend(Backend):
 
 
 @dataclass
-class Controller:
-    """A control service that commands joints by a plan, which counts ticks from the arming.
+class PlannedController:
+    """A control service that commands joints by a plan, which is a function of the ticks since arming.
 
-    A host accepts commands only from the holder of its command lease, and only those that name the present lease epoch
-    and the present arm session. The epoch counts the leases, the arm session counts the armings. So a command from
+    A host accepts commands only from the holder of its command lease, and only those that name the current lease epoch
+    and the current arm session. The epoch counts the leases, the arm session counts the armings. So a command from
     before an arming never moves a joint after it.
     """
 
-    plan: Plan = stay
+    plan: Plan = hold_all_joints
     last_sent_tick: int = -1
-    epoch: int = 0  # lease epoch of the newest command that was sent
+    last_lease_epoch: int = 0  # lease epoch of the newest command that was sent
     arm_session: int = 0  # arm session of the newest command that was sent
-    stopped: threading.Event = field(default_factory=threading.Event)
+    stop_event: threading.Event = field(default_factory=threading.Event)
 
     def run(self, link: Link) -> None:
-        """Connect to the host and command it until stopped.
+        """Connect to the host, and command it until `stop_event` is set.
 
-        In every tick it acquires or renews the lease, and sends setpoints. Before an arming, these are the measured
-        positions, which the host requires for arming. From the first tick of an arm session, the setpoints are the
-        last measured positions with the changes of the plan.
+        In every tick the controller acquires or renews the lease, and sends setpoints. Before an arming, these are the
+        measured positions, which the host requires for arming. From the first tick of an arm session, the setpoints
+        are the last positions that were measured before it, with the changes of the plan.
 
         Args:
-            link: to the host.
+            link: How to reach the host.
         """
         with open_session(link) as session:
-            client = Client(session, HOLDER)
-            robot = client.description()
-            joints = client.subscribe(keys.JOINTS, JointState)
+            client = Client(session, LEASE_HOLDER)
+            robot = client.wait_for_description()
+            joint_state_subscription = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
             client.announce()
-            arm_session = -1  # the session that `armed_tick` is about
+            current_arm_session = -1  # the session that `armed_tick` is about
             armed_tick = -1  # first tick of that session
             held_setpoints: RequestedSetpoints | None = None  # that hold the newest positions from before the arming
-            for clock in client.ticks(silence_s=0.05):
-                if self.stopped.is_set():
+            for clock in client.iterate_ticks(silence_timeout_s=0.05):
+                if self.stop_event.is_set():
                     return
                 if clock is None:
                     continue
-                measured = client.read(joints)
-                if measured is None or not commander.ensure_lease(clock):
+                measured_joints = client.read(joint_state_subscription)
+                if measured_joints is None or not commander.ensure_lease(clock):
                     client.report_done(clock.tick)
                     continue
                 if clock.lifecycle != "armed" or held_setpoints is None:
-                    held_setpoints = commander.hold_position(measured)
-                elif clock.arm_session != arm_session:
-                    arm_session = clock.arm_session
+                    held_setpoints = commander.make_hold_setpoints(measured_joints)
+                elif clock.arm_session != current_arm_session:
+                    current_arm_session = clock.arm_session
                     armed_tick = clock.tick
                 setpoints = self._plan_setpoints(clock, held_setpoints, clock.tick - armed_tick)
                 if setpoints is not None:
-                    commander.send(clock, measured, setpoints)
+                    commander.send_command(clock, measured_joints, setpoints)
                     self.last_sent_tick = clock.tick
-                    self.epoch = clock.lease_epoch
+                    self.last_lease_epoch = clock.lease_epoch
                     self.arm_session = clock.arm_session
                     client.report_done(clock.tick)
 
     def _plan_setpoints(
-        self, clock: Clock, held_setpoints: RequestedSetpoints, ticks: int
+        self, clock: Clock, held_setpoints: RequestedSetpoints, ticks_since_arming: int
     ) -> RequestedSetpoints | None:
         """Return the setpoints of a tick: those that hold the position, changed by the plan while the robot is armed.
 
         Args:
-            clock: the tick, and the lifecycle state in it.
-            held_setpoints: setpoints that hold all joints.
-            ticks: since the arming.
+            clock: Clock message of the tick, with the lifecycle state.
+            held_setpoints: Setpoints that hold all joints.
+            ticks_since_arming: Number of ticks since the arming.
 
         Returns:
-            The setpoints; None if the plan sends nothing in this tick.
+            The setpoints, or None if the plan sends nothing in this tick.
         """
         targets: JointTargets | None = {}
         if clock.lifecycle == "armed":
-            targets = self.plan(ticks)
+            targets = self.plan(ticks_since_arming)
         if targets is None:
             return None
         mode = list(held_setpoints.mode)
@@ -167,37 +172,39 @@ class Controller:
         return RequestedSetpoints(mode, target, held_setpoints.torque_limit_nm)
 
 
-class Hosted:
-    """Runs host and controller in threads until `close`, each with its own session, and observes them."""
+class HostedBackend:
+    """The backend under test behind a real host, commanded by a real controller; both run in threads until `close`."""
 
     def __init__(self, backend: Backend, config: RunConfig) -> None:
         """Start a host with a backend, and a controller, in two threads that communicate over a loopback network.
 
         Args:
-            backend: the backend under test, whose calls are recorded.
-            config: configuration of the run.
+            backend: The backend under test, whose joint states are recorded.
+            config: Configuration of the run.
         """
         link = Link(f"tcp/127.0.0.1:{find_free_port()}", f"contract/{config.robot.name}")
         self.backend = RecordingBackend(backend)
-        self.controller = Controller()
+        self.controller = PlannedController()
         self.config = config
-        self.armed_at = 0  # tick of the newest sample when the robot was armed last
+        self.armed_tick = 0  # tick of the newest sample when the robot was armed last
         self._threads: list[threading.Thread] = []
-        self._opened = contextlib.ExitStack()
-        self._opened.callback(self.backend.close)
-        self._opened.callback(sys.setswitchinterval, sys.getswitchinterval())
+        self._exit_stack = contextlib.ExitStack()
+        self._exit_stack.callback(self.backend.close)
+        self._exit_stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; otherwise they are processes
         try:
-            host_session = self._opened.enter_context(open_session(replace(link, listen=True)))
+            host_session = self._exit_stack.enter_context(open_session(replace(link, listen=True)))
             self.host = Host(config, GuardedBackend(self.backend), host_session)
             self.robot = self.host.description
-            self.session: Session = self._opened.enter_context(open_session(link))
-            self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)
-            wait_until(self._commands.has_subscriber, "the host receives our commands")  # earlier ones are lost
-            self._start("host", self.host.run, self.host.stop)
-            self._start("controller", lambda: self.controller.run(link), self.controller.stopped.set)
+            self.session: Session = self._exit_stack.enter_context(open_session(link))
+            self._command_publisher = self.session.declare_publisher(keys.JOINT_COMMAND, JointCommand)
+            wait_until(
+                self._command_publisher.has_subscriber, "the host receives our commands"
+            )  # earlier ones are lost
+            self._start_thread("host", self.host.run, self.host.request_stop)
+            self._start_thread("controller", lambda: self.controller.run(link), self.controller.stop_event.set)
         except BaseException:
-            self._opened.close()
+            self._exit_stack.close()
             raise
 
     @property
@@ -205,77 +212,88 @@ class Hosted:
         """The tick of the newest sample."""
         return self.backend.joint_states[-1].tick if self.backend.joint_states else -1
 
-    def lifecycle(self, action: Any) -> Answer:
-        """Send a lifecycle request, which names the robot, the backend and the configuration."""
+    def request_lifecycle(self, action: Any) -> Answer:
+        """Send a lifecycle request to the host, and return the answer.
+
+        Args:
+            action: The requested action, such as "arm".
+        """
         robot = self.robot
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
         )
-        return self.session.request(keys.LIFECYCLE, request, timeout_s=10.0)
+        return self.session.send_request(keys.LIFECYCLE, request, timeout_s=10.0)
 
     def arm(self, plan: Plan) -> None:
-        """Arm from any state; the controller acts by the plan from then on."""
+        """Arm the robot from any state, and let the controller follow a plan. Fails if the host refuses for too long.
+
+        Args:
+            plan: Returns the commanded joints for a number of ticks since arming.
+        """
         if self.host.authority.state == "armed":
-            self.lifecycle("disarm")
+            self.request_lifecycle("disarm")
         elif self.host.authority.state != "disarmed":
-            self.lifecycle("reset")
+            self.request_lifecycle("reset")
         self.controller.plan = plan
-        deadline = time.monotonic() + LIMIT_S
-        while not (answer := self.lifecycle("arm")).ok and time.monotonic() < deadline:
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while not (response := self.request_lifecycle("arm")).ok and time.monotonic() < deadline_s:
             time.sleep(0.01)
-        assert answer.ok, f"the robot cannot be armed: {answer.reason}"
-        self.armed_at = self.tick
+        assert response.ok, f"the robot cannot be armed: {response.reason}"
+        self.armed_tick = self.tick
 
     def wait_for_lifecycle(self, state: LifecycleState) -> None:
-        """Wait for a lifecycle state."""
+        """Wait until the host is in a lifecycle state. Fails if the host ends in another state."""
         wait_until(
-            lambda: self.host.authority.state == state or not self._threads_live(),
+            lambda: self.host.authority.state == state or not self._are_threads_alive(),
             f"lifecycle {state}",
         )
         assert self.host.authority.state == state, self.host.authority.reason
 
-    def wait_for_ticks(self, periods: int) -> list[JointState]:
-        """Wait for this many more ticks, and return their joint states."""
-        since = len(self.backend.joint_states)
+    def wait_for_ticks(self, tick_count: int) -> list[JointState]:
+        """Wait until the host has run some more ticks, and return the joint states of these ticks."""
+        first_index = len(self.backend.joint_states)
         wait_until(
-            lambda: len(self.backend.joint_states) >= since + periods or not self._threads_live(), f"{periods} ticks"
+            lambda: len(self.backend.joint_states) >= first_index + tick_count or not self._are_threads_alive(),
+            f"{tick_count} ticks",
         )
-        assert len(self.backend.joint_states) >= since + periods, f"the host ended: {self.host.authority.reason}"
-        return self.backend.joint_states[since:]
+        assert len(self.backend.joint_states) >= first_index + tick_count, (
+            f"the host ended: {self.host.authority.reason}"
+        )
+        return self.backend.joint_states[first_index:]
 
-    def send_forged_command(self, **wrong: Any) -> None:
-        """Publish a command that would turn the first joint.
+    def send_forged_command(self, **invalid_fields: Any) -> None:
+        """Publish a command that would move the joints if the host accepted it.
 
         Args:
-            wrong: invalid values by field; all other fields are valid.
+            invalid_fields: Invalid values by name of the field; all other fields are valid.
         """
         count = len(self.robot.joints)
         valid_fields: dict[str, Any] = {
             "tick": self.tick,
             "sequence": 2**40,
-            "lease_epoch": self.controller.epoch,
+            "lease_epoch": self.controller.last_lease_epoch,
             "arm_session": self.controller.arm_session,
             "layout": self.robot.layout,
             "valid_for_ns": self.robot.lease_ns,
             "mode": [Mode.POSITION] * count,
             "target": [0.5] * count,
         }
-        self._commands.put(JointCommand(**(valid_fields | wrong)))
+        self._command_publisher.put(JointCommand(**(valid_fields | invalid_fields)))
 
     def close(self) -> None:
-        """Stop everything and close the backend."""
-        self._opened.close()
+        """Stop controller and host, and close their sessions and the backend."""
+        self._exit_stack.close()
 
-    def _start(self, name: str, run: Callable[[], None], stop: Callable[[], None]) -> None:
+    def _start_thread(self, name: str, run: Callable[[], None], stop: Callable[[], None]) -> None:
         thread = threading.Thread(target=run, name=name, daemon=True)
         self._threads.append(thread)
 
         def end() -> None:
             stop()
-            thread.join(LIMIT_S)
+            thread.join(TIMEOUT_S)
 
         thread.start()
-        self._opened.callback(end)
+        self._exit_stack.callback(end)
 
-    def _threads_live(self) -> bool:
+    def _are_threads_alive(self) -> bool:
         return all(thread.is_alive() for thread in self._threads)

@@ -1,31 +1,35 @@
 """The pytest plugin: options, fixtures and the table at the end. It does nothing until a contract test runs.
 
+A bench is the fixture around one backend under test: the backend with its settings, and a column of the table. A clause
+is one contract test, and a row of the table. The clauses of one test module are a section of the table.
+
 Its options are --snakesim-backend, -scenario, -set, -mute, -drives and -table. A repository with several benches
 implements `pytest_snakesim_benches` in a conftest.py and imports the tests; see docs/hardware/contract-suite.md.
 """
 
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
 if TYPE_CHECKING:  # nothing else of SnakeSIM is imported before it is used: every pytest run loads this module
     from snakesim_hal.wire.messages import Mode
     from snakesim_testing.contract.bench import Bench, EmulatedDrives
-    from snakesim_testing.contract.loopback import Hosted
-    from snakesim_testing.contract.recordings import Pushing
+    from snakesim_testing.contract.loopback import HostedBackend
+    from snakesim_testing.contract.recordings import PushRecording
     from snakesim_testing.contract.rig import Floats, Record, Rig
 
 pytest.register_assert_rewrite("snakesim_testing.contract.loopback", "snakesim_testing.contract.rig")
 
 # Properties of a test's report; pytest-xdist sends them from its workers, too.
-CLAUSE = "snakesim_clause"
-BENCH = "snakesim_bench"
+CLAUSE_PROPERTY = "snakesim_clause"
+BENCH_PROPERTY = "snakesim_bench"
 PACKAGE = "snakesim_testing.contract."
-WORST_FIRST = ("error", "fail", "skip", "pass")
+OUTCOMES_WORST_FIRST = ("error", "fail", "skip", "pass")
+MIN_COLUMN_WIDTH = 5  # of the longest outcome, "error"
 # Tests that share an opening of the backend are adjacent; those that need their own openings come last.
-SUBJECTS = (
+SECTION_ORDER = (
     "description",
     "samples",
     "modes",
@@ -42,11 +46,11 @@ _failed = pytest.StashKey[bool]()
 
 
 class Hooks:
-    """What a conftest.py may implement."""
+    """The hooks that a conftest.py may implement."""
 
     @staticmethod
     def pytest_snakesim_benches(config: pytest.Config) -> "list[Bench] | None":  # pyright: ignore[reportReturnType]
-        """Benches that the contract tests below this folder run on, when no --snakesim-backend is given."""
+        """Return the benches that the contract tests below this folder run on if --snakesim-backend is not given."""
 
 
 def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
@@ -79,8 +83,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Prepare the storage of benches, and the collector of outcomes."""
-    config.stash[_benches] = {}
-    config.pluginmanager.register(Outcomes(), "snakesim-outcomes")
+    config.stash[_bench_by_name] = {}
+    config.pluginmanager.register(OutcomeTable(), "snakesim-outcomes")
 
 
 # --- benches ---------------------------------------------------------------------------------------------------
@@ -90,9 +94,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run every contract test on every bench. All tests of a bench run in a row, so that it is rarely opened again."""
     if "bench" not in metafunc.fixturenames or not metafunc.function.__module__.startswith(PACKAGE):
         return
-    benches = _find_benches_in_options(metafunc.config)
+    benches = _get_bench_from_options(metafunc.config)
     if not benches:
-        benches = _find_benches_in_hook(metafunc)
+        benches = _get_benches_from_hook(metafunc)
     if not benches:
         raise pytest.UsageError(
             "contract tests need a backend: give --snakesim-backend NAME or --snakesim-backend ./file.py:Class"
@@ -102,10 +106,10 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort contract tests into the order of `SUBJECTS`; all other tests keep their positions."""
+    """Sort contract tests into the order of `SECTION_ORDER`; all other tests keep their positions."""
     positions = [i for i, item in enumerate(items) if _find_test_module(item).startswith(PACKAGE)]
     contract_tests = [items[i] for i in positions]
-    contract_tests.sort(key=lambda item: _sort_key(_find_test_module(item).removeprefix(PACKAGE)))
+    contract_tests.sort(key=lambda item: _compute_sort_position(_find_test_module(item).removeprefix(PACKAGE)))
     for i, item in zip(positions, contract_tests, strict=True):
         items[i] = item
 
@@ -115,14 +119,17 @@ def _find_test_module(item: pytest.Item) -> str:
     return getattr(getattr(item, "function", None), "__module__", "")
 
 
-_benches = pytest.StashKey["dict[str, Bench]"]()
-COMMAND_LINE = "--snakesim-backend"
+_bench_by_name = pytest.StashKey["dict[str, Bench]"]()
+COMMAND_LINE_BENCH = "--snakesim-backend"
 
 
-def _find_benches_in_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
-    """Return the benches of conftest.py files. The hook is called for every test; tests share a bench by its name."""
+def _get_benches_from_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
+    """Return the benches that conftest.py files offer for a test.
+
+    The hook makes new benches for every test. Of those with the same name, the first one is used by all tests.
+    """
     results: list[list[Bench] | None] = metafunc.definition.ihook.pytest_snakesim_benches(config=metafunc.config)
-    known = metafunc.config.stash[_benches]
+    known = metafunc.config.stash[_bench_by_name]
     benches: list[Bench] = []
     for result in results:
         for bench in result or ():
@@ -130,53 +137,57 @@ def _find_benches_in_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
     return benches
 
 
-def _find_benches_in_options(config: pytest.Config) -> "list[Bench]":
-    """Return the bench that the options describe, made once; empty if they name no backend."""
+def _get_bench_from_options(config: pytest.Config) -> "list[Bench]":
+    """Return the bench that the command line describes, which all tests share; empty if it names no backend."""
     backend = config.getoption("--snakesim-backend")
     if not backend:
         return []
-    known = config.stash[_benches]
-    if COMMAND_LINE not in known:
+    known = config.stash[_bench_by_name]
+    if COMMAND_LINE_BENCH not in known:
         from snakesim_hal.base.errors import ConfigError
 
         try:
-            known[COMMAND_LINE] = _make_bench_from_options(backend, config)
+            known[COMMAND_LINE_BENCH] = _make_bench_from_options(backend, config)
         except ConfigError as error:
             raise pytest.UsageError(str(error)) from error
-    return [known[COMMAND_LINE]]
+    return [known[COMMAND_LINE_BENCH]]
 
 
 def _make_bench_from_options(backend: str, config: pytest.Config) -> "Bench":
-    """Return the bench for a backend that the user has named on the command line.
+    """Make the bench for a backend that the user has named on the command line, and load its scenario.
+
+    A bench is the fixture around one backend under test: the backend with its settings.
 
     Args:
-        backend: name of an installed backend, or ./file.py:Class.
-        config: configuration of pytest, with the options of the suite.
+        backend: Name of an installed backend, or ./file.py:Class.
+        config: Configuration of pytest, with the options of the suite.
 
     Raises:
-        ConfigError: the backend or its scenario cannot be loaded.
+        ConfigError: The backend, its scenario or a plugin of the options cannot be loaded.
     """
-    from snakesim_hal.model.plugins import BACKENDS, find_plugin
-    from snakesim_testing.contract.bench import SCENARIO, Bench
+    from snakesim_hal.model.plugins import BACKENDS, load_plugin
+    from snakesim_testing.contract.bench import DEFAULT_SCENARIO, Bench
 
-    sets: list[str] = config.getoption("--snakesim-set") or []
-    mute: Any = config.getoption("--snakesim-mute")
-    drives: Any = config.getoption("--snakesim-drives")
+    overrides: list[str] = config.getoption("--snakesim-set") or []  # KEY=VALUE
+    # Functions that silence one joint, and that find the emulated drives. They are looked up like backends: by the
+    # name of an entry point, or as ./file.py:NAME.
+    mute_plugin: str | None = config.getoption("--snakesim-mute")
+    drives_plugin: str | None = config.getoption("--snakesim-drives")
     bench = Bench(
-        backend.rpartition(":")[2],
-        backend,
-        scenario=str(config.getoption("--snakesim-scenario") or SCENARIO),
-        sets=tuple(sets),
-        mute=find_plugin(BACKENDS, mute) if mute else None,
-        drives=find_plugin(BACKENDS, drives) if drives else None,
+        name=backend.rpartition(":")[2],
+        backend=backend,
+        scenario=str(config.getoption("--snakesim-scenario") or DEFAULT_SCENARIO),
+        overrides=tuple(overrides),
+        mute_joint=load_plugin(BACKENDS, mute_plugin) if mute_plugin else None,
+        make_emulated_drives=load_plugin(BACKENDS, drives_plugin) if drives_plugin else None,
     )
-    assert bench.config  # loads it here, so that a wrong setting is reported once and not by every test
+    bench.load_config()  # here, so that a wrong setting is reported once and not by every test
     return bench
 
 
 @pytest.fixture(scope="session")
 def bench(request: pytest.FixtureRequest) -> "Iterator[Bench]":
-    """Provide a backend under test, which is not opened yet."""
+    """Provide the bench of the backend under test, which is not opened yet, and close it after its last test."""
     bench: Bench = request.param
     if bench.unavailable is not None:
         pytest.skip(bench.unavailable)
@@ -186,9 +197,9 @@ def bench(request: pytest.FixtureRequest) -> "Iterator[Bench]":
 
 @pytest.fixture
 def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
-    """Provide the open backend at its start pose, at rest and disarmed. After a failed test it is reopened."""
-    rig = bench.shared_rig()
-    rig.go_home()
+    """Provide the open backend at its start pose, at rest and disarmed. After a failed test, it is reopened."""
+    rig = bench.get_shared_rig()
+    rig.return_home()
     yield rig
     if rig.late_periods > 1:
         warning = f"{bench.name}: this machine fell {rig.late_periods:.1f} periods behind real time"
@@ -201,16 +212,16 @@ def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
 @pytest.fixture
 def drives(bench: "Bench", rig: "Rig") -> "EmulatedDrives":
     """Return the emulated drives of the open backend."""
-    drives = bench.look_at_drives(rig.backend)
+    drives = bench.find_emulated_drives(rig.backend)
     if drives is None:
         pytest.skip("this bench has no emulated drives to look at; give --snakesim-drives")
     return drives
 
 
 @pytest.fixture
-def hosted(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Hosted]":
+def hosted(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[HostedBackend]":
     """Provide the backend behind a real host, with a controller. After a failed test both are reopened."""
-    yield bench.shared_host()
+    yield bench.get_shared_host()
     if request.node.stash.get(_failed, False):
         bench.reopen_for_next_test()
 
@@ -224,7 +235,7 @@ def healthy(bench: "Bench", request: pytest.FixtureRequest) -> "Record":
 
 
 @pytest.fixture
-def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "Pushing":
+def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "PushRecording":
     """Return two joints that push against their stops; recorded once for all tests."""
     from snakesim_testing.contract.recordings import record_push
 
@@ -234,9 +245,9 @@ def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "Pushing":
 @pytest.fixture
 def switching(bench: "Bench", request: pytest.FixtureRequest) -> "dict[tuple[Mode, Mode], Floats]":
     """Return one joint through every change of mode; recorded once for all tests."""
-    from snakesim_testing.contract.recordings import record_switching
+    from snakesim_testing.contract.recordings import record_mode_switches
 
-    return bench.record_once("switching", lambda: record_switching(request.getfixturevalue("rig")))
+    return bench.record_once("switching", lambda: record_mode_switches(request.getfixturevalue("rig")))
 
 
 # --- outcomes --------------------------------------------------------------------------------------------------
@@ -252,7 +263,7 @@ def pytest_runtest_makereport(
     if module.startswith(PACKAGE) and isinstance(item, pytest.Function) and hasattr(item, "callspec"):
         clause = f"{module.removeprefix(PACKAGE)}::{item.originalname}"
         bench: Any = item.callspec.params["bench"]
-        for name, value in ((CLAUSE, clause), (BENCH, bench.name)):
+        for name, value in ((CLAUSE_PROPERTY, clause), (BENCH_PROPERTY, bench.name)):
             if (name, value) not in report.user_properties:
                 report.user_properties.append((name, value))
         if report.failed:
@@ -260,21 +271,21 @@ def pytest_runtest_makereport(
     return report
 
 
-class Outcomes:
+class OutcomeTable:
     """Collects the outcome of every contract test on every bench, and prints them as one table."""
 
     def __init__(self) -> None:
-        # (module, clause) -> bench -> outcomes with the reason of a skip
-        self._rows: dict[tuple[str, str], dict[str, list[tuple[str, str]]]] = {}
+        # By module and clause, then by name of the bench: outcomes, each with the reason of a skip.
+        self._outcomes_by_clause: dict[tuple[str, str], dict[str, list[tuple[str, str]]]] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Store an outcome. With pytest-xdist this runs in the process that collects the reports."""
         properties = dict(report.user_properties)
-        if CLAUSE not in properties or (report.when != "call" and report.passed):
+        if CLAUSE_PROPERTY not in properties or (report.when != "call" and report.passed):
             return
-        module, _, clause = str(properties[CLAUSE]).partition("::")
-        row = self._rows.setdefault((module, clause), {})
-        outcomes = row.setdefault(str(properties[BENCH]), [])
+        module, _, clause = str(properties[CLAUSE_PROPERTY]).partition("::")
+        row = self._outcomes_by_clause.setdefault((module, clause), {})
+        outcomes = row.setdefault(str(properties[BENCH_PROPERTY]), [])
         outcome = _get_outcome(report)
         if outcome not in outcomes:
             outcomes.append(outcome)
@@ -283,22 +294,27 @@ class Outcomes:
         """Print the table of clauses with their outcome on each bench, and write it to the requested file.
 
         Args:
-            terminalreporter: prints lines at the end of a session.
-            config: configuration of pytest, with the options of the suite.
+            terminalreporter: Prints lines at the end of a session.
+            config: Configuration of pytest, with the options of the suite.
         """
-        if not self._rows:
+        if not self._outcomes_by_clause:
             return
-        benches = list(dict.fromkeys(bench for row in self._rows.values() for bench in row))
-        lines: list[list[str]] = []  # module, clause, and the worst outcome on each bench
+        clauses = sorted(
+            self._outcomes_by_clause, key=lambda module_and_clause: _compute_sort_position(module_and_clause[0])
+        )
+        bench_names = list(dict.fromkeys(name for by_bench in self._outcomes_by_clause.values() for name in by_bench))
+        rows: list[ResultRow] = []
         skip_reasons: list[str] = []
-        for (module, clause), row in sorted(self._rows.items(), key=lambda item: _sort_key(item[0][0])):
+        for module, clause in clauses:
+            outcomes_by_bench = self._outcomes_by_clause[module, clause]
             clause_text = _describe_clause(clause)
-            lines.append([module, clause_text, *(_find_worst_outcome(row.get(bench, [])) for bench in benches)])
-            for bench, outcomes in row.items():
-                skip_reasons += [f"{clause_text}, on {bench}: {reason}" for _, reason in outcomes if reason]
-        skip_reasons = _merge_reasons(skip_reasons)
+            worst_outcomes = [_find_worst_outcome(outcomes_by_bench.get(name, [])) for name in bench_names]
+            rows.append(ResultRow(module, clause_text, worst_outcomes))
+            for bench_name, outcomes in outcomes_by_bench.items():
+                skip_reasons += [f"{clause_text}, on {bench_name}: {reason}" for _, reason in outcomes if reason]
+        skip_reasons = _merge_skip_reasons(skip_reasons)
         terminalreporter.section("contract")
-        for line in format_plain_table(benches, lines):
+        for line in format_plain_table(bench_names, rows):
             terminalreporter.write_line(line)
         for reason in skip_reasons:
             terminalreporter.write_line(f"skipped: {reason}")
@@ -306,39 +322,56 @@ class Outcomes:
         if path:
             from snakesim_hal.model.textfiles import write_text
 
-            write_text(Path(path), format_markdown_table(benches, lines, skip_reasons))
+            write_text(Path(path), format_markdown_table(bench_names, rows, skip_reasons))
             terminalreporter.write_line(f"written to {path}")
 
 
-def format_plain_table(benches: list[str], lines: list[list[str]]) -> list[str]:
-    """Return the table for a terminal: one line a clause, below the name of its subject.
+class ResultRow(NamedTuple):
+    """One row of the table of results: a clause, which is one contract test, with its outcomes."""
+
+    module: str  # test module of the clause, such as `test_modes`
+    clause: str  # the clause in words
+    outcomes: list[str]  # worst outcome on each bench, in the order of the benches
+
+
+def format_plain_table(bench_names: list[str], rows: list[ResultRow]) -> list[str]:
+    """Format the table of results for a terminal: one row for each contract test, grouped by test module.
 
     Args:
-        benches: names of the columns.
-        lines: module, clause, and the outcome on each bench.
+        bench_names: Names of the benches, which are the headings of the columns. A bench is a backend under test.
+        rows: The results; rows of the same module are adjacent.
+
+    Returns:
+        The lines of the table.
     """
-    clause_width = max(len(line[1]) for line in lines)
-    widths = [max(len(bench), 5) for bench in benches]
-    heading = "".join(f"  {bench:>{width}}" for bench, width in zip(benches, widths, strict=True))
-    table = [" " * clause_width + heading]
+    clause_width = max(len(row.clause) for row in rows)
+    column_widths = [max(len(name), MIN_COLUMN_WIDTH) for name in bench_names]
+    heading = "".join(f"  {name:>{width}}" for name, width in zip(bench_names, column_widths, strict=True))
+    lines = [" " * clause_width + heading]
     previous_module = ""
-    for module, clause, *outcomes in lines:
-        if module != previous_module:
-            table.append(_name_subject(module).upper())
-            previous_module = module
-        cells = "".join(f"  {outcome:>{width}}" for outcome, width in zip(outcomes, widths, strict=True))
-        table.append(f"{clause:<{clause_width}}{cells}")
-    return table
-
-
-def format_markdown_table(benches: list[str], lines: list[list[str]], skip_reasons: list[str]) -> str:
-    """Return the table as Markdown, with the reasons of skipped clauses below."""
-    rows = [["subject", "contract", *benches], ["---"] * (2 + len(benches))]
-    for module, *cells in lines:
-        rows.append([_name_subject(module), *cells])
-    text = ""
     for row in rows:
-        text += "| " + " | ".join(row) + " |\n"
+        if row.module != previous_module:
+            lines.append(_format_section_title(row.module).upper())
+            previous_module = row.module
+        cells = "".join(f"  {outcome:>{width}}" for outcome, width in zip(row.outcomes, column_widths, strict=True))
+        lines.append(f"{row.clause:<{clause_width}}{cells}")
+    return lines
+
+
+def format_markdown_table(bench_names: list[str], rows: list[ResultRow], skip_reasons: list[str]) -> str:
+    """Format the table of results as Markdown, with the reasons of skipped clauses below.
+
+    Args:
+        bench_names: Names of the benches, which are the headings of the columns. A bench is a backend under test.
+        rows: The results of the contract tests.
+        skip_reasons: Sentences about clauses that were skipped.
+    """
+    table_rows = [["subject", "contract", *bench_names], ["---"] * (2 + len(bench_names))]
+    for row in rows:
+        table_rows.append([_format_section_title(row.module), row.clause, *row.outcomes])
+    text = ""
+    for table_row in table_rows:
+        text += "| " + " | ".join(table_row) + " |\n"
     for reason in skip_reasons:
         text += f"\nSkipped: {reason}\n"
     return text
@@ -359,10 +392,10 @@ def _get_outcome(report: pytest.TestReport) -> tuple[str, str]:
 def _find_worst_outcome(outcomes: list[tuple[str, str]]) -> str:
     """Return the worst of some outcomes; a dash if there is none."""
     words = [word for word, _ in outcomes]
-    return next((word for word in WORST_FIRST if word in words), "-")
+    return next((word for word in OUTCOMES_WORST_FIRST if word in words), "-")
 
 
-def _merge_reasons(reasons: list[str]) -> list[str]:
+def _merge_skip_reasons(reasons: list[str]) -> list[str]:
     """Merge clauses that were skipped for the same reason on the same bench, as on an unavailable one."""
     reasons_by_cause: dict[str, list[str]] = {}  # "BENCH: REASON" -> the full reasons
     for reason in reasons:
@@ -377,7 +410,7 @@ def _merge_reasons(reasons: list[str]) -> list[str]:
     return merged
 
 
-def _name_subject(module: str) -> str:
+def _format_section_title(module: str) -> str:
     return module.removeprefix("test_")
 
 
@@ -385,6 +418,6 @@ def _describe_clause(clause: str) -> str:
     return clause.removeprefix("test_").replace("_", " ")
 
 
-def _sort_key(module: str) -> int:
-    subject = _name_subject(module)
-    return SUBJECTS.index(subject) if subject in SUBJECTS else len(SUBJECTS)
+def _compute_sort_position(module: str) -> int:
+    subject = _format_section_title(module)
+    return SECTION_ORDER.index(subject) if subject in SECTION_ORDER else len(SECTION_ORDER)

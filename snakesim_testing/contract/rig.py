@@ -26,18 +26,18 @@ from snakesim_hal.wire.messages import (
     make_arm_request,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
-from snakesim_testing.contract import tolerances as t
+from snakesim_testing.contract import tolerances
 
 JointTargets = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
-HOLDER = "control"
-REANCHOR_PERIODS = 10
+LEASE_HOLDER = "control"
+MAX_LATE_PERIODS = 10
 
 
 def _no_sleep(_seconds: float) -> None:
     """Do not wait: in lockstep the time of drives does not pass by a clock."""
 
 
-def unlimited(requested: RequestedSetpoints) -> SafeSetpoints:
+def skip_limiter(requested: RequestedSetpoints) -> SafeSetpoints:
     """Return setpoints as safe ones without limiting them, for clauses about the ends of joints."""
     return SafeSetpoints(requested.mode, requested.target, requested.torque_limit_nm)
 
@@ -73,33 +73,33 @@ class Record:
 
 @dataclass
 class Rig:
-    """An open backend with the real safety core. Every clause that needs no network is tested on it."""
+    """An open backend under test that is driven by the real safety core, without a network."""
 
     backend: Backend
     clock_mode: ClockMode
     period_ns: int
-    spoiled: bool = False  # unusable for further tests: closed, or a joint is silent
-    closed: bool = False
+    must_reopen: bool = False  # unusable for further tests: closed, or a joint is silent
+    is_closed: bool = False
     tick: int = 0
     late_periods: float = 0.0  # how far this machine fell behind real time at worst
-    _intermediate_rad: dict[int, float] = field(
+    _position_targets_rad: dict[int, float] = field(
         default_factory=dict[int, float]
     )  # by joint: last position of a joint without velocity mode, which follows a speed
     _faults_by_tick: list[tuple[int, Fault]] = field(default_factory=list[tuple[int, Fault]])
 
     def __post_init__(self) -> None:
         self.robot = self.backend.describe()
-        self.count = len(self.robot.joints)
+        self.joint_count = len(self.robot.joints)
         self.full_torque_nm = [joint.torque_limit_nm for joint in self.robot.joints]
-        self._cycle = ControlCycle(self.backend, Authority(self.robot))
+        self._control_cycle = ControlCycle(self.backend, Authority(self.robot))
         self._sequence = 0
-        self._anchor_ns = time.monotonic_ns()
-        self._samples: list[Samples] = []
-        self._setpoints: list[SafeSetpoints] = []
+        self._real_time_origin_ns = time.monotonic_ns()
+        self._sample_history: list[Samples] = []
+        self._setpoint_history: list[SafeSetpoints] = []
         self.first_sample = self._sample()
         # On a bus the first joint states may take a few periods.
-        for _ in range(t.ARMING_PERIODS):
-            self.idle()
+        for _ in range(tolerances.ARMING_PERIODS):
+            self.wait_periods()
             if all(self.newest_joints.valid):
                 break
         self.home_rad = list(self.newest_joints.angle_rad)
@@ -108,7 +108,7 @@ class Rig:
     @property
     def authority(self) -> Authority:
         """The safety core that drives the robot."""
-        return self._cycle.safety
+        return self._control_cycle.safety
 
     # --- capabilities --------------------------------------------------------------------------------------
 
@@ -129,8 +129,8 @@ class Rig:
         """Skip the clause if joint 0 or 1 does not have these modes, or does not measure its torque.
 
         Args:
-            modes: modes that the clause uses.
-            torque: whether the clause reads measured torque.
+            modes: Modes that the clause uses.
+            torque: Whether the clause reads measured torque.
         """
         for joint in (0, 1):
             name = self.robot.joints[joint].name
@@ -141,10 +141,10 @@ class Rig:
                 pytest.skip(f"{name} is described without measured torque")
 
     def _next_position_rad(self, joint: int, speed_rad_s: float) -> float:
-        """Return where a joint is one period later at this speed."""
-        position_rad = self._intermediate_rad.get(joint, self.newest_joints.angle_rad[joint])
+        """Return the next position target of a joint that follows a speed, for joints without velocity mode."""
+        position_rad = self._position_targets_rad.get(joint, self.newest_joints.angle_rad[joint])
         position_rad = position_rad + speed_rad_s * self.period_ns * 1e-9
-        self._intermediate_rad[joint] = position_rad
+        self._position_targets_rad[joint] = position_rad
         return position_rad
 
     # --- readings ------------------------------------------------------------------------------------------
@@ -157,13 +157,13 @@ class Rig:
     @property
     def newest_joints(self) -> JointState:
         """The newest joint state."""
-        return self._samples[-1].joints
+        return self._sample_history[-1].joints
 
     def record_since(self, tick: int) -> Record:
-        """Return the record of everything after a tick."""
-        first = len(self._samples) - (self.tick - tick)
-        faults = [fault for found_at, fault in self._faults_by_tick if found_at >= tick]
-        return Record(self._samples[first:], self._setpoints[first - 1 :], faults)
+        """Return the record of all joint states, setpoints and faults since a tick."""
+        first_index = len(self._sample_history) - (self.tick - tick)
+        faults = [fault for fault_tick, fault in self._faults_by_tick if fault_tick >= tick]
+        return Record(self._sample_history[first_index:], self._setpoint_history[first_index - 1 :], faults)
 
     def count_periods(self, seconds: float) -> int:
         """Return the number of periods in a time, rounded up."""
@@ -178,30 +178,36 @@ class Rig:
 
     def advance_period(self, setpoints: SafeSetpoints | None = None) -> None:
         """Let a period pass and sample, as the host does. Faults go to the authority, as in the host."""
-        self._setpoints.append(setpoints or self._setpoints[-1])
-        for fault in self._cycle.advance():
+        self._setpoint_history.append(setpoints or self._setpoint_history[-1])
+        for fault in self._control_cycle.advance():
             self._faults_by_tick.append((self.tick, fault))
         self.tick += 1
         if self.clock_mode == "realtime":
             self._wait_for_deadline()
         self._sample()
 
-    def idle(self, periods: int = 1) -> Record:
-        """Let periods pass without a new command: the last one stays active while its lease lasts."""
+    def wait_periods(self, periods: int = 1) -> Record:
+        """Run some control periods without a new command. The last command stays active while its lease lasts.
+
+        Returns:
+            The record of these periods.
+        """
         first_tick = self.tick
         for _ in range(periods):
-            decision = self._cycle.decide(self._now_ns, self.tick)
-            self._cycle.enact(decision)
+            decision = self._control_cycle.compute_setpoints(self._now_ns, self.tick)
+            self._control_cycle.enact(decision)
             self.advance_period(decision.setpoints)
         return self.record_since(first_tick)
 
-    def drive(self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
+    def command_joints(
+        self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None
+    ) -> Record:
         """Command some joints while the others hold the start pose, through lease, command limiter and lifecycle.
 
         Args:
-            targets: mode and target by joint.
-            periods: how often the command is sent.
-            torque_limit_nm: of all joints; None: their full torque.
+            targets: Mode and target by joint index.
+            periods: Number of control periods; the command is sent in each of them.
+            torque_limit_nm: Torque limits of all joints. If None, each joint may use its full torque.
 
         Returns:
             The record of these periods.
@@ -209,23 +215,36 @@ class Rig:
         first_tick = self.tick
         for _ in range(periods):
             self._send(self.make_setpoints(targets, torque_limit_nm))
-            self.idle()
+            self.wait_periods()
         return self.record_since(first_tick)
 
     def send_command(self, setpoints: RequestedSetpoints) -> Record:
         """Send one command, and return the record of the period after it."""
         first_tick = self.tick
         self._send(setpoints)
-        self.idle()
+        self.wait_periods()
         return self.record_since(first_tick)
 
-    def press(self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
-        """Command some joints without the command limiter, which does not drive a joint against its stop."""
+    def command_without_limiter(
+        self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None
+    ) -> Record:
+        """Command some joints without the command limiter, which would not drive a joint against its end stop.
+
+        Args:
+            targets: Mode and target by joint index.
+            periods: Number of control periods; the command is sent in each of them.
+            torque_limit_nm: Torque limits of all joints. If None, each joint may use its full torque.
+
+        Returns:
+            The record of these periods.
+        """
         first_tick = self.tick
         for _ in range(periods):
             self._send(self.make_setpoints(dict.fromkeys(targets, (Mode.PASSIVE, 0.0))))
-            self._cycle.decide(self._now_ns, self.tick)
-            self.enact_without_limiter(unlimited(self.make_setpoints(targets, torque_limit_nm)), self.authority.state)
+            self._control_cycle.compute_setpoints(self._now_ns, self.tick)
+            self.enact_without_limiter(
+                skip_limiter(self.make_setpoints(targets, torque_limit_nm)), self.authority.state
+            )
         return self.record_since(first_tick)
 
     def make_setpoints(self, targets: JointTargets, torque_limit_nm: list[float] | None = None) -> RequestedSetpoints:
@@ -233,10 +252,10 @@ class Rig:
 
         A joint without velocity mode gets a position instead, which moves on at the speed with each call.
         """
-        mode = [Mode.POSITION] * self.count
+        mode = [Mode.POSITION] * self.joint_count
         target = list(self.home_rad)
-        for joint in self._intermediate_rad.keys() - targets.keys():
-            del self._intermediate_rad[joint]
+        for joint in self._position_targets_rad.keys() - targets.keys():
+            del self._position_targets_rad[joint]
         for joint, (joint_mode, joint_target) in targets.items():
             if joint_mode is Mode.VELOCITY and not self.supports_mode(joint, Mode.VELOCITY):
                 joint_mode = Mode.POSITION
@@ -249,8 +268,8 @@ class Rig:
         """Let time pass in which the host does nothing, as when its process is stopped and continued later.
 
         Args:
-            seconds: how long.
-            freeze_driver: freezes the driver for a time, with the given sleep; see `EmulatedDrives`.
+            seconds: Duration of the freeze.
+            freeze_driver: Freezes the driver for a duration in s, with a function that sleeps; see `EmulatedDrives`.
         """
         freeze_driver(seconds, time.sleep if self.clock_mode == "realtime" else _no_sleep)
         self.tick += self.count_periods(seconds)
@@ -258,17 +277,17 @@ class Rig:
     # --- the lifecycle -------------------------------------------------------------------------------------
 
     def arm(self) -> None:
-        """Arm at the present pose, and wait until the joint modules are armed."""
+        """Arm the robot at its current pose, and wait until the joint modules are armed. Fails if that is refused."""
         if self.authority.state == "armed":
             return
         if self.authority.state != "disarmed":
             self.disarm()
-            self.idle(t.TRANSPORT_PERIODS)
-        here = {i: (Mode.POSITION, angle) for i, angle in enumerate(self.newest_joints.angle_rad)}
-        self._send(self.make_setpoints(here))
-        answer = self.authority.on_lifecycle(make_arm_request(self.robot, "conformance"), self._now_ns)
-        assert answer.ok, f"the robot cannot be armed: {answer.reason}"
-        self.drive(here, t.ARMING_PERIODS)
+            self.wait_periods(tolerances.TRANSPORT_PERIODS)
+        measured_targets = {i: (Mode.POSITION, angle) for i, angle in enumerate(self.newest_joints.angle_rad)}
+        self._send(self.make_setpoints(measured_targets))
+        response = self.authority.handle_lifecycle_request(make_arm_request(self.robot, "conformance"), self._now_ns)
+        assert response.ok, f"the robot cannot be armed: {response.reason}"
+        self.command_joints(measured_targets, tolerances.ARMING_PERIODS)
         self.assert_armed()
 
     def assert_armed(self) -> None:
@@ -276,68 +295,82 @@ class Rig:
         assert self.authority.state == "armed", f"no longer armed: {self.authority.reason}"
 
     def disarm(self) -> None:
-        """Disarm; or reset a stop."""
+        """Disarm an armed robot; reset a robot that was stopped."""
         if self.authority.state == "armed":
-            self.authority.on_lifecycle(LifecycleRequest(action="disarm"), self._now_ns)
+            self.authority.handle_lifecycle_request(LifecycleRequest(action="disarm"), self._now_ns)
         else:
             self.reset()
 
     def reset(self) -> None:
-        """Reset a stop, and end isolations."""
-        self.authority.on_lifecycle(LifecycleRequest(action="reset"), self._now_ns)
+        """Request a reset, which ends a fault or an emergency stop, and the isolation of joints."""
+        self.authority.handle_lifecycle_request(LifecycleRequest(action="reset"), self._now_ns)
 
-    def estop(self) -> None:
+    def trigger_estop(self) -> None:
         """Trigger an emergency stop."""
-        self.authority.on_estop(EstopRequest(requester="bench"), self.tick)
+        self.authority.handle_estop_request(EstopRequest(requester="bench"), self.tick)
 
-    def fault(self) -> None:
-        """Report a fault to the authority which the backend has not reported."""
-        self.authority.fault(Fault(tick=self.tick, what="bench", cause="planted by the contract tests"))
+    def report_fault(self) -> None:
+        """Report a fault to the authority that the backend itself has not reported."""
+        self.authority.latch_fault(Fault(tick=self.tick, what="bench", cause="planted by the contract tests"))
 
     @contextlib.contextmanager
     def with_isolation_allowed(self) -> Iterator[None]:
-        """Allow the isolation of one failed joint, whatever the robot file allows. Begins and ends disarmed."""
-        usual_cycle = self._cycle
-        tolerant = Authority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
-        self._cycle = ControlCycle(self.backend, tolerant)
-        self.idle()
+        """Allow the isolation of one failed joint within the context, whatever the robot file allows.
+
+        The robot is disarmed at the begin and at the end of the context.
+        """
+        usual_cycle = self._control_cycle
+        tolerant_authority = Authority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
+        self._control_cycle = ControlCycle(self.backend, tolerant_authority)
+        self.wait_periods()
         yield
         self.disarm()
-        self.idle()
-        self._cycle = usual_cycle
-        self.idle()
+        self.wait_periods()
+        self._control_cycle = usual_cycle
+        self.wait_periods()
 
     def isolate_joint(self, joint: int) -> None:
-        """Isolate a joint, as after a failure."""
+        """Isolate a joint, by reporting a fault of this joint alone."""
         name = self.robot.joints[joint].name
         cause = f"the contract tests isolate {name}"
-        self.authority.fault(Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint"))
+        self.authority.latch_fault(Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint"))
 
-    def cruise(self, joint: int = 0) -> Record:
-        """Arm, and move one joint at constant speed."""
+    def arm_and_move_joint(self, joint: int = 0) -> Record:
+        """Arm the robot, and move one joint at constant speed. Fails if the joint does not move.
+
+        Args:
+            joint: Index of the joint.
+
+        Returns:
+            The record of the motion.
+        """
         self.arm()
-        record = self.drive({joint: (Mode.VELOCITY, t.CRUISE_RAD_S)}, self.count_periods(t.CRUISE_S))
+        record = self.command_joints(
+            {joint: (Mode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}, self.count_periods(tolerances.MOTION_DURATION_S)
+        )
         self.assert_armed()
-        moved = record.angle_rad[-1, joint] - record.angle_rad[0, joint]
-        assert moved > t.STILL_RAD, f"joint {joint} does not move in velocity mode, so stopping cannot be tested"
+        moved_rad = record.angle_rad[-1, joint] - record.angle_rad[0, joint]
+        assert moved_rad > tolerances.STANDSTILL_RAD, (
+            f"joint {joint} does not move in velocity mode, so stopping cannot be tested"
+        )
         return record
 
-    def go_home(self) -> None:
+    def return_home(self) -> None:
         """Bring every joint back to the start pose, at rest and disarmed."""
         is_home = self._is_home()
         if self.authority.state == "armed" or not is_home:
             if not is_home:
                 self.arm()
-                self.drive({}, self.count_periods(t.SETTLE_S))
+                self.command_joints({}, self.count_periods(tolerances.SETTLING_TIME_S))
             self.disarm()
-            self.idle(t.TRANSPORT_PERIODS)
+            self.wait_periods(tolerances.TRANSPORT_PERIODS)
         elif self.authority.state != "disarmed":
             self.disarm()
-            self.idle()
+            self.wait_periods()
 
     def close(self) -> None:
         """Close the backend; safe to call again."""
-        self.spoiled = self.closed = True
+        self.must_reopen = self.is_closed = True
         self.backend.close()
 
     # --- inside --------------------------------------------------------------------------------------------
@@ -347,13 +380,16 @@ class Rig:
         return self.tick * self.period_ns
 
     def _is_home(self) -> bool:
-        away = np.abs(np.array(self.newest_joints.angle_rad) - self.home_rad)
-        return bool(away.max() < t.REACHED_RAD and np.abs(self.newest_joints.velocity_rad_s).max() < t.STILL_RAD_S)
+        deviation_rad = np.abs(np.array(self.newest_joints.angle_rad) - self.home_rad)
+        return bool(
+            deviation_rad.max() < tolerances.POSITION_TOLERANCE_RAD
+            and np.abs(self.newest_joints.velocity_rad_s).max() < tolerances.STANDSTILL_RAD_S
+        )
 
     def _send(self, setpoints: RequestedSetpoints) -> None:
         """Send a command to the authority; the clause sees a rejection in the joint states."""
-        if self.authority.state == "disarmed" and not self.authority.lease.is_live(self._now_ns):
-            self.authority.on_lease(LeaseRequest(action="acquire", holder=HOLDER), self._now_ns)
+        if self.authority.state == "disarmed" and not self.authority.lease.is_held(self._now_ns):
+            self.authority.handle_lease_request(LeaseRequest(action="acquire", holder=LEASE_HOLDER), self._now_ns)
         self._sequence += 1
         command = JointCommand(
             tick=self.tick,
@@ -366,19 +402,19 @@ class Rig:
             target=setpoints.target,
             torque_limit_nm=setpoints.torque_limit_nm,
         )
-        self.authority.offer_command(command, now_ns=self._now_ns, tick=self.tick, age_ns=0)
+        self.authority.process_command(command, now_ns=self._now_ns, tick=self.tick, age_ns=0)
 
     def _sample(self) -> Samples:
-        samples = self._cycle.sample(self.tick, self._now_ns)
-        self._cycle.observe(samples, self._now_ns)
-        self._samples.append(samples)
+        samples = self._control_cycle.sample(self.tick, self._now_ns)
+        self._control_cycle.process_samples(samples, self._now_ns)
+        self._sample_history.append(samples)
         return samples
 
     def _wait_for_deadline(self) -> None:
-        left_ns = self._anchor_ns + self._now_ns - time.monotonic_ns()
-        if left_ns > 0:
-            time.sleep(left_ns * 1e-9)
+        remaining_ns = self._real_time_origin_ns + self._now_ns - time.monotonic_ns()
+        if remaining_ns > 0:
+            time.sleep(remaining_ns * 1e-9)
             return
-        self.late_periods = max(self.late_periods, -left_ns / self.period_ns)
-        if -left_ns > REANCHOR_PERIODS * self.period_ns:
-            self._anchor_ns -= left_ns
+        self.late_periods = max(self.late_periods, -remaining_ns / self.period_ns)
+        if -remaining_ns > MAX_LATE_PERIODS * self.period_ns:
+            self._real_time_origin_ns -= remaining_ns

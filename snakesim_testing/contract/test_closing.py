@@ -9,51 +9,54 @@ from snakesim_hal.backend import Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import JointState, Mode
-from snakesim_testing.contract import tolerances as t
+from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.contract.rig import Rig, unlimited
-from snakesim_testing.contract.test_lifecycle import GO
+from snakesim_testing.contract.rig import Rig, skip_limiter
+from snakesim_testing.contract.test_lifecycle import MOVE_JOINT_0
 
 
-def keep_using(rig: Rig) -> list[JointState]:
-    """Go on as if nothing had happened. A closed backend may raise BackendError, and nothing else."""
-    seen: list[JointState] = []
-    for tick in range(rig.tick + 1, rig.tick + 1 + t.CLOSING_PERIODS):
+def use_closed_backend(rig: Rig) -> list[JointState]:
+    """Call every method of a closed backend for some periods, and return the joint states that it still reports.
+
+    A closed backend may raise BackendError, and nothing else.
+    """
+    joint_states: list[JointState] = []
+    for tick in range(rig.tick + 1, rig.tick + 1 + tolerances.CLOSING_PERIODS):
         with contextlib.suppress(BackendError):
-            rig.backend.enact(unlimited(rig.make_setpoints(GO)), "armed")
+            rig.backend.enact(skip_limiter(rig.make_setpoints(MOVE_JOINT_0)), "armed")
         with contextlib.suppress(BackendError):
             rig.backend.advance()
         with contextlib.suppress(BackendError):
             rig.backend.faults()
         with contextlib.suppress(BackendError):
-            seen.append(rig.backend.sample(tick, tick * rig.period_ns).joints)
-    return seen
+            joint_states.append(rig.backend.sample(tick, tick * rig.period_ns).joints)
+    return joint_states
 
 
 def test_a_closed_backend_drives_nothing(bench: Bench, rig: Rig) -> None:
-    """Closed while a joint moves, and handed setpoints afterwards: nothing is driven any more."""
-    rig.cruise()
-    before = rig.newest_joints.angle_rad[0]
+    """A backend that is closed while a joint moves drives no joint any more, even if it gets setpoints."""
+    rig.arm_and_move_joint()
+    start_angle_rad = rig.newest_joints.angle_rad[0]
     rig.close()
-    went = max((abs(joints.angle_rad[0] - before) for joints in keep_using(rig)), default=0.0)
-    coasting = 0.5 * t.CRUISE_RAD_S * t.CLOSING_PERIODS * rig.period_ns * 1e-9
-    assert went < coasting, f"it went on by {went:.3f} rad"
+    moved_rad = max((abs(joints.angle_rad[0] - start_angle_rad) for joints in use_closed_backend(rig)), default=0.0)
+    max_coasting_rad = 0.5 * tolerances.MOTION_SPEED_RAD_S * tolerances.CLOSING_PERIODS * rig.period_ns * 1e-9
+    assert moved_rad < max_coasting_rad, f"it went on by {moved_rad:.3f} rad"
 
 
 def test_closing_twice_does_no_harm(bench: Bench) -> None:
-    """Also right after opening, before anything was sampled; the host closes after errors of every kind."""
+    """A backend can be closed twice, also right after opening, because the host closes it after errors of any kind."""
     backend = bench.open()
     backend.close()
     backend.close()
 
 
 def test_a_backend_opens_again_after_it_was_closed(bench: Bench) -> None:
-    """In the same process, as after the first opening: disarmed, at rest, and it moves when it is armed."""
+    """A backend that was closed opens again in the same process: disarmed, at rest, and able to move once armed."""
     if not bench.was_opened:
         bench.open().close()
-    again = bench.open_rig()
-    assert np.abs(again.newest_joints.velocity_rad_s).max() < t.STILL_RAD_S
-    again.cruise()
+    rig = bench.open_rig()
+    assert np.abs(rig.newest_joints.velocity_rad_s).max() < tolerances.STANDSTILL_RAD_S
+    rig.arm_and_move_joint()
 
 
 def test_in_lockstep_same_seed_and_commands_give_same_samples(bench: Bench) -> None:
@@ -61,17 +64,18 @@ def test_in_lockstep_same_seed_and_commands_give_same_samples(bench: Bench) -> N
     if bench.clock_mode != "lockstep":
         pytest.skip("this backend supports real time only, which is not exactly repeatable")
 
-    def once() -> list[Samples]:
+    def run_once() -> list[Samples]:
         rig = bench.open_rig()
-        rig.cruise()
-        rig.drive(
-            {0: (Mode.TORQUE, -0.1), 1: (Mode.POSITION, rig.home_rad[1] + t.STEP_RAD)}, rig.count_periods(t.CRUISE_S)
+        rig.arm_and_move_joint()
+        rig.command_joints(
+            {0: (Mode.TORQUE, -0.1), 1: (Mode.POSITION, rig.home_rad[1] + tolerances.STEP_RAD)},
+            rig.count_periods(tolerances.MOTION_DURATION_S),
         )
-        rig.estop()
-        rig.idle(t.ARMING_PERIODS)
+        rig.trigger_estop()
+        rig.wait_periods(tolerances.ARMING_PERIODS)
         return rig.record_since(1).samples
 
-    first, second = once(), once()
+    first, second = run_once(), run_once()
     for a, b in zip(first, second, strict=True):
         assert a.joints == b.joints, f"tick {a.joints.tick}"
-        assert encode(dict(a.others)) == encode(dict(b.others)), f"tick {a.joints.tick}"
+        assert encode(dict(a.by_key)) == encode(dict(b.by_key)), f"tick {a.joints.tick}"

@@ -6,45 +6,49 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.contract import tolerances as t
+from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import EmulatedDrives
 from snakesim_testing.contract.rig import Rig
 
 
 def do_nothing(_rig: Rig) -> None:
-    """Do nothing: the host finds by itself that it was away."""
+    """Do nothing: the host detects by itself that it was frozen."""
 
 
-@pytest.mark.parametrize("then", [do_nothing, Rig.disarm, Rig.estop], ids=["goes_on", "disarm", "estop"])
+@pytest.mark.parametrize(
+    "act_after_freeze", [do_nothing, Rig.disarm, Rig.trigger_estop], ids=["goes_on", "disarm", "estop"]
+)
 def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
-    rig: Rig, drives: EmulatedDrives, then: Callable[[Rig], None]
+    rig: Rig, drives: EmulatedDrives, act_after_freeze: Callable[[Rig], None]
 ) -> None:
-    """A host that does nothing for 1 s while a joint moves: every drive stops by its own watchdog.
+    """A host that does nothing for 1 s while a joint moves: every drive switches off by its own watchdog.
 
     Once the host resumes, the backend reports each of those stops as a fault of its joint, whatever the operator asks
     for first. No drive is enabled again before the fault is reset and the robot armed.
     """
-    unguarded = rig.joints_without_watchdog
-    if unguarded:
-        pytest.skip(f"described without a watchdog, so they hold while the host is frozen: {unguarded}")
-    rig.cruise()
-    rig.spoiled = True
-    assert all(drives.enabled()), f"armed, and enabled are {drives.enabled()}"
-    began = rig.tick
-    rig.freeze_host(t.FROZEN_S, drives.freeze_driver)
-    assert not any(drives.enabled()), f"{t.FROZEN_S} s without the driver, and still enabled are {drives.enabled()}"
-    then(rig)
-    assert_drives_stay_off(rig, drives, rig.count_periods(t.SETTLE_S))
-    record = rig.record_since(began)
-    named = {fault.joint for fault in record.faults if fault.cause}
-    silent = [joint.name for joint in rig.robot.joints if joint.name not in named]
-    assert not silent, f"their stop was never reported: {silent}; reported were {record.faults}"
+    joints_without_watchdog = rig.joints_without_watchdog
+    if joints_without_watchdog:
+        pytest.skip(f"described without a watchdog, so they hold while the host is frozen: {joints_without_watchdog}")
+    rig.arm_and_move_joint()
+    rig.must_reopen = True
+    assert all(drives.list_enabled()), f"armed, and enabled are {drives.list_enabled()}"
+    start_tick = rig.tick
+    rig.freeze_host(tolerances.FREEZE_DURATION_S, drives.freeze_driver)
+    assert not any(drives.list_enabled()), (
+        f"{tolerances.FREEZE_DURATION_S} s without the driver, and still enabled are {drives.list_enabled()}"
+    )
+    act_after_freeze(rig)
+    assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
+    record = rig.record_since(start_tick)
+    reported_joints = {fault.joint for fault in record.faults if fault.cause}
+    unreported_joints = [joint.name for joint in rig.robot.joints if joint.name not in reported_joints]
+    assert not unreported_joints, f"their stop was never reported: {unreported_joints}; reported were {record.faults}"
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
     rig.reset()
-    assert_drives_stay_off(rig, drives, t.ARMING_PERIODS)
+    assert_drives_stay_off(rig, drives, tolerances.ARMING_PERIODS)
     reset_tick = rig.tick
-    rig.cruise()
-    assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
+    rig.arm_and_move_joint()
+    assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
     assert not rig.record_since(reset_tick).faults, rig.record_since(reset_tick).faults
 
 
@@ -54,43 +58,43 @@ def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: Rig, driv
     Once it resumes, the backend switches each of them off at once, reports it as a fault of its joint, and enables none
     before the fault is reset and the robot armed.
     """
-    unguarded = rig.joints_without_watchdog
-    if not unguarded:
+    joints_without_watchdog = rig.joints_without_watchdog
+    if not joints_without_watchdog:
         pytest.skip("every joint is described with a watchdog")
-    rig.cruise()
-    rig.spoiled = True
-    began = rig.tick
-    rig.freeze_host(t.FROZEN_S, drives.freeze_driver)
-    rig.idle(t.TRANSPORT_PERIODS)
-    assert_drives_stay_off(rig, drives, rig.count_periods(t.SETTLE_S))
-    record = rig.record_since(began)
-    named = {fault.joint for fault in record.faults if fault.cause}
-    assert named >= {*unguarded}, f"reported were {record.faults}"
+    rig.arm_and_move_joint()
+    rig.must_reopen = True
+    start_tick = rig.tick
+    rig.freeze_host(tolerances.FREEZE_DURATION_S, drives.freeze_driver)
+    rig.wait_periods(tolerances.TRANSPORT_PERIODS)
+    assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
+    record = rig.record_since(start_tick)
+    reported_joints = {fault.joint for fault in record.faults if fault.cause}
+    assert reported_joints >= {*joints_without_watchdog}, f"reported were {record.faults}"
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
     rig.reset()
-    assert_drives_stay_off(rig, drives, t.ARMING_PERIODS)
-    rig.cruise()
-    assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
+    assert_drives_stay_off(rig, drives, tolerances.ARMING_PERIODS)
+    rig.arm_and_move_joint()
+    assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
 
 
 def assert_drives_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:
-    """Fail if a drive is enabled at any time."""
+    """Fail if a drive is enabled after any of some periods without a command."""
     for _ in range(periods):
-        rig.idle()
-        assert not any(drives.enabled()), f"enabled again, in state {rig.authority.state}: {drives.enabled()}"
+        rig.wait_periods()
+        assert not any(drives.list_enabled()), f"enabled again, in state {rig.authority.state}: {drives.list_enabled()}"
 
 
 def test_drives_brake_after_fault_and_are_off_after_watchdog(rig: Rig, drives: EmulatedDrives) -> None:
-    """A fault that the driver gets: the drive of a moving joint brakes, for its watchdog's time at most."""
-    rig.cruise()
-    rig.fault()
-    rig.idle()
+    """A fault while a joint moves: its drive brakes the joint, but no longer than the drive's watchdog lasts."""
+    rig.arm_and_move_joint()
+    rig.report_fault()
+    rig.wait_periods()
     if rig.supports_mode(
         0, Mode.VELOCITY
     ):  # otherwise the joint is led to rest by its position, which takes less than a period
-        assert drives.enabled()[0], "the joint moves, and its drive does not brake"
-    rig.idle(rig.count_periods(t.BRAKES_S) + t.TRANSPORT_PERIODS)
-    assert_drives_stay_off(rig, drives, rig.count_periods(t.SETTLE_S))
-    assert np.abs(rig.newest_joints.velocity_rad_s).max() < t.STILL_RAD_S, (
+        assert drives.list_enabled()[0], "the joint moves, and its drive does not brake"
+    rig.wait_periods(rig.count_periods(tolerances.MAX_BRAKING_S) + tolerances.TRANSPORT_PERIODS)
+    assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
+    assert np.abs(rig.newest_joints.velocity_rad_s).max() < tolerances.STANDSTILL_RAD_S, (
         f"still moving: {rig.newest_joints.velocity_rad_s} rad/s"
     )

@@ -9,92 +9,105 @@ import pytest
 
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.contract import tolerances as t
+from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import EmulatedDrives
 from snakesim_testing.contract.faults import inject_or_skip
 from snakesim_testing.contract.rig import JointTargets, Rig
 from snakesim_testing.contract.test_drives import assert_drives_stay_off
 
-GO: JointTargets = {0: (Mode.VELOCITY, t.CRUISE_RAD_S)}
+MOVE_JOINT_0: JointTargets = {0: (Mode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}
+
+# Injected faults, as KIND:TARGET@BEGIN-END with times in s of robot time; the tests begin and end them by themselves.
+BUS_1_LOST = "cut:bus_1@0-9"
+JOINT_2_DUPLICATED = "duplicate:joint_2@0-9"
 
 
-@pytest.mark.parametrize("stop", [Rig.disarm, Rig.estop], ids=["disarm", "estop"])
+@pytest.mark.parametrize("stop", [Rig.disarm, Rig.trigger_estop], ids=["disarm", "estop"])
 def test_torque_is_off_in_time_by_the_drives_own_log(
     rig: Rig, drives: EmulatedDrives, stop: Callable[[Rig], None]
 ) -> None:
-    """Disarmed or stopped in motion: every drive has switched its torque off a few periods later."""
-    rig.cruise()
-    began_s = drives.now_s()
+    """A robot that is disarmed or stopped in motion: every drive has switched its torque off a few periods later."""
+    rig.arm_and_move_joint()
+    start_s = drives.read_time_s()
     stop(rig)
-    rig.idle(rig.count_periods(t.SETTLE_S))
-    assert_switched_off(rig, drives, began_s, t.OFF_PERIODS * rig.period_ns * 1e-9)
+    rig.wait_periods(rig.count_periods(tolerances.SETTLING_TIME_S))
+    assert_switched_off(rig, drives, start_s, tolerances.TORQUE_OFF_PERIODS * rig.period_ns * 1e-9)
 
 
 def test_torque_is_off_after_watchdog_by_the_drives_own_log(rig: Rig, drives: EmulatedDrives) -> None:
-    """A host that does nothing while a joint moves: every drive switches off by its own watchdog, in its time."""
-    unguarded = rig.joints_without_watchdog
-    if unguarded:
-        pytest.skip(f"described without a watchdog, so they hold while the host does nothing: {unguarded}")
-    rig.cruise()
-    rig.spoiled = True
-    began_s = drives.now_s()
-    rig.freeze_host(t.FROZEN_S, drives.freeze_driver)
-    assert_switched_off(rig, drives, began_s, t.WATCHDOG_OFF_S)
+    """A host that does nothing while a joint moves: every drive switches its torque off by its watchdog, in time."""
+    joints_without_watchdog = rig.joints_without_watchdog
+    if joints_without_watchdog:
+        pytest.skip(
+            f"described without a watchdog, so they hold while the host does nothing: {joints_without_watchdog}"
+        )
+    rig.arm_and_move_joint()
+    rig.must_reopen = True
+    start_s = drives.read_time_s()
+    rig.freeze_host(tolerances.FREEZE_DURATION_S, drives.freeze_driver)
+    assert_switched_off(rig, drives, start_s, tolerances.MAX_WATCHDOG_OFF_S)
 
 
 def test_a_drive_restarted_in_motion_stays_off_until_reset(rig: Rig, drives: EmulatedDrives) -> None:
-    """The drive of a moving joint restarts: the fault names it, and all drives are off until reset and arming."""
-    rig.cruise()
-    rig.spoiled = True
-    began = rig.tick
+    """The drive of a moving joint restarts: a fault names the joint, and all drives are off until reset and arming."""
+    rig.arm_and_move_joint()
+    rig.must_reopen = True
+    start_tick = rig.tick
     inject_or_skip(rig, "reboot:joint_1@0")
-    rig.drive(GO, rig.count_periods(t.RESTART_S))
-    assert_fault_names_joint(rig, began, 0)
+    rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
+    assert_fault_names_joint(rig, start_tick, 0)
     assert_recovers_by_reset_alone(rig, drives)
 
 
 def test_two_drives_with_one_id_stop_the_robot(rig: Rig, drives: EmulatedDrives) -> None:
-    """A second drive with the id of a joint's drive is a fault, also after a reset, until it is gone."""
-    rig.cruise()
-    rig.spoiled = True
-    began = rig.tick
-    inject_or_skip(rig, "duplicate:joint_2@0-9")
-    rig.drive(GO, rig.count_periods(t.SETTLE_S))
-    assert_fault_names_joint(rig, began, 1)
-    assert "duplicate_node" in {fault.what for fault in rig.record_since(began).faults}, rig.record_since(began).faults
+    """A second drive with the id of a joint's drive is a fault, also after a reset, until the second drive is gone."""
+    rig.arm_and_move_joint()
+    rig.must_reopen = True
+    start_tick = rig.tick
+    inject_or_skip(rig, JOINT_2_DUPLICATED)
+    rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S))
+    assert_fault_names_joint(rig, start_tick, 1)
+    assert "duplicate_node" in {fault.what for fault in rig.record_since(start_tick).faults}, rig.record_since(
+        start_tick
+    ).faults
     rig.reset()
-    rig.idle(rig.count_periods(t.SETTLE_S))
+    rig.wait_periods(rig.count_periods(tolerances.SETTLING_TIME_S))
     assert rig.authority.state == "fault", "reset while the second drive is still there, and the robot may be armed"
-    rig.backend.inject(parse_injection("duplicate:joint_2@0-9"), begins=False)
+    rig.backend.inject(parse_injection(JOINT_2_DUPLICATED), begins=False)  # ends the fault
     assert_recovers_by_reset_alone(rig, drives)
 
 
 def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: Rig, drives: EmulatedDrives) -> None:
-    """Nothing passes the bus for a while: its drives stop by their watchdogs, and stay off when it works again.
+    """A bus loses all frames in motion: the drives on it are disabled, and stay disabled once frames pass again.
 
-    Drives that are described without a watchdog hold meanwhile, and the driver switches them off when it works again.
+    Drives with a watchdog switch their torque off by themselves while the bus is lost. Drives that are described
+    without a watchdog hold their joints until the bus works again, and are then switched off by the driver. In both
+    cases the robot is at fault, and no drive is enabled again before a reset and an arming.
     """
-    unguarded = rig.joints_without_watchdog
-    rig.cruise()
-    rig.spoiled = True
-    began = rig.tick
-    began_s = drives.now_s()
-    inject_or_skip(rig, "cut:bus_1@0-9")
-    rig.drive(GO, rig.count_periods(t.FROZEN_S))
+    joints_without_watchdog = rig.joints_without_watchdog
+    rig.arm_and_move_joint()
+    rig.must_reopen = True
+    start_tick = rig.tick
+    start_s = drives.read_time_s()
+    inject_or_skip(rig, BUS_1_LOST)
+    rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.FREEZE_DURATION_S))
     assert rig.authority.state == "fault", "the bus is lost, and the robot continues"
-    assert rig.record_since(began).faults
-    if (
-        not unguarded and drives.now_s() > began_s + t.WATCHDOG_OFF_S
-    ):  # in lockstep the time of some drives comes by the bus
-        assert_switched_off(rig, drives, began_s, t.WATCHDOG_OFF_S + t.TRANSPORT_PERIODS * rig.period_ns * 1e-9)
-    rig.backend.inject(parse_injection("cut:bus_1@0-9"), begins=False)
-    if unguarded:
-        rig.idle(t.TRANSPORT_PERIODS)
+    assert rig.record_since(start_tick).faults
+    # In lockstep, some drives get their time over the bus. Their time does not pass while the bus is lost, so their
+    # watchdogs cannot expire.
+    has_drive_time_passed = drives.read_time_s() > start_s + tolerances.MAX_WATCHDOG_OFF_S
+    if not joints_without_watchdog and has_drive_time_passed:
+        assert_switched_off(
+            rig, drives, start_s, tolerances.MAX_WATCHDOG_OFF_S + tolerances.TRANSPORT_PERIODS * rig.period_ns * 1e-9
+        )
+    rig.backend.inject(parse_injection(BUS_1_LOST), begins=False)  # ends the fault
+    if joints_without_watchdog:
+        rig.wait_periods(tolerances.TRANSPORT_PERIODS)
     assert_recovers_by_reset_alone(rig, drives)
 
 
 def assert_fault_names_joint(rig: Rig, since_tick: int, joint: int) -> None:
-    """Fail if the robot continues, or no fault names the joint."""
+    """Fail if the robot is not at fault, or if no fault since a tick names the joint."""
     assert rig.authority.state == "fault", f"the robot continues: {rig.authority.state}"
     faults = rig.record_since(since_tick).faults
     name = rig.robot.joints[joint].name
@@ -102,22 +115,33 @@ def assert_fault_names_joint(rig: Rig, since_tick: int, joint: int) -> None:
 
 
 def assert_recovers_by_reset_alone(rig: Rig, drives: EmulatedDrives) -> None:
-    """Fail if a drive is enabled before reset and arming, or if the robot does not work after them."""
-    assert_drives_stay_off(rig, drives, rig.count_periods(t.SETTLE_S))
+    """Fail if a drive is enabled before reset and arming, or if the robot cannot be moved after them."""
+    assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
     rig.reset()
-    assert_drives_stay_off(rig, drives, rig.count_periods(t.RESTART_S))
-    if rig.authority.state == "fault":  # what was found while the cause was still there
+    assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
+    if rig.authority.state == "fault":  # a fault that was detected again while its cause was still there
         rig.reset()
-        assert_drives_stay_off(rig, drives, rig.count_periods(t.RESTART_S))
-    rig.cruise()
-    assert all(drives.enabled()), f"reset and armed, and enabled are {drives.enabled()}"
+        assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
+    rig.arm_and_move_joint()
+    assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
 
 
-def assert_switched_off(rig: Rig, drives: EmulatedDrives, since_s: float, limit_s: float) -> None:
-    """Fail if a drive's own log does not show its torque off in time, and off since then."""
-    assert not any(drives.enabled()), f"still enabled are {drives.enabled()}"
+def assert_switched_off(rig: Rig, drives: EmulatedDrives, start_s: float, max_duration_s: float) -> None:
+    """Fail unless every drive's own log shows that its torque was switched off in time, and has been off since then.
+
+    Args:
+        rig: The open backend.
+        drives: The emulated drives of the backend.
+        start_s: Time of the stop, by the drives' own clock.
+        max_duration_s: Maximum time from the stop until the torque is off.
+    """
+    assert not any(drives.list_enabled()), f"still enabled are {drives.list_enabled()}"
     for i, joint in enumerate(rig.robot.joints):
-        off_s = [entry.time_s for entry in drives.torque_log() if entry.joint == i and not entry.on]
-        assert off_s and off_s[-1] >= since_s, f"the log of {joint.name} does not show when its torque went off"
-        took_s = off_s[-1] - since_s
-        assert took_s <= limit_s, f"{joint.name} had torque for {took_s:.3f} s; at most {limit_s:.3f} s"
+        off_times_s = [entry.time_s for entry in drives.list_torque_switches() if entry.joint == i and not entry.is_on]
+        assert off_times_s and off_times_s[-1] >= start_s, (
+            f"the log of {joint.name} does not show when its torque went off"
+        )
+        duration_s = off_times_s[-1] - start_s
+        assert duration_s <= max_duration_s, (
+            f"{joint.name} had torque for {duration_s:.3f} s; at most {max_duration_s:.3f} s"
+        )

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from snakesim_gnc.guidance.depth_scan import Intrinsics
-from snakesim_gnc.guidance.scan import Noise, Scan, make_scan
+from snakesim_gnc.guidance.scan import RangeNoise, Scan, make_scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
-from snakesim_operator.features.robots.urdf_tree import rotation
+from snakesim_operator.features.robots.urdf_tree import make_rotation_from_rpy
 
 Ground = Callable[[Floats, Floats], Floats]
 INTRINSICS = Intrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
@@ -18,31 +18,31 @@ RANGE_M = (0.05, 3.0)
 SCALE_M = 0.001
 
 
-def cylinder(name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2) -> Obstacle:
-    """An upright peg."""
+def make_cylinder(name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2) -> Obstacle:
+    """Return an upright cylinder."""
     return Obstacle(name=name, shape="cylinder", position_w=(x, y, height_m / 2), radius_m=radius_m, height_m=height_m)
 
 
-def box(name: str, x: float, y: float, size_m: tuple[float, float], yaw_rad: float = 0.0) -> Obstacle:
-    """An upright block."""
+def make_box(name: str, x: float, y: float, size_m: tuple[float, float], yaw_rad: float = 0.0) -> Obstacle:
+    """Return an upright box."""
     half = (size_m[0] / 2, size_m[1] / 2, 0.1)
     return Obstacle(name=name, shape="box", position_w=(x, y, 0.1), yaw_rad=yaw_rad, half_size_m=half, height_m=0.2)
 
 
-def flat(x: Floats, _y: Floats) -> Floats:
-    """A ground without hills."""
+def flat_ground(x: Floats, _y: Floats) -> Floats:
+    """Return the height of a ground without hills, which is 0 everywhere."""
     return np.zeros_like(x)
 
 
-def hills(height_m: float = 0.02, wavelength_m: float = 1.5) -> Ground:
-    """Smooth hills, from lowest to highest `height_m`."""
+def make_hills(height_m: float = 0.02, wavelength_m: float = 1.5) -> Ground:
+    """Return the height function of smooth hills, with `height_m` from the lowest to the highest point."""
     k = 2 * math.pi / wavelength_m
     return lambda x, y: 0.25 * height_m * (np.sin(k * x + 0.7) + np.sin(k * y + 2.0))
 
 
 @dataclass
-class Eye:
-    """A sensor's errors: noise floor + per m², share of pixels that drop out."""
+class SensorErrors:
+    """Errors of a range sensor: noise that grows with the squared distance, and pixels that drop out."""
 
     floor_m: float = 0.0
     per_m2: float = 0.0
@@ -50,15 +50,24 @@ class Eye:
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
 
     def through(self, distance_m: Floats) -> Floats:
-        """Distances with errors; infinite where nothing is seen."""
+        """Return measured distances, with errors; infinite where nothing is measured."""
         with np.errstate(invalid="ignore"):
             noise = (self.floor_m + self.per_m2 * distance_m**2) * self.random.standard_normal(distance_m.shape)
             seen = np.where(self.random.random(distance_m.shape) < self.dropout, np.inf, distance_m + noise)
         return np.where(np.isfinite(distance_m), seen, np.inf)
 
 
-def distance_along(origin: Floats, rays: Floats, obstacles: Sequence[Obstacle], ground: Ground = flat) -> Floats:
-    """Multiple of each ray (n, 3) at which it meets something first; infinite: nowhere."""
+def compute_ray_distances(
+    origin: Floats, rays: Floats, obstacles: Sequence[Obstacle], ground: Ground = flat_ground
+) -> Floats:
+    """Return the multiple of each ray at which the ray meets an obstacle or the ground first; infinite if nowhere.
+
+    Args:
+        origin: (3,) start of all rays, m.
+        rays: (n, 3) directions.
+        obstacles: Upright cylinders and boxes.
+        ground: Height of the ground as a function of x and y.
+    """
     nearest = np.full(len(rays), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(rays[:, 2] < 0, -origin[2] / rays[:, 2], np.inf)
@@ -93,13 +102,13 @@ def _on_upright(origin: Floats, rays: Floats, o: Obstacle) -> Floats:
     return np.where((height >= middle - half) & (height <= middle + half), t, np.inf)
 
 
-def depth_image(
+def render_depth_image(
     obstacles: Sequence[Obstacle],
     position_w: Floats,
-    rotation: Floats,
+    world_from_camera: Floats,
     *,
-    ground: Ground = flat,
-    eye: Eye | None = None,
+    ground: Ground = flat_ground,
+    sensor_errors: SensorErrors | None = None,
     timestamp_ns: int = 0,
     link: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -108,20 +117,20 @@ def depth_image(
 
     Args:
         obstacles: What the camera can see, besides the ground.
-        position_w: (3,) place of the camera in the world, m.
-        rotation: (3, 3) world_from_camera.
-        ground: Height of the ground.
-        eye: Errors of the camera; None: it is exact.
+        position_w: (3,) position of the camera in the world, m.
+        world_from_camera: (3, 3) rotation matrix from the camera's frame to the world.
+        ground: Height of the ground as a function of x and y.
+        sensor_errors: Errors of the camera. If None, the camera is exact.
         timestamp_ns: Time of the image.
-        link: Link that the message reports as the camera's.
-        position_l: Mount on this link that the message reports, m; it does not move the camera.
+        link: Link of the camera, as the message reports it.
+        position_l: Position of the camera on this link, as the message reports it, m. It does not move the camera.
     """
-    rays = INTRINSICS.rays().astype(np.float64) @ rotation.T
-    errors = eye or Eye()
-    depth_m = errors.through(distance_along(position_w, rays, obstacles, ground))
+    rays = INTRINSICS.compute_rays().astype(np.float64) @ world_from_camera.T
+    errors = sensor_errors or SensorErrors()
+    depth_m = errors.through(compute_ray_distances(position_w, rays, obstacles, ground))
     min_range_m, max_range_m = RANGE_M
     is_measured = np.isfinite(depth_m) & (depth_m < max_range_m) & (depth_m > min_range_m)
-    counts = np.where(is_measured, depth_m / SCALE_M, 0.0)  # 0: not measured
+    depth_counts = np.where(is_measured, depth_m / SCALE_M, 0.0)  # 0: not measured
     return DepthImage(
         tick=0,
         timestamp_ns=timestamp_ns,
@@ -132,27 +141,32 @@ def depth_image(
         range_min_m=min_range_m,
         range_max_m=max_range_m,
         scale_m=SCALE_M,
-        depth=np.round(counts).astype("<u2").tobytes(),
+        depth=np.round(depth_counts).astype("<u2").tobytes(),
     )
 
 
-def lidar(
-    obstacles: Sequence[Obstacle], position_w: Floats, rotation: Floats, *, beams: int = 181, timestamp_ns: int = 0
+def render_lidar_scan(
+    obstacles: Sequence[Obstacle],
+    position_w: Floats,
+    world_from_lidar: Floats,
+    *,
+    beam_count: int = 181,
+    timestamp_ns: int = 0,
 ) -> Ranges:
     """Return the scan of an exact planar lidar that covers half a turn.
 
     Args:
         obstacles: What the beams can hit, besides flat ground.
-        position_w: (3,) place of the lidar in the world, m.
-        rotation: (3, 3) world_from_lidar; x points forward.
-        beams: Number of beams, from right to left.
+        position_w: (3,) position of the lidar in the world, m.
+        world_from_lidar: (3, 3) rotation matrix from the lidar's frame, in which x points forward, to the world.
+        beam_count: Number of beams, from right to left.
         timestamp_ns: Time of the scan.
     """
     max_range_m = 4.0
-    angles_rad = np.linspace(-math.pi / 2, math.pi / 2, beams)
-    rays = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(beams)], axis=1) @ rotation.T
-    distances_m = distance_along(position_w, rays, obstacles)
-    angle_step_rad = float(angles_rad[1] - angles_rad[0]) if beams > 1 else 0.01  # a message needs a step above 0
+    angles_rad = np.linspace(-math.pi / 2, math.pi / 2, beam_count)
+    rays = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(beam_count)], axis=1) @ world_from_lidar.T
+    distances_m = compute_ray_distances(position_w, rays, obstacles)
+    angle_step_rad = float(angles_rad[1] - angles_rad[0]) if beam_count > 1 else 0.01  # a message needs a step above 0
     return Ranges(
         tick=0,
         timestamp_ns=timestamp_ns,
@@ -167,13 +181,13 @@ def lidar(
     )
 
 
-def scanned(*obstacles: Obstacle, at: tuple[float, float] = (0.0, 0.0), timestamp_ns: int = 0) -> Scan:
-    """What that lidar sees from a place near the ground, looking along x."""
-    position, ahead = np.array([*at, 0.05]), turned(0.0)
-    ranges = lidar(obstacles, position, ahead, beams=361, timestamp_ns=timestamp_ns)
-    return make_scan(ranges, position, ahead, 0.0, Noise(0.002, 0.0))
+def make_lidar_scan(*obstacles: Obstacle, at: tuple[float, float] = (0.0, 0.0), timestamp_ns: int = 0) -> Scan:
+    """Return the scan of a lidar near the ground that looks along x, with the given obstacles around it."""
+    position, ahead = np.array([*at, 0.05]), make_rotation(0.0)
+    ranges = render_lidar_scan(obstacles, position, ahead, beam_count=361, timestamp_ns=timestamp_ns)
+    return make_scan(ranges, position, ahead, 0.0, RangeNoise(0.002, 0.0))
 
 
-def turned(yaw_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> Floats:
-    """World_from_sensor, from yaw, then pitch (downwards), then roll."""
-    return rotation(roll_rad, pitch_rad, yaw_rad)
+def make_rotation(yaw_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> Floats:
+    """Return the rotation matrix from a sensor's frame to the world: by yaw, then pitch (downwards), then roll."""
+    return make_rotation_from_rpy(roll_rad, pitch_rad, yaw_rad)

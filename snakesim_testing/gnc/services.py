@@ -9,78 +9,78 @@ from typing import Any
 from snakesim_gnc.control.hold import Hold
 from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.controller import ControllerCommand, Observation
-from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
+from snakesim_hal.model.plugins import CONTROLLERS, register_plugin_temporarily
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.streams import Reader
-from snakesim_hal.programs.preflight import find_service
+from snakesim_hal.programs.preflight import load_service_class
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
-from snakesim_testing.hal.local_network import Running, running
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.local_network import RunningHost, running_host
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.harness.wait import wait_until
 
 SCHEDULE: dict[str, Any] = {"guidance": {"decimation": 2}, "navigation": {"decimation": 5}, "control": {}}
 POSE = {"robot__sensors__pose": {"rate_hz": 10.0}}  # as the host's backend of the tests gives it
 
 
-class Showing(Hold):
-    """Holds, unless it is to answer otherwise."""
+class ObservationRecorder(Hold):
+    """A controller that records its observations, and holds the joints unless a test sets another response."""
 
     observations: list[Observation]
-    answers: list[Callable[["Showing", Observation], Any]]  # its only entry is how it answers
+    answers: list[Callable[["ObservationRecorder", Observation], Any]]  # its only entry is how it answers
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Keeps what it was given."""
+        """Record the observation, and return the command that the test has set, or else one that holds the joints."""
         self.observations.append(observation)
         return self.answers[0](self, observation) if self.answers else super().update(observation)
 
 
-class Serving:
-    """A service at work in a thread."""
+class ServiceThread:
+    """A service that runs in a thread."""
 
     def __init__(self, name: str, config: RunConfig, link: Link) -> None:
         self.stopped, self.error = threading.Event(), None
-        self.thread = threading.Thread(target=self._work, args=(name, config, link), name=name)
+        self.thread = threading.Thread(target=self._run_service, args=(name, config, link), name=name)
         self.thread.start()
 
-    def _work(self, name: str, config: RunConfig, link: Link) -> None:
+    def _run_service(self, name: str, config: RunConfig, link: Link) -> None:
         with open_session(link) as session:
             try:
-                loop = ServiceLoop(find_service(config, name), config, session)
-                loop.join()
-                loop.run(self.stopped.is_set)
+                service_loop = ServiceLoop(load_service_class(config, name), config, session)
+                service_loop.connect()
+                service_loop.run(self.stopped.is_set)
             except SnakesimError as error:
                 self.error = error
 
     def stop(self) -> None:
-        """End it as a process ends: without a word."""
+        """Stop the service without any message to the host, as when its process ends."""
         self.stopped.set()
         self.thread.join(20.0)
         assert not self.thread.is_alive(), "the service did not stop"
 
 
 @dataclass
-class Stage:
-    """A host, its services, and who watches them."""
+class RunningServices:
+    """A running host, its services, and what their controller has reported."""
 
-    run: Running
-    services: dict[str, Serving]
+    run: RunningHost
+    services: dict[str, ServiceThread]
     states: Reader[ControlState]
     observations: list[Observation]  # what the controller was given so far
     reported: list[ControlState] = field(default_factory=list[ControlState])
 
-    def state(self) -> ControlState | None:
-        """The newest state that control reported."""
+    def read_newest_state(self) -> ControlState | None:
+        """Return the newest state that control has reported; None if there is none."""
         self.reported += self.states.drain()
         return self.reported[-1] if self.reported else None
 
     def wait_for_reason(self, words: str) -> ControlState:
-        """Wait until control has reported a reason with these words."""
+        """Wait until control has reported a reason that contains some words, and return that report."""
 
         def found() -> list[ControlState]:
-            self.state()
+            self.read_newest_state()
             return [state for state in self.reported if words in state.reason]
 
         wait_until(found, f"{words!r} reported; last: {self.reported[-1].reason if self.reported else 'nothing'}")
@@ -88,11 +88,16 @@ class Stage:
 
 
 @contextmanager
-def stage(**config: Any) -> Iterator[Stage]:
-    """Run the worm in real time with guidance, navigation and control; the controller records its observations.
+def running_services(**config_changes: Any) -> Iterator[RunningServices]:
+    """Run a host and the services guidance, navigation and control in real time, in threads of this process.
+
+    The controller records its observations. Host and services end with the context.
 
     Args:
-        config: Changes of the configuration, as for `run_config`.
+        config_changes: Changes of the configuration, as `make_run_config` takes them.
+
+    Yields:
+        The host and the services, once all services are alive.
     """
     defaults = {
         "controller": "showing",
@@ -102,19 +107,19 @@ def stage(**config: Any) -> Iterator[Stage]:
         "allow_fault_injection": True,
         **POSE,
     }
-    run_settings = run_config(**{**defaults, **config})
-    Showing.observations = []
-    Showing.answers = []
+    run_settings = make_run_config(**{**defaults, **config_changes})
+    ObservationRecorder.observations = []
+    ObservationRecorder.answers = []
     with (
-        offer_plugin(CONTROLLERS, "showing", Showing),
-        running(run_settings) as run,
+        register_plugin_temporarily(CONTROLLERS, "showing", ObservationRecorder),
+        running_host(run_settings) as run,
         open_session(run.link) as session,
         ExitStack() as stack,
     ):
-        states = session.reader(keys.CONTROL_STATE, ControlState)
-        services: dict[str, Serving] = {}
+        state_reader = session.declare_reader(keys.CONTROL_STATE, ControlState)
+        services: dict[str, ServiceThread] = {}
         for name in SCHEDULE:
-            services[name] = Serving(name, run_settings, run.link)
+            services[name] = ServiceThread(name, run_settings, run.link)
             stack.callback(services[name].stop)
         wait_until(lambda: set(SCHEDULE) <= set(run.status.alive), "all services")
-        yield Stage(run, services, states, Showing.observations)
+        yield RunningServices(run, services, state_reader, ObservationRecorder.observations)

@@ -5,12 +5,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from snakesim_gnc.geometry.body_on_path import chain_nodes
+from snakesim_gnc.geometry.body_on_path import compute_chain_points
 from snakesim_hal.controller import Observation
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
+from snakesim_hal.model.route import (
+    Route,
+    compute_yaw_segments_m,
+    expand_yaw_angles,
+    place_chain_on_route,
+    sample_sine_curve,
+)
 from snakesim_hal.wire.messages import Axis, Description, Obstacle, Trajectory, World, WorldContact
-from snakesim_testing.hal.small_robots import description, state
+from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
 T = TypeVar("T")
 
@@ -19,12 +25,12 @@ AMPLITUDE_M, WAVELENGTH_M, LENGTH_M = 0.045, 0.6, 6.0
 BODY_RADIUS_M, PEG_RADIUS_M, CLEARANCE_M = 0.04, 0.05, 0.005
 
 
-def stamp_of(tick: int) -> int:
+def tick_to_time_ns(tick: int) -> int:
     """Robot time of a tick."""
     return tick * round(PERIOD_S * 1e9)
 
 
-def known(value: T | None) -> T:
+def require_value(value: T | None) -> T:
     """A value that must be there."""
     assert value is not None
     return value
@@ -34,7 +40,7 @@ def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: 
     """A chain of modules of 0.11 m."""
     limits = {"speed_rad_s": 7.5, "acceleration_rad_s2": 400, "torque_nm": torque_nm, "torque_rate_nm_s": 200}
     gains = {"stiffness_nm_per_rad": 60, "damping_nm_s_per_rad": 1.5, "velocity_gain_nm_s_per_rad": 1.5}
-    return description(
+    return make_description(
         chain={"modules": modules, "axes": list(axes)},
         module={"length_m": 0.11, "radius_m": BODY_RADIUS_M, "mass_kg": 0.3},
         limits={"angle_rad": 1.5, **limits},
@@ -73,17 +79,17 @@ def make_contact(
 
 def make_route(amplitude_m: float = AMPLITUDE_M, wavelength_m: float = WAVELENGTH_M) -> Route:
     """A sine along x."""
-    return Route(sine_points(amplitude_m, wavelength_m, LENGTH_M))
+    return Route(sample_sine_curve(amplitude_m, wavelength_m, LENGTH_M))
 
 
 def make_pegs(route: Route) -> list[Obstacle]:
     """Pegs at the inflections, on the side from which they push forward."""
     pegs: list[Obstacle] = []
-    for k, s in enumerate(route.inflections_s_m()):
+    for k, s in enumerate(route.find_inflections_s_m()):
         tangent = route.tangent_w(s)
         left = np.array([-tangent[1], tangent[0]])
         push = left if left[0] > 0 else -left
-        x, y = (route.position_w(s) - push * (BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M)).tolist()
+        x, y = (route.compute_positions_w(s) - push * (BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M)).tolist()
         pegs.append(
             Obstacle(name=f"peg_{k}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_RADIUS_M, height_m=0.2)
         )
@@ -101,7 +107,7 @@ class Stage:
     path_id: int = 0
     assumed_obstacle_friction: float = 0.0  # that the path was planned with
 
-    def observe(
+    def make_observation(
         self,
         tick: int,
         tail_s_m: float,
@@ -116,23 +122,25 @@ class Stage:
     ) -> Observation:
         """turned: joint -> how far it is from where the route has it. without: `world` or `trajectory`, perhaps."""
         axes = [joint.axis for joint in self.robot.joints]
-        segments = yaw_segments_m(axes, [link.length_m for link in self.robot.links])
-        lay = lay_chain(self.route, tail_s_m, segments)
-        angles = chain_angles(axes, lay.angles_rad)
+        segments = compute_yaw_segments_m(axes, [link.length_m for link in self.robot.links])
+        lay = place_chain_on_route(self.route, tail_s_m, segments)
+        angles = expand_yaw_angles(axes, lay.angles_rad)
         for joint, by in (turned or {}).items():
             angles[joint] += by
-        seen = lay if world_tail_s_m is None else lay_chain(self.route, world_tail_s_m, segments)
+        seen = lay if world_tail_s_m is None else place_chain_on_route(self.route, world_tail_s_m, segments)
         world = make_world(
             tick=tick - world_age_ticks,
-            timestamp_ns=stamp_of(tick - world_age_ticks),
-            pose_timestamp_ns=stamp_of(tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)),
+            timestamp_ns=tick_to_time_ns(tick - world_age_ticks),
+            pose_timestamp_ns=tick_to_time_ns(tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)),
             base_position_w=(*seen.tail_w, BODY_RADIUS_M),
             base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
             contacts=contacts or [],
-            contacts_timestamp_ns=None if contacts is None else stamp_of(tick - world_age_ticks),
+            contacts_timestamp_ns=None if contacts is None else tick_to_time_ns(tick - world_age_ticks),
             obstacles=self.pegs,
         )
-        joints = state(self.robot, angles.tolist(), torque=torque_nm, tick=tick, timestamp_ns=stamp_of(tick))
+        joints = make_joint_state(
+            self.robot, angles.tolist(), torque=torque_nm, tick=tick, timestamp_ns=tick_to_time_ns(tick)
+        )
         trajectory = Trajectory(
             tick=0,
             timestamp_ns=0,
@@ -159,9 +167,9 @@ def make_stage(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: 
     return Stage(make_robot(modules, axes, torque_nm), route, make_pegs(route))
 
 
-def nodes_of(stage: Stage, tail_s_m: float) -> np.ndarray:
+def compute_body_points(stage: Stage, tail_s_m: float) -> np.ndarray:
     """Nodes (2, n_nodes) of the body on the route."""
     axes = [joint.axis for joint in stage.robot.joints]
-    segments = yaw_segments_m(axes, [link.length_m for link in stage.robot.links])
-    lay = lay_chain(stage.route, tail_s_m, segments)
-    return chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad.tolist(), segments)
+    segments = compute_yaw_segments_m(axes, [link.length_m for link in stage.robot.links])
+    lay = place_chain_on_route(stage.route, tail_s_m, segments)
+    return compute_chain_points(lay.tail_w, lay.heading_rad, lay.angles_rad.tolist(), segments)

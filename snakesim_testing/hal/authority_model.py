@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from hypothesis.stateful import RuleBasedStateMachine
 
-from snakesim_hal.safety.authority import Authority, TickDecision
+from snakesim_hal.safety.authority import Authority, TickOutput
 from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.wire.messages import Answer, JointCommand, LifecycleState, Mode
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS
@@ -43,12 +43,12 @@ TINY = 1e-9
 NAN, INF = float("nan"), float("inf")
 
 
-def within(value: float, low: float, high: float) -> float:
+def clamp(value: float, low: float, high: float) -> float:
     """Return the value, limited to the range from low to high."""
     return min(max(value, low), high)
 
 
-def max_stopping_speed_rad_s(distance_rad: float) -> float:
+def compute_max_stopping_speed_rad_s(distance_rad: float) -> float:
     """Return the highest speed from which a joint still stops within a distance; 0 if there is no distance left.
 
     The joint keeps its speed v for the reaction time t, and then brakes with the limit a of its acceleration:
@@ -61,7 +61,7 @@ def max_stopping_speed_rad_s(distance_rad: float) -> float:
     return ACCELERATION_LIMIT_RAD_S2 * (total_time_s - REACTION_S)
 
 
-def torque_bounds(angle_rad: float, velocity_rad_s: float, torque_limit_nm: float) -> tuple[float, float]:
+def compute_torque_bounds_nm(angle_rad: float, velocity_rad_s: float, torque_limit_nm: float) -> tuple[float, float]:
     """Return the lowest and the highest torque with which a joint can still stop at its end stops.
 
     A torque may accelerate the joint up to the speed from which it stops in time. Above that speed the bound has the
@@ -72,8 +72,8 @@ def torque_bounds(angle_rad: float, velocity_rad_s: float, torque_limit_nm: floa
         velocity_rad_s: Its measured velocity.
         torque_limit_nm: Torque limit of its drive, which also limits both bounds.
     """
-    max_speed_down_rad_s = max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle_rad)
-    max_speed_up_rad_s = max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle_rad)
+    max_speed_down_rad_s = compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle_rad)
+    max_speed_up_rad_s = compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle_rad)
     low_nm = BRAKE_GAIN_NM_S_PER_RAD * (-max_speed_down_rad_s - velocity_rad_s)
     high_nm = BRAKE_GAIN_NM_S_PER_RAD * (max_speed_up_rad_s - velocity_rad_s)
     # At a stop, no torque outwards. The other bound moves with it where it would lie beyond it.
@@ -88,12 +88,12 @@ def torque_bounds(angle_rad: float, velocity_rad_s: float, torque_limit_nm: floa
         high_nm = max(high_nm, low_inwards_nm)
         low_nm = low_inwards_nm
     return (
-        within(low_nm, -torque_limit_nm, torque_limit_nm),
-        within(high_nm, -torque_limit_nm, torque_limit_nm),
+        clamp(low_nm, -torque_limit_nm, torque_limit_nm),
+        clamp(high_nm, -torque_limit_nm, torque_limit_nm),
     )
 
 
-def holding_position_target_rad(angle_rad: float, velocity_rad_s: float, torque_nm: float) -> float:
+def compute_holding_position_rad(angle_rad: float, velocity_rad_s: float, torque_nm: float) -> float:
     """Return the position target with which a drive would produce the torque that was measured.
 
     A drive in position mode produces torque = stiffness (target - angle) - damping velocity. A joint that enters
@@ -102,7 +102,7 @@ def holding_position_target_rad(angle_rad: float, velocity_rad_s: float, torque_
     return angle_rad + (torque_nm + DAMPING_NM_S_PER_RAD * velocity_rad_s) / STIFFNESS_NM_PER_RAD
 
 
-def holding_velocity_target_rad_s(velocity_rad_s: float, torque_nm: float) -> float:
+def compute_holding_velocity_rad_s(velocity_rad_s: float, torque_nm: float) -> float:
     """Return the velocity target with which a drive would produce the torque that was measured.
 
     A drive in velocity mode produces torque = gain (target - velocity).
@@ -111,7 +111,7 @@ def holding_velocity_target_rad_s(velocity_rad_s: float, torque_nm: float) -> fl
 
 
 class Health:
-    """What one module reported last, and what follows from it."""
+    """The newest health report of one joint module, and the faults and the derating that follow from it."""
 
     def __init__(self) -> None:
         self.received_ns: int | None = None
@@ -129,11 +129,11 @@ class Health:
 
     def share(self, now_ns: int) -> float:
         over = (self.celsius - DERATE_FROM) / (STOP_AT - DERATE_FROM)
-        return 1.0 - (1.0 - MIN_SHARE) * within(over, 0.0, 1.0) if self.known(now_ns) else 1.0
+        return 1.0 - (1.0 - MIN_SHARE) * clamp(over, 0.0, 1.0) if self.known(now_ns) else 1.0
 
 
-class Model(RuleBasedStateMachine):
-    """What is known of an authority without looking at it."""
+class AuthorityModel(RuleBasedStateMachine):
+    """A model that predicts every decision of an authority, for comparison with the real one."""
 
     authority: Authority
     action: str
@@ -158,80 +158,93 @@ class Model(RuleBasedStateMachine):
         self.priority = 0
         self.expires_ns = 0
         self.newest_command: tuple[int, JointCommand] | None = None  # when it came; only of this holder
-        self.since_arming: list[JointCommand] = []
-        self.counting: JointCommand | None = None  # of those, what the last tick was decided by
+        self.commands_since_arming: list[JointCommand] = []
+        self.active_command: JointCommand | None = None  # of those, what the last tick was decided by
         self.last_sequence = -1
         self.measured: tuple[list[float], list[float], list[float]] = ([0.0] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS)
-        self.doubt: set[int] | None = set(ALL)  # joints whose newest state is not believed; None: whatever their number
+        self.doubtful_joints: set[int] | None = set(
+            ALL
+        )  # joints whose newest state is not believed; None: whatever their number
         self.isolated: set[int] = set()  # joints that have failed
         self.offered = 0
         self.rejected = 0
         self.faults = 0  # kept since the last reset
-        self.hold_at = [0.0] * JOINTS
-        self.halt: list[list[float]] | None = None  # wanted angle, its velocity, target: of every joint
+        self.hold_angles_rad = [0.0] * JOINTS
+        self.braking_states: list[list[float]] | None = None  # wanted angle, its velocity, target: of every joint
         self.timestamp_ns = 0
-        self.good: list[tuple[float, float] | None] = [None] * JOINTS  # angle and when it was taken
-        self.strays: list[list[tuple[float, float]]] = [[] for _ in range(JOINTS)]
-        self.same: list[list[tuple[Any, float, float]]] = [[] for _ in range(JOINTS)]  # state, time, target
+        self.last_plausible_angles: list[tuple[float, float] | None] = [None] * JOINTS  # angle and when it was taken
+        self.implausible_angles: list[list[tuple[float, float]]] = [[] for _ in range(JOINTS)]
+        self.unchanged_states: list[list[tuple[Any, float, float]]] = [[] for _ in range(JOINTS)]  # state, time, target
         self.healths = [Health() for _ in range(JOINTS)]
-        self.wrong: set[tuple[str, int]] = set()  # at the last tick
+        self.health_faults: set[tuple[str, int]] = set()  # at the last tick
         self.silent: set[int] = set()
-        self.shares = [1.0] * JOINTS
-        self.reported = True  # the last stop was sent to the motors
-        self.last: TickDecision | None = None
+        self.torque_fractions = [1.0] * JOINTS
+        self.is_stop_sent = True  # the last stop was sent to the motors
+        self.last_output: TickOutput | None = None
 
     @property
-    def live(self) -> bool:
+    def is_lease_held(self) -> bool:
         return self.holder is not None and self.now_ns <= self.expires_ns
 
-    def leave_for(self, following: LifecycleState) -> None:
+    def change_state(self, following: LifecycleState) -> None:
         if following != self.state:
-            self.hold_at = self.measured[0]
-            self.halt = [self.beginning_of_halt(i) for i in range(JOINTS)] if self.state == "armed" else None
-            self.reported = self.reported and following != "disarmed"
+            self.hold_angles_rad = self.measured[0]
+            self.braking_states = (
+                [self.compute_braking_start(i) for i in range(JOINTS)] if self.state == "armed" else None
+            )
+            self.is_stop_sent = self.is_stop_sent and following != "disarmed"
         if self.state == "armed":
             self.newest_command = None
         self.state = following
 
     def mode_before(self, i: int) -> Mode:
-        return Mode.PASSIVE if self.last is None else self.last.setpoints.mode[i]
+        return Mode.PASSIVE if self.last_output is None else self.last_output.setpoints.mode[i]
 
     def target_before(self, i: int) -> float:
-        return 0.0 if self.last is None else self.last.setpoints.target[i]
+        return 0.0 if self.last_output is None else self.last_output.setpoints.target[i]
 
-    def beginning_of_halt(self, i: int) -> list[float]:
+    def compute_braking_start(self, i: int) -> list[float]:
         """Return angle, velocity and position target from which joint i brakes when the robot stops being armed."""
         angle, velocity, torque = (column[i] for column in self.measured)
-        target = holding_position_target_rad(angle, velocity, torque)
+        target = compute_holding_position_rad(angle, velocity, torque)
         if self.mode_before(i) is Mode.POSITION:
             target = self.target_before(i)
-        near_angle = within(target, angle - MAX_STEP_RAD, angle + MAX_STEP_RAD)
-        target = within(near_angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+        near_angle = clamp(target, angle - MAX_STEP_RAD, angle + MAX_STEP_RAD)
+        target = clamp(near_angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
         return [
-            within(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD),
-            within(velocity, -SPEED_LIMIT_RAD_S, SPEED_LIMIT_RAD_S),
+            clamp(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD),
+            clamp(velocity, -SPEED_LIMIT_RAD_S, SPEED_LIMIT_RAD_S),
             target,
         ]
 
-    def halt_for_a_period(self, i: int) -> float:
+    def brake_for_a_period(self, i: int) -> float:
         """Brake joint i for one period with the acceleration limit, and return its next position target in rad."""
-        assert self.halt is not None
-        wanted, velocity, target = self.halt[i]
+        assert self.braking_states is not None
+        wanted, velocity, target = self.braking_states[i]
         slower = math.copysign(max(abs(velocity) - ACCELERATION_LIMIT_RAD_S2 * PERIOD_S, 0.0), velocity)
-        wanted = within(wanted + (velocity + slower) / 2 * PERIOD_S, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
-        target = within(wanted, target - SPEED_LIMIT_RAD_S * PERIOD_S, target + SPEED_LIMIT_RAD_S * PERIOD_S)
-        self.halt[i] = [wanted, slower, target]
+        wanted = clamp(wanted + (velocity + slower) / 2 * PERIOD_S, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+        target = clamp(wanted, target - SPEED_LIMIT_RAD_S * PERIOD_S, target + SPEED_LIMIT_RAD_S * PERIOD_S)
+        self.braking_states[i] = [wanted, slower, target]
         return target
 
-    def believe(self, i: int, angle: float, taken_s: float) -> bool:
-        """Whether an angle that is otherwise sound is believed; keeps those that are not."""
+    def check_angle_plausible(self, i: int, angle: float, taken_s: float) -> bool:
+        """Return whether a finite, valid angle is plausible, and remember it if it is not.
+
+        An angle is plausible if the joint can have moved there since the last plausible angle. While the robot is not
+        armed, it also becomes plausible after enough implausible angles that agree with each other.
+
+        Args:
+            i: Index of the joint.
+            angle: Measured angle in rad.
+            taken_s: Time of the measurement in s.
+        """
 
         def reachable(before: tuple[float, float]) -> bool:
             angle_before, taken_before_s = before
             passed_s = max(taken_s - taken_before_s, 0.0)
             return abs(angle - angle_before) <= BELIEVED_ERROR_RAD + MAX_BELIEVED_SPEED_RAD_S * passed_s
 
-        good, strays = self.good[i], self.strays[i]
+        good, strays = self.last_plausible_angles[i], self.implausible_angles[i]
         if good is None or reachable(good):
             return True
         if strays and not reachable(strays[-1]):
@@ -244,15 +257,17 @@ class Model(RuleBasedStateMachine):
 
     def is_frozen(self, i: int, state_: Any, taken_s: float) -> bool:
         if self.state != "armed" or self.mode_before(i) is not Mode.POSITION:
-            self.same[i] = []
+            self.unchanged_states[i] = []
             return False
-        if self.same[i] and self.same[i][-1][0] != state_:
-            self.same[i] = []
-        self.same[i].append((state_, taken_s, self.target_before(i)))
-        limit = self.last.setpoints.torque_limit_nm[i] if self.last else TORQUE_LIMIT_NM
-        targets = [target for _, _, target in self.same[i]]
+        if self.unchanged_states[i] and self.unchanged_states[i][-1][0] != state_:
+            self.unchanged_states[i] = []
+        self.unchanged_states[i].append((state_, taken_s, self.target_before(i)))
+        limit = self.last_output.setpoints.torque_limit_nm[i] if self.last_output else TORQUE_LIMIT_NM
+        targets = [target for _, _, target in self.unchanged_states[i]]
         ways = [max(targets[: k + 1]) - min(targets[: k + 1]) for k in range(len(targets))]
-        far = [taken for (_, taken, _), way in zip(self.same[i], ways, strict=True) if way > MAX_STEP_RAD / 4]
+        far = [
+            taken for (_, taken, _), way in zip(self.unchanged_states[i], ways, strict=True) if way > MAX_STEP_RAD / 4
+        ]
         return bool(far) and taken_s - min(far) > LEASE_NS * 1e-9 and abs(state_[2]) < 0.95 * limit
 
     def drop_lease(self) -> None:
@@ -260,17 +275,17 @@ class Model(RuleBasedStateMachine):
         self.last_sequence = -1
 
     def note_fault(self) -> None:
-        """One fault more is kept, up to the limit."""
+        """Count one more logged fault, up to the limit of the log."""
         self.faults = min(self.faults + 1, MAX_FAULTS)
 
     def fail(self) -> None:
         if self.state != "estop":
-            self.leave_for("fault")
+            self.change_state("fault")
         self.drop_lease()
         self.note_fault()
 
     def lose(self, joints: set[int]) -> bool:
-        """Whether the robot goes on without these joints, too."""
+        """Isolate failed joints if that is allowed, and return whether the robot continues without them."""
         if joints <= self.isolated:
             return True
         if self.state != "armed" or len(self.isolated | joints) > self.max_isolated:
@@ -286,7 +301,7 @@ class Model(RuleBasedStateMachine):
     @property
     def known(self) -> bool:
         """The joint state is fresh and valid."""
-        return self.doubt == set()
+        return self.doubtful_joints == set()
 
     def check(self, answer: Answer, ok: bool) -> None:
         assert answer.ok == ok and (answer.refusal is None) == ok, answer
@@ -294,7 +309,7 @@ class Model(RuleBasedStateMachine):
         assert answer.epoch == self.epoch
         assert answer.lifecycle == self.state
 
-    def check_isolated(self, decision: TickDecision) -> None:
+    def check_isolated(self, decision: TickOutput) -> None:
         points = decision.setpoints
         assert points.isolated == self.isolated
         assert len(self.isolated) <= self.max_isolated
@@ -309,16 +324,16 @@ class Model(RuleBasedStateMachine):
         return [value for i, value in enumerate(values) if i not in self.isolated]
 
     def torques(self) -> Any:
-        return pytest.approx(self.select_connected([TORQUE_LIMIT_NM * share for share in self.shares]))
+        return pytest.approx(self.select_connected([TORQUE_LIMIT_NM * share for share in self.torque_fractions]))
 
-    def check_safe(self, decision: TickDecision) -> None:
-        assert decision.sequence is None
-        assert not decision.limited
-        action = self.action if self.state == "fault" and self.halt is not None else "passive"
+    def check_safe(self, decision: TickOutput) -> None:
+        assert decision.command_sequence is None
+        assert not decision.limit_by_joint
+        action = self.action if self.state == "fault" and self.braking_states is not None else "passive"
         assert self.select_connected(decision.setpoints.torque_limit_nm) == self.torques()
         if action == "hold":
             assert set(self.select_connected(decision.setpoints.mode)) <= {Mode.POSITION}
-            held = [self.halt_for_a_period(i) for i in range(JOINTS)]
+            held = [self.brake_for_a_period(i) for i in range(JOINTS)]
             assert self.select_connected(decision.setpoints.target) == pytest.approx(self.select_connected(held))
             assert all(abs(target) <= ANGLE_LIMIT_RAD for target in decision.setpoints.target)
             return
@@ -326,31 +341,31 @@ class Model(RuleBasedStateMachine):
         assert set(self.select_connected(decision.setpoints.mode)) <= {mode}
         assert decision.setpoints.target == [0.0] * JOINTS
 
-    def check_held(self, decision: TickDecision, angle_rad: list[float]) -> None:
+    def check_held(self, decision: TickOutput, angle_rad: list[float]) -> None:
         assert set(self.select_connected(decision.setpoints.mode)) <= {Mode.POSITION}
-        assert not decision.limited
-        held = [within(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in angle_rad]
+        assert not decision.limit_by_joint
+        held = [clamp(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in angle_rad]
         assert self.select_connected(decision.setpoints.target) == self.select_connected(held)
         assert self.select_connected(decision.setpoints.torque_limit_nm) == self.torques()
 
-    def check_commanded(self, decision: TickDecision, sent: JointCommand) -> None:
-        """Check the setpoints of a tick in which a command counts: mode, torque limit and target of every joint.
+    def check_commanded(self, decision: TickOutput, sent: JointCommand) -> None:
+        """Check the setpoints of a tick in which a command is active: mode, torque limit and target of every joint.
 
         Isolated joints are passive with every command. A torque limit is at most that of the command and that of
         the drive at its present temperature, and rises no faster than the limit of the torque's rate of change.
 
         Args:
-            decision: What the authority applied.
-            sent: The command that counts.
+            decision: Output of the authority in this tick.
+            sent: The active command.
         """
         for i in self.isolated:
-            assert decision.limited.get(i) == (None if sent.mode[i] is Mode.PASSIVE else "isolated")
+            assert decision.limit_by_joint.get(i) == (None if sent.mode[i] is Mode.PASSIVE else "isolated")
         assert self.select_connected(decision.setpoints.mode) == self.select_connected(sent.mode)
         for i in self.select_connected(ALL):
             applied_nm = decision.setpoints.torque_limit_nm[i]
-            previous_nm = TORQUE_LIMIT_NM if self.last is None else self.last.setpoints.torque_limit_nm[i]
+            previous_nm = TORQUE_LIMIT_NM if self.last_output is None else self.last_output.setpoints.torque_limit_nm[i]
             commanded_nm = TORQUE_LIMIT_NM if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
-            derated_nm = TORQUE_LIMIT_NM * self.shares[i] + TINY
+            derated_nm = TORQUE_LIMIT_NM * self.torque_fractions[i] + TINY
             assert 0.0 <= applied_nm <= min(derated_nm, commanded_nm)
             assert applied_nm <= previous_nm + TORQUE_RATE_LIMIT_NM_S * PERIOD_S + TINY
             if sent.mode[i] is not Mode.PASSIVE:
@@ -358,9 +373,9 @@ class Model(RuleBasedStateMachine):
                 self.check_target(i, decision, sent.mode[i], sent.target[i], is_derated=is_derated)
             else:
                 assert decision.setpoints.target[i] == 0.0
-                assert i not in decision.limited
+                assert i not in decision.limit_by_joint
 
-    def check_target(self, i: int, decision: TickDecision, mode: Mode, wanted: float, *, is_derated: bool) -> None:
+    def check_target(self, i: int, decision: TickOutput, mode: Mode, wanted: float, *, is_derated: bool) -> None:
         """Check the target that the authority applied to one joint.
 
         It must be inside the limits, change no faster than allowed, and be as near to the command as both permit. A
@@ -368,7 +383,7 @@ class Model(RuleBasedStateMachine):
 
         Args:
             i: Index of the joint.
-            decision: What the authority applied.
+            decision: Output of the authority in this tick.
             mode: Mode of the command.
             wanted: Target of the command, in rad, rad/s or N·m, by its mode.
             is_derated: Whether the drive's temperature lowers the torque limit of the command.
@@ -378,25 +393,25 @@ class Model(RuleBasedStateMachine):
         # `previous` is the target before: in a new mode it is the one with which the torque does not jump.
         match mode:
             case Mode.POSITION:
-                low = within(angle - MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
-                high = within(angle + MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+                low = clamp(angle - MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
+                high = clamp(angle + MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
                 max_change = SPEED_LIMIT_RAD_S * PERIOD_S
-                previous = holding_position_target_rad(angle, velocity, torque)
+                previous = compute_holding_position_rad(angle, velocity, torque)
             case Mode.VELOCITY:
-                low = max(-SPEED_LIMIT_RAD_S, -max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle))
-                high = min(SPEED_LIMIT_RAD_S, max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle))
+                low = max(-SPEED_LIMIT_RAD_S, -compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle))
+                high = min(SPEED_LIMIT_RAD_S, compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle))
                 max_change = ACCELERATION_LIMIT_RAD_S2 * PERIOD_S
-                previous = holding_velocity_target_rad_s(velocity, torque)
+                previous = compute_holding_velocity_rad_s(velocity, torque)
             case _:
-                low, high = torque_bounds(angle, velocity, decision.setpoints.torque_limit_nm[i])
+                low, high = compute_torque_bounds_nm(angle, velocity, decision.setpoints.torque_limit_nm[i])
                 max_change = TORQUE_RATE_LIMIT_NM_S * PERIOD_S
                 previous = torque
-        if self.last is not None and self.last.setpoints.mode[i] is mode:
-            previous = self.last.setpoints.target[i]
+        if self.last_output is not None and self.last_output.setpoints.mode[i] is mode:
+            previous = self.last_output.setpoints.target[i]
         assert math.isfinite(target)
         assert low <= target <= high
         # The limits have priority over the rate of change.
         assert abs(target - previous) <= max_change + TINY or target in (low, high)
-        nearest_reachable = within(wanted, previous - max_change, previous + max_change)
-        assert abs(target - within(nearest_reachable, low, high)) <= TINY
-        assert (i in decision.limited) == (target != wanted or is_derated)
+        nearest_reachable = clamp(wanted, previous - max_change, previous + max_change)
+        assert abs(target - clamp(nearest_reachable, low, high)) <= TINY
+        assert (i in decision.limit_by_joint) == (target != wanted or is_derated)

@@ -1,8 +1,8 @@
 """Samples of nodes that do not belong to the robot."""
 
-from snakesim_testing.hal.small_robots import clock, description
+from snakesim_testing.hal.small_robots import make_clock, make_description
 
-ROBOT = description()  # three joints, four links
+ROBOT = make_description()  # three joints, four links
 
 
-CLOCK = clock(3, clock_mode="realtime")
+CLOCK = make_clock(3, clock_mode="realtime")

@@ -36,15 +36,15 @@ from snakesim_hal.wire.messages import (
     Status,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
-from snakesim_testing.hal.small_robots import pose
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.hal.small_robots import make_pose
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 
 LIMIT_S = 20.0
 
 
 @contextmanager
-def threads_switching(every_s: float = 0.0005) -> Iterator[None]:
+def fast_thread_switching(every_s: float = 0.0005) -> Iterator[None]:
     """Threads take turns so often: host and client share one interpreter here; in real life they are processes."""
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(every_s)
@@ -54,7 +54,7 @@ def threads_switching(every_s: float = 0.0005) -> Iterator[None]:
         sys.setswitchinterval(before_s)
 
 
-def received(reader: Reader[MessageT], what: str, count: int = 1) -> list[MessageT]:
+def wait_for_messages(reader: Reader[MessageT], what: str, count: int = 1) -> list[MessageT]:
     """What a reader has got, as soon as it is so many."""
     found: list[MessageT] = []
     wait_until(lambda: found.extend(reader.drain()) or len(found) >= count, what)
@@ -62,10 +62,10 @@ def received(reader: Reader[MessageT], what: str, count: int = 1) -> list[Messag
 
 
 @contextmanager
-def meeting(*namespaces: str | None) -> Iterator[list[Session]]:
+def connected_sessions(*namespaces: str | None) -> Iterator[list[Session]]:
     """Sessions on a network of their own; the first one listens."""
     with ExitStack() as stack:
-        endpoint = free_endpoint()
+        endpoint = find_free_endpoint()
         links = [Link(endpoint, name, listen=not i) for i, name in enumerate(namespaces)]
         yield [stack.enter_context(open_session(each)) for each in links]
 
@@ -113,7 +113,7 @@ class LagBackend(Backend):
         )
         if tick % 5:
             return Samples(joints)
-        return Samples(joints, {keys.POSE: pose(tick, timestamp_ns, position_w=(0.001 * tick, 0.0, 0.0))})
+        return Samples(joints, {keys.POSE: make_pose(tick, timestamp_ns, position_w=(0.001 * tick, 0.0, 0.0))})
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """From now on."""
@@ -160,11 +160,11 @@ class Follower:
         """Until stopped."""
         with open_session(link) as session:
             client = Client(session, self.name)
-            robot = client.description()
+            robot = client.wait_for_description()
             joints = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
             client.announce()
-            for clock in client.ticks(silence_s=0.02):
+            for clock in client.iterate_ticks(silence_timeout_s=0.02):
                 if self.stopped.is_set():
                     return
                 if clock is None or self.silent.is_set():
@@ -176,17 +176,17 @@ class Follower:
     ) -> None:
         self.ticks_seen.append(clock.tick)
         if joints is not None and commander.ensure_lease(clock):
-            points = commander.hold_position(joints)
+            points = commander.make_hold_setpoints(joints)
             if clock.lifecycle == "armed":
                 self.armed_ticks.append(clock.tick)
                 wave = self.amplitude_rad * math.sin(2 * math.pi * clock.timestamp_ns * 1e-9)
                 points = RequestedSetpoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
-            commander.send(clock, joints, points)
+            commander.send_command(clock, joints, points)
         client.report_done(clock.tick)
 
 
 @dataclass
-class Running:
+class RunningHost:
     """A host at work."""
 
     host: Host
@@ -209,59 +209,59 @@ class Running:
         self._status = found[-1] if found else self._status
         return self._status
 
-    def ask(self, key: str, request: Message) -> Answer:
+    def request(self, key: str, request: Message) -> Answer:
         """Ask the host; a no is an answer too."""
-        return self.session.request(key, request)
+        return self.session.send_request(key, request)
 
-    def lifecycle(self, action: Any) -> Answer:
+    def request_lifecycle(self, action: Any) -> Answer:
         """Arm (naming the robot rightly), disarm, reset or finish."""
         config_hash = self.host.description.config_hash
         request = LifecycleRequest(action=action, robot="worm", backend="lag", config_hash=config_hash)
-        return self.ask(keys.LIFECYCLE, request)
+        return self.request(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
         """As soon as the host is ready: on a busy machine a status is soon out of date."""
-        wait_until(lambda: self.status.ready_to_arm and self.lifecycle("arm").ok, "armed")
+        wait_until(lambda: self.status.ready_to_arm and self.request_lifecycle("arm").ok, "armed")
 
-    def reaches(self, lifecycle: str) -> None:
+    def wait_for_lifecycle(self, lifecycle: str) -> None:
         """Wait for a state to be shown."""
         wait_until(lambda: self.status.lifecycle == lifecycle, f"lifecycle {lifecycle}")
 
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether the host's loop is over."""
         return not self.thread.is_alive()
 
 
 @contextmanager
-def running(config: RunConfig, **host: Any) -> Iterator[Running]:
+def running_host(config: RunConfig, **host: Any) -> Iterator[RunningHost]:
     """A host of a `LagBackend`, and a client that watches it. The host is stopped at the end."""
-    endpoint, backend = free_endpoint(), LagBackend(config)
+    endpoint, backend = find_free_endpoint(), LagBackend(config)
     link = Link(endpoint, "lab/worm")
     with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
         faulty, faults = create_host_faults(config, GuardedBackend(backend), own)
         made = Host(config, faulty, own, HostOptions(faults=faults, **host))
         thread = threading.Thread(target=made.run, name="host")
-        statuses = watcher.latched_reader(keys.STATUS, Status)
+        statuses = watcher.declare_latched_reader(keys.STATUS, Status)
         thread.start()
         try:
-            yield Running(made, backend, link, watcher, thread, statuses)
+            yield RunningHost(made, backend, link, watcher, thread, statuses)
         finally:
-            made.stop()
+            made.request_stop()
             thread.join(LIMIT_S)
             assert not thread.is_alive(), "the host did not stop"
 
 
 @contextmanager
-def commanded(config: RunConfig, ticks: int = 5, **host: Any) -> Iterator[tuple[Running, Follower]]:
+def running_commanded_host(config: RunConfig, ticks: int = 5, **host: Any) -> Iterator[tuple[RunningHost, Follower]]:
     """A host that is armed, and a follower that has commanded it for more ticks than that."""
-    with running(config, **host) as run, following(run.link, Follower()) as control:
+    with running_host(config, **host) as run, running_follower(run.link, Follower()) as control:
         run.arm()
         wait_until(lambda: len(control.armed_ticks) > ticks, "commands")
         yield run, control
 
 
 @contextmanager
-def following(link: Link, follower: Follower) -> Iterator[Follower]:
+def running_follower(link: Link, follower: Follower) -> Iterator[Follower]:
     """A follower in a thread of its own."""
     thread = threading.Thread(target=follower.run, args=(link,), name=follower.name)
     thread.start()

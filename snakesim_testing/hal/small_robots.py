@@ -83,8 +83,8 @@ decimation = 2
 """
 
 
-def changed(base: dict[str, Any], **dotted: Any) -> dict[str, Any]:
-    """A copy with other values; `__` in a name stands for the dot: limits__torque_nm=0.1."""
+def with_changes(base: dict[str, Any], **dotted: Any) -> dict[str, Any]:
+    """Return a deep copy of a table with other values; `__` in a name stands for the dot: limits__torque_nm=0.1."""
     copied = copy.deepcopy(base)
     for name, value in dotted.items():
         *parents, last = name.split("__")
@@ -95,24 +95,26 @@ def changed(base: dict[str, Any], **dotted: Any) -> dict[str, Any]:
     return copied
 
 
-def robot_file(**dotted: Any) -> RobotFile:
-    """The test robot, with changes."""
-    return msgspec.convert(changed(ROBOT, **dotted), RobotFile)
+def make_robot_file(**dotted: Any) -> RobotFile:
+    """Return the robot file of the test robot, with changes."""
+    return msgspec.convert(with_changes(ROBOT, **dotted), RobotFile)
 
 
-def run_config(**dotted: Any) -> RunConfig:
-    """The test run, with changes."""
-    return msgspec.convert(changed(RUN, **dotted), RunConfig)
+def make_run_config(**dotted: Any) -> RunConfig:
+    """Return the configuration of the test run, with changes."""
+    return msgspec.convert(with_changes(RUN, **dotted), RunConfig)
 
 
-def description(*, simulated_time: bool = False, **dotted: Any) -> Description:
-    """The test robot as a HAL publishes it."""
+def make_description(*, simulated_time: bool = False, **dotted: Any) -> Description:
+    """Return the description of the test robot, as a host publishes it, with changes."""
     reported = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
-    return describe_robot(robot_file(**dotted), simulated_time=simulated_time, **reported)
+    return describe_robot(make_robot_file(**dotted), simulated_time=simulated_time, **reported)
 
 
-def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any) -> JointState:
-    """A joint state; single numbers stand for all joints."""
+def make_joint_state(
+    robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any
+) -> JointState:
+    """Return a joint state of a robot. A single number is the value of every joint."""
     count = len(robot.joints)
 
     def column(value: Any) -> list[Any]:
@@ -122,8 +124,8 @@ def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any
     return JointState(angle_rad=column(angle), velocity_rad_s=column(velocity), torque_nm=column(torque), **values)
 
 
-def command(robot: Description, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> JointCommand:
-    """A command, good unless changed; a single target or mode stands for all joints."""
+def make_joint_command(robot: Description, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> JointCommand:
+    """Return a joint command, valid unless changed. A single target or mode is that of every joint."""
     count = len(robot.joints)
     values: dict[str, Any] = {
         "tick": 0,
@@ -138,10 +140,10 @@ def command(robot: Description, target: Any = 0.0, mode: Any = Mode.POSITION, **
     return JointCommand(**values)
 
 
-def power(
+def make_power(
     motor_c: Any = 20.0, voltage_v: Any = 24.0, leak: Any = False, valid: Any = True, *, joints: int = 3, **other: Any
 ) -> Power:
-    """What modules tell of their health; a single value stands for all joints."""
+    """Return a power sample with the health of joint modules. A single value is that of every joint."""
 
     def column(value: Any) -> list[Any]:
         return value if isinstance(value, list) else [value] * joints
@@ -151,24 +153,24 @@ def power(
     return Power(tick=0, timestamp_ns=0, current_a=column(0.0), board_c=column(20.0), **columns)
 
 
-def pose(tick: int = 0, timestamp_ns: int = 0, **other: Any) -> Pose:
-    """A body at rest at the origin, unless configured otherwise."""
+def make_pose(tick: int = 0, timestamp_ns: int = 0, **other: Any) -> Pose:
+    """Return the pose of a body at rest at the origin, with changes."""
     still = (0.0, 0.0, 0.0)
     values = {"position_w": still, "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
     values |= {"velocity_w": still, "angular_velocity_w": still, **other}
     return Pose(tick=tick, timestamp_ns=timestamp_ns, **values)
 
 
-def contact(link: int = 0, **other: Any) -> Contact:
-    """A touch from the left that presses nothing, unless configured otherwise."""
+def make_link_contact(link: int = 0, **other: Any) -> Contact:
+    """Return a contact on the left of a link without force, with changes."""
     still = (0.0, 0.0, 0.0)
     values = {"position_l": still, "normal_l": (0.0, -1.0, 0.0), "force_l": still, "torque_l": still}
     values |= {"tangent_1_l": (1.0, 0.0, 0.0), "tangent_2_l": (0.0, 0.0, 1.0)}
     return Contact(link=link, **{"obstacle": None, **values, **other})
 
 
-def clock(tick: int, *, arm_session: int = 0, **other: Any) -> Clock:
-    """A clock of 100 Hz in lockstep, armed if it names an arming."""
+def make_clock(tick: int, *, arm_session: int = 0, **other: Any) -> Clock:
+    """Return a clock message of 100 Hz in lockstep; the robot is armed if there is an arm session."""
     values = {
         "clock_mode": "lockstep",
         "lifecycle": "armed" if arm_session else "disarmed",
@@ -180,21 +182,21 @@ def clock(tick: int, *, arm_session: int = 0, **other: Any) -> Clock:
     )
 
 
-def write_files(
+def write_scenario_files(
     folder: Path, *, robot: str = ROBOT_TOML, scene: str = SCENE_TOML, scenario: str = SCENARIO_TOML
 ) -> str:
-    """A scenario with its robot and scene beside it; returns the scenario's path."""
+    """Write a scenario with its robot and scene into a folder, and return the path of the scenario."""
     (folder / "worm.toml").write_text(robot)
     (folder / "bend.toml").write_text(scene)
     (folder / "crawl.toml").write_text(scenario)
     return str(folder / "crawl.toml")
 
 
-def status(**reported: Any) -> Status:
+def make_status(**reported: Any) -> Status:
     """Return a status as the host of the robot `worm` publishes it, armed and without faults.
 
     Args:
-        **reported: fields that differ from these defaults.
+        **reported: Fields that differ from these defaults.
     """
     values: dict[str, Any] = {
         "tick": 0,

@@ -7,34 +7,41 @@ import msgspec
 from hypothesis import strategies as st
 from msgspec import inspect
 
-LONGEST = 3  # entries of a list or section, where the type allows more
+MAX_EXTRA_ENTRIES = 3  # entries of a list or section, where the type allows more
 NAMES = st.characters(exclude_categories=("Cs",))
 
 
-def messages_of(struct: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
-    """Any value of a Struct that its own decoder takes."""
-    return _strategy(inspect.type_info(struct))
+def make_strategy(struct: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
+    """Return a strategy for all values of a Struct that its own decoder accepts."""
+    return _make_strategy(inspect.type_info(struct))
 
 
-def _strategy(info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: C901 - one case a type
-    """Return a strategy of Hypothesis that generates every valid value of a message's field.
+def _make_strategy(type_info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: C901 - one case a type
+    """Return a Hypothesis strategy that generates valid values of a type, up to its bounds.
 
     Args:
-        info: type of the field with its bounds, as msgspec inspects it.
+        type_info: Type of a message's field with its bounds, as msgspec inspects it.
+
+    Raises:
+        NotImplementedError: There is no strategy for this type yet.
     """
-    match info:
+    match type_info:
         case inspect.Metadata():
-            return _strategy(info.type)
+            return _make_strategy(type_info.type)
         case inspect.FloatType():
-            low = info.ge if info.ge is not None else info.gt
-            high = info.le if info.le is not None else info.lt
+            min_value = type_info.ge if type_info.ge is not None else type_info.gt
+            max_value = type_info.le if type_info.le is not None else type_info.lt
             return st.floats(
-                low, high, exclude_min=info.gt is not None, exclude_max=info.lt is not None, allow_nan=False
+                min_value,
+                max_value,
+                exclude_min=type_info.gt is not None,
+                exclude_max=type_info.lt is not None,
+                allow_nan=False,
             )
         case inspect.IntType():
-            return st.integers(lowest(info), highest(info))
+            return st.integers(find_min_integer(type_info), find_max_integer(type_info))
         case inspect.StrType():
-            return st.text(NAMES, min_size=info.min_length or 0, max_size=min(info.max_length or 20, 20))
+            return st.text(NAMES, min_size=type_info.min_length or 0, max_size=min(type_info.max_length or 20, 20))
         case inspect.BytesType():
             return st.binary(max_size=20)
         case inspect.BoolType():
@@ -42,52 +49,59 @@ def _strategy(info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: C901 - one
         case inspect.NoneType():
             return st.none()
         case inspect.LiteralType():
-            return st.sampled_from(info.values)
+            return st.sampled_from(type_info.values)
         case inspect.EnumType():
-            return st.sampled_from(list(info.cls))
+            return st.sampled_from(list(type_info.cls))
         case inspect.ListType():
-            least = info.min_length or 0
-            return st.lists(_strategy(info.item_type), min_size=least, max_size=least + LONGEST)
+            min_length = type_info.min_length or 0
+            return st.lists(
+                _make_strategy(type_info.item_type), min_size=min_length, max_size=min_length + MAX_EXTRA_ENTRIES
+            )
         case inspect.TupleType():
-            return st.tuples(*(_strategy(item) for item in info.item_types))
+            return st.tuples(*(_make_strategy(item) for item in type_info.item_types))
         case inspect.DictType():
-            return st.dictionaries(_strategy(info.key_type), _strategy(info.value_type), max_size=LONGEST)
+            return st.dictionaries(
+                _make_strategy(type_info.key_type), _make_strategy(type_info.value_type), max_size=MAX_EXTRA_ENTRIES
+            )
         case inspect.UnionType():
-            return st.one_of([_strategy(option) for option in info.types])
+            return st.one_of([_make_strategy(option) for option in type_info.types])
         case inspect.StructType():
-            return st.builds(info.cls, **{f.name: _strategy(f.type) for f in info.fields})
+            return st.builds(type_info.cls, **{f.name: _make_strategy(f.type) for f in type_info.fields})
         case _:
-            raise NotImplementedError(f"no strategy for {info}; write one, so that the message stays tested")
+            raise NotImplementedError(f"no strategy for {type_info}; write one, so that the message stays tested")
 
 
-def lowest(info: inspect.IntType) -> int | None:
-    """The least whole number that is allowed."""
+def find_min_integer(info: inspect.IntType) -> int | None:
+    """Return the minimum integer of a type; None if it has no lower bound."""
     return info.ge if info.ge is not None else None if info.gt is None else info.gt + 1
 
 
-def highest(info: inspect.IntType) -> int | None:
-    """The greatest whole number that is allowed."""
+def find_max_integer(info: inspect.IntType) -> int | None:
+    """Return the maximum integer of a type; None if it has no upper bound."""
     return info.le if info.le is not None else None if info.lt is None else info.lt - 1
 
 
-def plain_example(struct: type[msgspec.Struct]) -> dict[str, Any]:
-    """One valid value as plain dicts and lists, with an entry in every list and section."""
-    return _example(inspect.type_info(struct))
+def make_plain_example(struct: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return one valid value of a Struct as plain dicts and lists, with an entry in every list and section."""
+    return _make_example(inspect.type_info(struct))
 
 
-def _example(info: inspect.Type) -> Any:  # noqa: C901 - one case a type
-    """Return one valid value of a message's field, as simple as its type allows.
+def _make_example(type_info: inspect.Type) -> Any:  # noqa: C901 - one case a type
+    """Return one valid value of a type as plain data, as simple as the type allows.
 
     Args:
-        info: type of the field with its bounds, as msgspec inspects it.
+        type_info: Type of a message's field with its bounds, as msgspec inspects it.
+
+    Raises:
+        NotImplementedError: There is no example for this type yet.
     """
-    match info:
+    match type_info:
         case inspect.Metadata():
-            return _example(info.type)
+            return _make_example(type_info.type)
         case inspect.FloatType():
             return 0.5
         case inspect.IntType():
-            return lowest(info) or 0
+            return find_min_integer(type_info) or 0
         case inspect.StrType():
             return "a"
         case inspect.BytesType():
@@ -97,80 +111,86 @@ def _example(info: inspect.Type) -> Any:  # noqa: C901 - one case a type
         case inspect.NoneType():
             return None
         case inspect.LiteralType():
-            return info.values[0]
+            return type_info.values[0]
         case inspect.EnumType():
-            return next(iter(info.cls)).value
+            return next(iter(type_info.cls)).value
         case inspect.ListType():
-            return [_example(info.item_type) for _ in range(max(info.min_length or 0, 1))]
+            return [_make_example(type_info.item_type) for _ in range(max(type_info.min_length or 0, 1))]
         case inspect.TupleType():
-            return [_example(item) for item in info.item_types]
+            return [_make_example(item) for item in type_info.item_types]
         case inspect.DictType():
-            return {_example(info.key_type): _example(info.value_type)}
+            return {_make_example(type_info.key_type): _make_example(type_info.value_type)}
         case inspect.UnionType():
-            return _example(next(option for option in info.types if not isinstance(option, inspect.NoneType)))
+            return _make_example(next(option for option in type_info.types if not isinstance(option, inspect.NoneType)))
         case inspect.StructType():
-            return {f.encode_name: _example(f.type) for f in info.fields}
+            return {f.encode_name: _make_example(f.type) for f in type_info.fields}
         case _:
-            raise NotImplementedError(f"no example for {info}")
+            raise NotImplementedError(f"no example for {type_info}")
 
 
 Place = tuple[str | int, ...]
 
 
-def places(value: Any, info: inspect.Type, at: Place = ()) -> Iterator[tuple[Place, inspect.Type]]:
-    """Every place inside an example, with the type that is declared there."""
-    if isinstance(info, inspect.Metadata):
-        info = info.type
-    if isinstance(info, inspect.UnionType):
-        info = next(option for option in info.types if not isinstance(option, inspect.NoneType))
-        yield from places(value, info, at)
+def iter_places(value: Any, type_info: inspect.Type, place: Place = ()) -> Iterator[tuple[Place, inspect.Type]]:
+    """Yield every place inside an example, with the declared type of the value there.
+
+    Args:
+        value: The example, or a part of it, as plain dicts and lists.
+        type_info: Declared type of the value.
+        place: Place of the value in the whole example: names of fields and indices of entries.
+    """
+    if isinstance(type_info, inspect.Metadata):
+        type_info = type_info.type
+    if isinstance(type_info, inspect.UnionType):
+        type_info = next(option for option in type_info.types if not isinstance(option, inspect.NoneType))
+        yield from iter_places(value, type_info, place)
         return
-    yield at, info
-    match info:
+    yield place, type_info
+    match type_info:
         case inspect.StructType():
-            for field in info.fields:
-                yield from places(value[field.encode_name], field.type, (*at, field.encode_name))
+            for field in type_info.fields:
+                yield from iter_places(value[field.encode_name], field.type, (*place, field.encode_name))
         case inspect.ListType():
-            yield from places(value[0], info.item_type, (*at, 0))
+            yield from iter_places(value[0], type_info.item_type, (*place, 0))
         case inspect.TupleType():
-            for i, item in enumerate(info.item_types):
-                yield from places(value[i], item, (*at, i))
+            for i, item in enumerate(type_info.item_types):
+                yield from iter_places(value[i], item, (*place, i))
         case inspect.DictType():
             for key, inner in value.items():
-                yield from places(inner, info.value_type, (*at, key))
+                yield from iter_places(inner, type_info.value_type, (*place, key))
         case _:
             pass
 
 
-def replaced(value: Any, at: Place, by: Any) -> Any:
-    """A copy of plain data with another value in one place."""
+def replace_at(value: Any, at: Place, by: Any) -> Any:
+    """Return a copy of plain data with another value in one place."""
     if not at:
         return by
     step: Any = at[0]
     copy: Any = list(value) if isinstance(value, list) else dict(value)
-    copy[step] = replaced(value[step], at[1:], by)
+    copy[step] = replace_at(value[step], at[1:], by)
     return copy
 
 
-def poisons(info: inspect.Type) -> list[Any]:  # noqa: C901 - one case a type
+def list_invalid_values(type_info: inspect.Type) -> list[Any]:  # noqa: C901 - one case a type
     """Return values that a field of this type must reject: values out of its bounds, and values of other types."""
-    match info:
+    match type_info:
         case inspect.FloatType():
-            return _invalid_floats(info)
+            return _invalid_floats(type_info)
         case inspect.IntType():
-            return _invalid_integers(info)
+            return _invalid_integers(type_info)
         case inspect.StrType():
-            invalid: list[Any] = [1, b"a"]
-            if info.max_length is not None:
-                invalid.append("a" * (info.max_length + 1))
-            if info.min_length:
-                invalid.append("")
-            return invalid
+            invalid_values: list[Any] = [1, b"a"]
+            if type_info.max_length is not None:
+                invalid_values.append("a" * (type_info.max_length + 1))
+            if type_info.min_length:
+                invalid_values.append("")
+            return invalid_values
         case inspect.BytesType():
-            invalid = [1, [1]]
-            if info.max_length is not None:
-                invalid.append(bytes(info.max_length + 1))
-            return invalid
+            invalid_values = [1, [1]]
+            if type_info.max_length is not None:
+                invalid_values.append(bytes(type_info.max_length + 1))
+            return invalid_values
         case inspect.BoolType():
             return [0, 1, "true"]
         case inspect.LiteralType():
@@ -178,12 +198,12 @@ def poisons(info: inspect.Type) -> list[Any]:  # noqa: C901 - one case a type
         case inspect.EnumType():
             return [-1, 1000, "POSITION"]
         case inspect.ListType():
-            invalid = [{}, 1]
-            if info.min_length:
-                invalid.append([])
-            return invalid
+            invalid_values = [{}, 1]
+            if type_info.min_length:
+                invalid_values.append([])
+            return invalid_values
         case inspect.TupleType():
-            return [[], [0.0] * (len(info.item_types) + 1)]
+            return [[], [0.0] * (len(type_info.item_types) + 1)]
         case inspect.DictType() | inspect.StructType():
             return [[], 1]
         case _:
@@ -207,10 +227,10 @@ def _invalid_floats(info: inspect.FloatType) -> list[Any]:
 def _invalid_integers(info: inspect.IntType) -> list[Any]:
     """Return integers out of the wire's range or the field's bounds, and values of other types."""
     invalid: list[Any] = [-(2**63), 2**63, 0.5, "1"]
-    minimum = lowest(info)
+    minimum = find_min_integer(info)
     if minimum is not None:
         invalid.append(minimum - 1)
-    maximum = highest(info)
+    maximum = find_max_integer(info)
     if maximum is not None:
         invalid.append(maximum + 1)
     return invalid

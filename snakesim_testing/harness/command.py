@@ -12,18 +12,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.harness.processes import parts_of, processes_of
-from snakesim_testing.harness.wait import LIMIT_S, wait_until
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.harness.processes import find_processes_of_run, find_run_processes
+from snakesim_testing.harness.wait import TIMEOUT_S, wait_until
 
-SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
+SNAKESIM_COMMAND = [sys.executable, "-m", "snakesim_operator"]
 WITH_TESTS = ["setpriv", "--pdeathsig", "KILL"]  # ends when the tests are killed, too
-TOO_LONG = 124  # as timeout(1) has it: no exit code of ours
+TIMED_OUT = 124  # as timeout(1) has it: no exit code of ours
 HANDED_DOWN = {"MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS", "WORKERS"}
 
 
 @dataclass(frozen=True)
-class Ended:
+class CompletedRun:
     """A finished command."""
 
     code: int
@@ -37,7 +37,7 @@ class Ended:
         return self.out + self.err
 
 
-def environment(home: Path, **more: str) -> dict[str, str]:
+def make_environment(home: Path, **more: str) -> dict[str, str]:
     """The caller's environment without what `make` hands down, and with a state folder of the test's own."""
     kept = {name: value for name, value in os.environ.items() if name not in HANDED_DOWN}
     return {**kept, "XDG_STATE_HOME": str(home), "PYTHONUNBUFFERED": "1", **more}
@@ -46,55 +46,59 @@ def environment(home: Path, **more: str) -> dict[str, str]:
 def snakesim(
     *arguments: str,
     cwd: Path,
-    limit_s: float = LIMIT_S,
-    more: Mapping[str, str] | None = None,
-    inside: Sequence[str] = (),
-) -> Ended:
+    limit_s: float = TIMEOUT_S,
+    extra_env: Mapping[str, str] | None = None,
+    command_prefix: Sequence[str] = (),
+) -> CompletedRun:
     """Run a command to its end. more: of the environment. inside: a prefix that runs it somewhere else."""
-    return call([*inside, *SNAKESIM, *arguments], cwd, environment(cwd, **(more or {})), limit_s)
+    return run_to_end(
+        [*command_prefix, *SNAKESIM_COMMAND, *arguments], cwd, make_environment(cwd, **(extra_env or {})), limit_s
+    )
 
 
-def call(
-    typed: Sequence[object],
+def run_to_end(
+    command_line: Sequence[object],
     cwd: Path,
     env: Mapping[str, str] | None = None,
-    limit_s: float = LIMIT_S,
-    begin: Callable[[], None] | None = None,
-) -> Ended:
+    limit_s: float = TIMEOUT_S,
+    child_setup: Callable[[], None] | None = None,
+) -> CompletedRun:
     """Run a program to its end, without input.
 
     Args:
-        typed: The program and its arguments.
+        command_line: The program and its arguments.
         cwd: Folder in which it runs.
         env: All of its environment; None: `environment(cwd)`.
         limit_s: Time after which it is killed; its exit code is then TOO_LONG.
-        begin: Called in the child process before the program begins.
+        child_setup: Called in the child process before the program begins.
     """
     start_s = time.monotonic()
     try:
         completed = subprocess.run(
-            [str(word) for word in typed],
+            [str(word) for word in command_line],
             cwd=cwd,
-            env=environment(cwd) if env is None else env,
+            env=make_environment(cwd) if env is None else env,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=limit_s,
             check=False,
-            preexec_fn=begin,
+            preexec_fn=child_setup,
         )
         code = completed.returncode
         out = completed.stdout
         err = completed.stderr
     except subprocess.TimeoutExpired as timeout:
-        code = TOO_LONG
+        code = TIMED_OUT
         out = timeout.stdout or b""
         err = (timeout.stderr or b"") + b"\n[did not end within %g s]" % limit_s
-    return Ended(code, out.decode(errors="replace"), err.decode(errors="replace"), took_s=time.monotonic() - start_s)
+    return CompletedRun(
+        code, out.decode(errors="replace"), err.decode(errors="replace"), took_s=time.monotonic() - start_s
+    )
 
 
 @dataclass(frozen=True)
 class Running:
-    """A `snakesim run` that goes on."""
+    """A `snakesim run` in the background."""
 
     process: subprocess.Popen[bytes]
     out: Path
@@ -121,78 +125,78 @@ class Running:
             lambda: re.search(pattern, self.printed()) or self.process.poll() is not None, f"{pattern!r} from the run"
         )
         found = re.search(pattern, self.printed())
-        assert found is not None, self.how_it_ended()
+        assert found is not None, self.describe_ending()
         return found[1]
 
-    def how_it_ended(self) -> str:
-        """For the words of a failure."""
+    def describe_ending(self) -> str:
+        """Return exit code and last output of the run, for the text of a failure."""
         return f"the run ended with {self.process.returncode}: {self.printed()[-2000:]}"
 
     def printed(self) -> str:
-        """All that it has printed."""
+        """Return everything that the run has printed."""
         return self.out.with_suffix(".printed").read_text(encoding="utf-8", errors="replace")
 
-    def wait_for(self, text: str, limit_s: float = LIMIT_S) -> None:
-        """Wait until it has printed this text."""
+    def wait_for(self, text: str, limit_s: float = TIMEOUT_S) -> None:
+        """Wait until the run has printed a text. Fails if the run ends without it."""
         wait_until(lambda: text in self.printed() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
-        assert text in self.printed(), self.how_it_ended()
+        assert text in self.printed(), self.describe_ending()
 
-    def tell(self, *arguments: str, limit_s: float = LIMIT_S) -> Ended:
+    def run_tool(self, *arguments: str, limit_s: float = TIMEOUT_S) -> CompletedRun:
         """Run a tool on the same machine with the endpoint of this run."""
         where = (*arguments, "--endpoint", self.endpoint)
-        return snakesim(*where, cwd=self.home, limit_s=limit_s, more=self.more, inside=self.inside)
+        return snakesim(*where, cwd=self.home, limit_s=limit_s, extra_env=self.more, command_prefix=self.inside)
 
     def part(self, name: str) -> int:
-        """Process id of one of its parts: `host`, `control`, ..."""
-        return parts_of(self.out)[name]
+        """Return the process id of one part of the run, such as `host` or `control`."""
+        return find_run_processes(self.out)[name]
 
     def parts(self) -> dict[str, int]:
-        """Process ids of those of its host and services that live."""
+        """Return the process ids of host and services that are alive, by name."""
         own = ("host", "guidance", "navigation", "control")
-        return {name: pid for name, pid in parts_of(self.out).items() if name in own}
+        return {name: pid for name, pid in find_run_processes(self.out).items() if name in own}
 
-    def end(self, limit_s: float = LIMIT_S) -> int:
-        """Wait for its exit code."""
+    def end(self, limit_s: float = TIMEOUT_S) -> int:
+        """Wait until the run has ended, and return its exit code."""
         return self.process.wait(limit_s)
 
-    def interrupt(self, limit_s: float = LIMIT_S) -> int:
-        """Ctrl-C."""
+    def interrupt(self, limit_s: float = TIMEOUT_S) -> int:
+        """Send SIGINT to the run, as Ctrl-C does, wait until it has ended, and return its exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.end(limit_s)
 
 
 @contextmanager
-def running(
-    out: Path,
+def running_snakesim(
+    output_path: Path,
     *arguments: str,
     endpoint: str | None = "free",
-    more: Mapping[str, str] | None = None,
-    inside: Sequence[str] = (),
+    extra_env: Mapping[str, str] | None = None,
+    command_prefix: Sequence[str] = (),
 ) -> Iterator[Running]:
     """Run `snakesim run` in the background, and kill all of its processes that are left at the end.
 
     Args:
-        out: Folder of the run; its output is written beside it.
+        output_path: Folder of the run; its output is written beside it.
         *arguments: Arguments of the command.
         endpoint: Endpoint of its network; "free" for an unused port, None to let it choose.
-        more: Variables that are added to its environment.
-        inside: Command line that runs it elsewhere, such as in a network namespace.
+        extra_env: Variables that are added to its environment.
+        command_prefix: Command line that runs it elsewhere, such as in a network namespace.
     """
-    asked = free_endpoint() if endpoint == "free" else endpoint
+    asked = find_free_endpoint() if endpoint == "free" else endpoint
     network = ["--endpoint", asked] if asked is not None and "--router" not in arguments else []
-    with out.with_suffix(".printed").open("wb") as output:
+    with output_path.with_suffix(".printed").open("wb") as output:
         process = subprocess.Popen(
-            [*inside, *WITH_TESTS, *SNAKESIM, "run", *arguments, "--out", str(out), *network],
-            cwd=out.parent,
-            env=environment(out.parent, **(more or {})),
+            [*command_prefix, *WITH_TESTS, *SNAKESIM_COMMAND, "run", *arguments, "--out", str(output_path), *network],
+            cwd=output_path.parent,
+            env=make_environment(output_path.parent, **(extra_env or {})),
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
         )
     try:
-        yield Running(process, out, asked, more, inside)
+        yield Running(process, output_path, asked, extra_env, command_prefix)
     finally:
-        for pid, _ in processes_of(out):
+        for pid, _ in find_processes_of_run(output_path):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
         if process.poll() is None:

@@ -3,6 +3,6 @@
 from snakesim_hal.network.free_ports import find_free_port
 
 
-def free_endpoint() -> str:
+def find_free_endpoint() -> str:
     """For a Zenoh network."""
     return f"tcp/127.0.0.1:{find_free_port()}"

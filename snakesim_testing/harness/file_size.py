@@ -10,11 +10,14 @@ import pytest
 
 
 @contextmanager
-def max_file_size(size_bytes: int) -> Iterator[None]:
-    """Let no file grow beyond a size, neither here nor in child processes.
+def limited_file_size(size_bytes: int) -> Iterator[None]:
+    """Limit the size of all files that this process and its children write within the context.
 
-    No bytecode is written meanwhile: Python 3.11 does not notice that it could write only a part of it, and every
-    later process that imports the module would fail.
+    Python does not write bytecode meanwhile: Python 3.11 does not notice if only a part of it could be written, and
+    every later process that imports the module would fail.
+
+    Args:
+        size_bytes: Maximum size of a file in bytes. Writing beyond it fails with EFBIG.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

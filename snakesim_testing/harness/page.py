@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from snakesim_testing.harness.wait import LIMIT_S, wait_until
+from snakesim_testing.harness.wait import TIMEOUT_S, wait_until
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -46,7 +46,7 @@ class Page:
             compression=None,
             max_size=None,
             proxy=None,
-            open_timeout=LIMIT_S,
+            open_timeout=TIMEOUT_S,
         )
         self.controls: dict[str, dict[str, Any]] = {}  # by their id
         self.closed_by: int | None = None

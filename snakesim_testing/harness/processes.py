@@ -15,8 +15,13 @@ PROGRAMS = {
 }
 
 
-def processes_with(file: str, content: str) -> list[tuple[int, str]]:
-    """(pid, NUL-separated command line) of every live process with a content in its `cmdline`, `environ` or so."""
+def find_processes_with(file: str, content: str) -> list[tuple[int, str]]:
+    """Return process id and NUL-separated command line of every live process with a text in a file below /proc/PID.
+
+    Args:
+        file: Name of the file, such as `cmdline` or `environ`.
+        content: The text.
+    """
     found: list[tuple[int, str]] = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, IndexError):  # gone in the meantime, or of another user
@@ -26,21 +31,21 @@ def processes_with(file: str, content: str) -> list[tuple[int, str]]:
     return found
 
 
-def processes_of(out: Path) -> list[tuple[int, str]]:
-    """Those that were started for a run's folder."""
-    return processes_with("cmdline", f"{out}/config.json")
+def find_processes_of_run(out: Path) -> list[tuple[int, str]]:
+    """Return process id and command line of every live process that was started for the folder of a run."""
+    return find_processes_with("cmdline", f"{out}/config.json")
 
 
-def parts_of(out: Path) -> dict[str, int]:
-    """Process ids of a run's parts, by name; a second process of the same name is `NAME again`."""
+def find_run_processes(out: Path) -> dict[str, int]:
+    """Return the process ids of a run by name of the part. A second process of a part is named `NAME again`."""
     found: dict[str, int] = {}
-    for pid, line in sorted(processes_of(out)):
+    for pid, line in sorted(find_processes_of_run(out)):
         service = SERVICE.search(line)
         name = service[1] if service else next((name for module, name in PROGRAMS.items() if module in line), "run")
         found[f"{name} again" if name in found else name] = pid
     return found
 
 
-def nothing_left(out: Path, limit_s: float = 10.0) -> None:
-    """Fail unless every process of a run is gone soon."""
-    wait_until(lambda: not processes_of(out), f"no process of {out} left", limit_s)
+def assert_no_process_left(out: Path, limit_s: float = 10.0) -> None:
+    """Fail unless every process of a run has ended within a time."""
+    wait_until(lambda: not find_processes_of_run(out), f"no process of {out} left", limit_s)

@@ -12,8 +12,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from snakesim_hal.base.arithmetic import ONE_THREAD
-from snakesim_hal.base.process import SERVICE_PRIORITY, die_with_parent, python_command
+from snakesim_hal.base.arithmetic import SINGLE_THREAD_ENV
+from snakesim_hal.base.process import SERVICE_PRIORITY, make_python_command, set_parent_death_signal
 
 NET = "10.78.0"
 HURRIED = ("chrt", "--fifo", str(SERVICE_PRIORITY))
@@ -31,11 +31,11 @@ class Machine:
 
     @property
     def pid(self) -> str:
-        """Of a process in it."""
+        """Process id of a process in the namespace."""
         return str(self._holder.pid)
 
-    def inside(self, *command: str) -> list[str]:
-        """A command that runs in it."""
+    def wrap_command(self, *command: str) -> list[str]:
+        """Return a command line that runs a command in this namespace."""
         return ["nsenter", "--target", self.pid, "--net", *command]
 
     def run(
@@ -43,7 +43,7 @@ class Machine:
     ) -> str:
         """Run a command in it to its end, and return its output."""
         output, env = subprocess.PIPE, {**os.environ, **(env or {})}
-        inside = self.inside(*command)
+        inside = self.wrap_command(*command)
         done = subprocess.run(inside, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, cwd=cwd, env=env)
         assert done.returncode == 0 or not check, f"{self.name}: {' '.join(command)}: {done.stdout}"
         return f"{done.stdout}(exit code {done.returncode})"
@@ -56,18 +56,27 @@ class Machine:
         inherits: Sequence[int] = (),
         hurried: bool = False,
     ) -> subprocess.Popen[bytes]:
-        """Start a program in it, that dies with this process.
+        """Start a program in the namespace. It ends with this process.
 
-        hurried: before ordinary processes, as on a machine that has nothing else to do.
+        Args:
+            command: The program and its arguments.
+            log: File that gets the output.
+            env: Variables that are added to the environment.
+            inherits: File descriptors that the program inherits.
+            hurried: Whether the program gets a real-time priority, as on a machine that has nothing else to do.
         """
-        return self._started(self.inside(*(HURRIED if hurried else ()), *command), log, env or {}, inherits)
+        return self._started(self.wrap_command(*(HURRIED if hurried else ()), *command), log, env or {}, inherits)
 
-    def module(
+    def start_module(
         self, *module_and_arguments: str, log: Path, inherits: Sequence[int] = (), hurried: bool = False
     ) -> subprocess.Popen[bytes]:
-        """The same for a Python module."""
+        """Start a Python module in the namespace, with one thread for numeric libraries. See `start`."""
         return self.start(
-            *python_command("-m", *module_and_arguments), log=log, env=ONE_THREAD, inherits=inherits, hurried=hurried
+            *make_python_command("-m", *module_and_arguments),
+            log=log,
+            env=SINGLE_THREAD_ENV,
+            inherits=inherits,
+            hurried=hurried,
         )
 
     def _started(
@@ -93,13 +102,13 @@ class Machine:
             stderr=subprocess.STDOUT,
             pass_fds=keep,
             env={**os.environ, **(env or {})},
-            preexec_fn=lambda: die_with_parent(parent),
+            preexec_fn=lambda: set_parent_death_signal(parent),
         )
         self._stack.callback(_end, process)
         return process
 
-    def address(self, interface: str, address: str) -> None:
-        """Give an interface an address, and have it up."""
+    def set_address(self, interface: str, address: str) -> None:
+        """Give an interface an address, and set it up."""
         self.run("ip", "address", "add", address, "dev", interface)
         self.run("ip", "link", "set", interface, "up")
 
@@ -109,36 +118,44 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait(10)
 
 
-def connected(names: Sequence[str], stack: ExitStack) -> dict[str, Machine]:
-    """Machines with a cable each to the first one; addresses 10.78.0.1, .2, ... They reach that one alone."""
+def connect_machines(names: Sequence[str], stack: ExitStack) -> dict[str, Machine]:
+    """Create machines, and connect each by a cable to the first one, which is the only one that they reach.
+
+    Args:
+        names: Names of the machines. Their addresses are 10.78.0.1, 10.78.0.2 and so on.
+        stack: Ends the machines.
+
+    Returns:
+        The machines by name.
+    """
     machines = {name: Machine(stack, name) for name in names}
     middle = machines[names[0]]
-    middle.address("lo", f"{NET}.1/32")
+    middle.set_address("lo", f"{NET}.1/32")
     for number, name in enumerate(names[1:], 2):
         machine, port, own = machines[name], f"port{number}", f"{NET}.{number}"
         middle.run("ip", "link", "add", port, "type", "veth", "peer", "name", "lab0", "netns", machine.pid)
         middle.run("ip", "link", "set", port, "up")
         middle.run("ip", "route", "add", own, "dev", port, "src", f"{NET}.1")
-        machine.address("lab0", f"{own}/32")
+        machine.set_address("lab0", f"{own}/32")
         machine.run("ip", "route", "add", f"{NET}.1", "dev", "lab0", "src", own)
     return machines
 
 
-def wire(a: Machine, b: Machine, name: str, net: str) -> None:
-    """A cable: `net`.1 at a, `net`.2 at b."""
+def connect_by_cable(a: Machine, b: Machine, name: str, net: str) -> None:
+    """Connect two machines by a cable, with the addresses `net`.1 and `net`.2."""
     a.run("ip", "link", "add", name, "type", "veth", "peer", "name", name, "netns", b.pid)
-    a.address(name, f"{net}.1/24")
-    b.address(name, f"{net}.2/24")
+    a.set_address(name, f"{net}.1/24")
+    b.set_address(name, f"{net}.2/24")
 
 
 @dataclass(frozen=True)
-class Radio:
-    """A link that can be made bad while it is in use."""
+class RadioLink:
+    """A radio link between two machines whose quality can be changed while it is in use."""
 
     _relay: subprocess.Popen[bytes]
 
-    def make(self, *, loss: float = 0.0, delay_s: float = 0.0, jitter_s: float = 0.0, cut: bool = False) -> None:
-        """What is not given is good."""
+    def set_quality(self, *, loss: float = 0.0, delay_s: float = 0.0, jitter_s: float = 0.0, cut: bool = False) -> None:
+        """Set the quality of the link. A property that is not named becomes perfect."""
         assert self._relay.stdin is not None
         order = {"loss": loss, "delay_s": delay_s, "jitter_s": jitter_s, "cut": cut}
         self._relay.stdin.write(json.dumps(order).encode() + b"\n")
@@ -146,14 +163,14 @@ class Radio:
 
 
 @contextmanager
-def radio(a: Machine, b: Machine, name: str, net: str) -> Iterator[Radio]:
-    """Such a link: `net`.1 at a, `net`.2 at b."""
+def connect_by_radio(a: Machine, b: Machine, name: str, net: str) -> Iterator[RadioLink]:
+    """Connect two machines by a radio link, with the addresses `net`.1 and `net`.2, within the context."""
     command = [sys.executable, "-m", "verification.links.relay", a.pid, b.pid, name]
     relay = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         assert relay.stdout is not None and relay.stdout.readline() == b"ready\n", "no TAP interface"
-        a.address(name, f"{net}.1/24")
-        b.address(name, f"{net}.2/24")
-        yield Radio(relay)
+        a.set_address(name, f"{net}.1/24")
+        b.set_address(name, f"{net}.2/24")
+        yield RadioLink(relay)
     finally:
         _end(relay)

@@ -1,6 +1,7 @@
 """A lab of robots and workstations on loopback, for tests of access rights.
 
-As a user would, `small_lab` writes a lab file, makes its certificates and configuration files, and starts its router.
+As a user would, `running_test_lab` writes a lab file, makes its certificates and configuration files, and starts its
+router.
 """
 
 import json
@@ -16,32 +17,32 @@ from typing import Any
 
 import zenoh
 
-from snakesim_hal.base.process import die_with_parent
+from snakesim_hal.base.process import set_parent_death_signal
 from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.wire.roles import Role
 from snakesim_operator.features.lab.certificates import write_certificates
-from snakesim_operator.features.lab.identities import Identity, identities
+from snakesim_operator.features.lab.identities import Identity, iterate_identities
 from snakesim_operator.features.lab.lab_file import Lab, load_lab
-from snakesim_operator.features.lab.render import render
-from snakesim_operator.features.lab.zenoh_files import session_settings
+from snakesim_operator.features.lab.render import write_lab_files
+from snakesim_operator.features.lab.zenoh_files import make_session_settings
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import SNAKESIM, environment
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, make_environment
 
 # The two robots of the lab: tests take the role of a user of the first.
-OWN = "planar13"
-OTHER = "second"
-LIMIT_S = 20.0  # for the start and for the end of the router
+OWN_ROBOT = "planar13"
+OTHER_ROBOT = "second"
+ROUTER_TIMEOUT_S = 20.0  # for the start and for the end of the router
 CONNECT_TIMEOUT_MS = 3000
 COLOR = re.compile(r"\x1b\[[0-9;]*m")  # escape sequences in a terminal's output
 MACHINES = ("hub", "robot1", "robot2", "ws1", "ws2", "laptop")
 
 
-def lab_text(folder: Path, port: int) -> str:
-    """Return the lab file of two robots, each with every role, behind one router.
+def format_lab_file(folder: Path, port: int) -> str:
+    """Return the text of a lab file with two robots behind one router, and every role for each of them.
 
     Args:
-        folder: Where each machine has a folder of its own.
-        port: Port of the router. The port after it is that of `spare`, a router that is never started.
+        folder: Folder that gets a subfolder for each machine.
+        port: Port of the router `main`. The next port is that of the router `spare`, which is never started.
     """
     machines = [f'[machines.{name}]\naddress = "127.0.0.1"\nfolder = "{folder}/{name}"' for name in MACHINES]
     routers = [
@@ -49,110 +50,113 @@ def lab_text(folder: Path, port: int) -> str:
         f'[routers.spare]\nmachine = "hub"\nport = {port + 1}',
     ]
     robots = [
-        f'[robots.{OWN}]\nmachine = "robot1"\nscenario = "triplet"\nbackend = "sim"\nfaults = true',
-        f'[robots.{OTHER}]\nmachine = "robot2"\nscenario = "triplet"\nbackend = "sim"',
+        f'[robots.{OWN_ROBOT}]\nmachine = "robot1"\nscenario = "triplet"\nbackend = "sim"\nfaults = true',
+        f'[robots.{OTHER_ROBOT}]\nmachine = "robot2"\nscenario = "triplet"\nbackend = "sim"',
     ]
     roles: list[str] = []
-    for robot, workstation in ((OWN, "ws1"), (OTHER, "ws2")):
+    for robot, workstation in ((OWN_ROBOT, "ws1"), (OTHER_ROBOT, "ws2")):
         roles += [
-            _role_text("gnc", workstation, robot),
-            _role_text("recorder", workstation, robot),
-            _role_text("operator", "laptop", robot),
-            _role_text("viewer", "laptop", robot),
-            _role_text("administrator", "hub", robot),
+            _format_role_section("gnc", workstation, robot),
+            _format_role_section("recorder", workstation, robot),
+            _format_role_section("operator", "laptop", robot),
+            _format_role_section("viewer", "laptop", robot),
+            _format_role_section("administrator", "hub", robot),
         ]
-    roles.append(_role_text("operator", "laptop", "all"))
+    roles.append(_format_role_section("operator", "laptop", "all"))
     return "\n\n".join(['name = "small lab"', *machines, *routers, *robots, *roles])
 
 
-def _role_text(role: str, machine: str, robot: str) -> str:
+def _format_role_section(role: str, machine: str, robot: str) -> str:
     """Return the section of the lab file that gives a machine a role for a robot."""
     return f'[[roles]]\nmachine = "{machine}"\nrole = "{role}"\nrobot = "{robot}"'
 
 
 @dataclass
-class SmallLab:
-    """A lab whose router runs, and where its files are."""
+class RunningLab:
+    """A lab whose router is running, with the paths of its files."""
 
     lab: Lab  # content of the lab file
     folder: Path  # has a folder for each machine, with its certificates
     log: Path  # output of the router
 
-    def identity(self, common_name: str) -> Identity:
+    def find_identity_by_name(self, common_name: str) -> Identity:
         """Return the identity whose certificate has this common name."""
-        return next(identity for identity in identities(self.lab) if identity.common_name == common_name)
+        return next(identity for identity in iterate_identities(self.lab) if identity.common_name == common_name)
 
-    def who(self, role: Role, robot: str) -> Identity:
+    def find_identity_by_role(self, role: Role, robot: str) -> Identity:
         """Return the first identity that has a role for a robot."""
-        return next(found for found in identities(self.lab) if found.role == role and found.of == robot)
+        return next(found for found in iterate_identities(self.lab) if found.role == role and found.subject == robot)
 
-    def settings(self, identity: Identity, **more: Any) -> dict[str, Any]:
+    def make_session_settings(self, identity: Identity, **more: Any) -> dict[str, Any]:
         """Return the Zenoh configuration of a session with the certificate of an identity.
 
         The session has no namespace, so that a test can use the full key of any robot.
 
         Args:
-            identity: Whose certificate authenticates the session.
+            identity: Identity whose certificate authenticates the session.
             more: Sections of the configuration that replace those of the identity.
         """
-        settings = session_settings(identity, self.lab)
+        settings = make_session_settings(identity, self.lab)
         settings.pop("namespace", None)
-        running_router = self.lab.endpoints()[:1]  # the other router never runs
+        running_router = self.lab.list_endpoints()[:1]  # the other router never runs
         settings["connect"]["endpoints"] = running_router
         settings["connect"]["timeout_ms"] = CONNECT_TIMEOUT_MS
         return {**settings, **more}
 
-    def session(self, identity: Identity, **more: Any) -> zenoh.Session:
+    def open_session(self, identity: Identity, **more: Any) -> zenoh.Session:
         """Open a plain Zenoh session with the certificate of an identity. Raises ZError if no router accepts it."""
-        return opened(self.settings(identity, **more))
+        return open_zenoh_session(self.make_session_settings(identity, **more))
 
-    def printed(self) -> list[str]:
+    def read_router_log(self) -> list[str]:
         """Return the lines of the router's log, without colors."""
         return COLOR.sub("", self.log.read_text(errors="replace")).splitlines()
 
 
-def opened(settings: dict[str, Any]) -> zenoh.Session:
+def open_zenoh_session(settings: dict[str, Any]) -> zenoh.Session:
     """Open a plain Zenoh session with a configuration. Raises ZError if no router accepts it."""
     zenoh.init_log_from_env_or("off")
     return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
 
 
 @contextmanager
-def small_lab(folder: Path) -> Iterator[SmallLab]:
-    """Create a lab in a folder, and run its router until the end of the context.
+def running_test_lab(folder: Path) -> Iterator[RunningLab]:
+    """Create the files of a lab in a folder, and run its router until the end of the context.
 
-    The lab has two robots and the machines in MACHINES, all on loopback; see `lab_text`. Only the router runs: tests
-    open the sessions of the machines by themselves.
+    A lab is a network of robots and machines, described by a lab file. This one has two robots and the machines in
+    MACHINES, all on loopback; see `format_lab_file`. Only the router runs: tests open the sessions of the machines
+    themselves.
 
     Args:
-        folder: An empty folder, which gets the lab file, certificates, configuration files and the router's log.
+        folder: An empty folder, which gets the lab file, certificates, configuration files and the log of the router.
 
     Yields:
-        The lab, when its router accepts connections.
+        The lab, once its router accepts connections.
     """
     port = find_free_port()
-    lab_file = folder / "lab.toml"
-    lab_file.write_text(lab_text(folder, port))
-    lab = load_lab(lab_file)
+    lab_path = folder / "lab.toml"
+    lab_path.write_text(format_lab_file(folder, port))
+    lab = load_lab(lab_path)
     write_certificates(lab, folder, folder / "authority")
-    render(lab, folder)
-    log = folder / "router.log"
+    write_lab_files(lab, folder)
+    log_path = folder / "router.log"
     parent = os.getpid()  # the router ends with this process, even if it is killed
-    with log.open("w") as out:
+    with log_path.open("w") as log_file:
         router = subprocess.Popen(
-            [*SNAKESIM, "start", "router", str(folder / "hub" / "router.main.json5")],
+            [*SNAKESIM_COMMAND, "start", "router", str(folder / "hub" / "router.main.json5")],
             cwd=folder,
-            env=environment(folder),
-            stdout=out,
+            env=make_environment(folder),
+            stdout=log_file,
             stderr=subprocess.STDOUT,
-            preexec_fn=lambda: die_with_parent(parent),
+            preexec_fn=lambda: set_parent_death_signal(parent),
         )
     try:
         # A router that has ended will never run, so its end also ends the wait, and fails here.
-        wait_until(lambda: "router running" in log.read_text() or router.poll() is not None, "a router", LIMIT_S)
+        wait_until(
+            lambda: "router running" in log_path.read_text() or router.poll() is not None, "a router", ROUTER_TIMEOUT_S
+        )
         has_ended = router.poll() is not None
-        assert not has_ended, log.read_text()
-        yield SmallLab(lab, folder, log)
+        assert not has_ended, log_path.read_text()
+        yield RunningLab(lab, folder, log_path)
     finally:
         router.send_signal(signal.SIGTERM)
-        router.wait(LIMIT_S)
+        router.wait(ROUTER_TIMEOUT_S)

@@ -166,8 +166,12 @@ class Browser:
 
 
 @contextmanager
-def chromium(*, with_webgl: bool = True) -> Iterator[Browser]:
-    """A browser with a profile of its own, which ends with the context."""
+def open_chromium(*, with_webgl: bool = True) -> Iterator[Browser]:
+    """Start a Chromium browser with a profile of its own, and end it with the context.
+
+    Args:
+        with_webgl: Whether the browser supports WebGL.
+    """
     assert CHROMIUM is not None, MISSING
     flags = (*FLAGS, *(WEBGL_FLAGS if with_webgl else NO_WEBGL_FLAGS))
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:

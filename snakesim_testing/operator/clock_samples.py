@@ -10,4 +10,4 @@ from snakesim_testing.hal import small_robots as rig
 
 
 def clock(tick: int) -> Arrival:
-    return Arrival(keys.CLOCK, encode(rig.clock(tick)), format_encoding(Clock), time.monotonic_ns())
+    return Arrival(keys.CLOCK, encode(rig.make_clock(tick)), format_encoding(Clock), time.monotonic_ns())

@@ -10,9 +10,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.recording import mcap_file, writer
-from snakesim_operator.recording.chunks import HEAD
+from snakesim_operator.recording.chunks import RECORD_HEADER
 from snakesim_operator.run.in_process import simulate
 
 
@@ -29,8 +29,8 @@ def spans(content: bytes | bytearray, magic: int = 8) -> list[Span]:
     """All records of a whole file; or of a chunk, which has no magic bytes around them."""
     found, at = list[Span](), magic
     while at < len(content) - magic:
-        opcode, length = HEAD.unpack_from(content, at)
-        found.append(Span(opcode, at, at + HEAD.size + length))
+        opcode, length = RECORD_HEADER.unpack_from(content, at)
+        found.append(Span(opcode, at, at + RECORD_HEADER.size + length))
         at = found[-1].end
     return found
 
@@ -50,7 +50,7 @@ def recorded(out: Path, duration_s: float, chunk_bytes: int) -> Path:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(mcap_file, "CHUNK_BYTES", chunk_bytes)
         patched.setattr(writer, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
-        simulate(load("peg_row", [parse_set(f"duration_s={duration_s}")]).config, out)
+        simulate(load_scenario("peg_row", [parse_set_option(f"duration_s={duration_s}")]).config, out)
     return out
 
 

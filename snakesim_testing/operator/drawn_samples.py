@@ -3,16 +3,16 @@
 from typing import Any
 
 from snakesim_hal.wire.messages import ControlState, JointState, Obstacle, World, WorldContact
-from snakesim_testing.hal.small_robots import description, state
+from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
-ROBOT = description()
+ROBOT = make_description()
 
 
 COUNT = len(ROBOT.joints)
 
 
 def joints(*angles_rad: float) -> JointState:
-    return state(ROBOT, [*angles_rad, *[0.0] * (COUNT - len(angles_rad))])
+    return make_joint_state(ROBOT, [*angles_rad, *[0.0] * (COUNT - len(angles_rad))])
 
 
 def contact(

@@ -10,12 +10,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from snakesim_hal.model.scenario import load
+from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.report import page as report_page
+from snakesim_operator.results.report import render_report as report_page
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import summarise
+from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import simulate
 
 PLOTLY = LIBRARY.read_text(encoding="utf-8")
@@ -29,11 +29,11 @@ ARMED_S = 0.37  # a robot is armed some time after its clock has begun
 @cache
 def triplet() -> RunRecord:
     """As shipped, 10 s; armed later, and with commands that were refused or limited."""
-    record = simulate(load("triplet").config).record
+    record = simulate(load_scenario("triplet").config).record
     later_ns = round(ARMED_S * 1e9)
     reported = {
         name: [msgspec.structs.replace(one, timestamp_ns=one.timestamp_ns + later_ns) for one in getattr(record, name)]
-        for name in ("control", "worlds")
+        for name in ("control_states", "worlds")
     }
     return dataclasses.replace(record, host=finished(1000), time_s=record.time_s + ARMED_S, **reported)
 
@@ -48,7 +48,8 @@ def first_seconds(record: RunRecord, seconds: float) -> RunRecord:
         if isinstance(getattr(record, field.name), np.ndarray)
     }
     messages = {
-        name: [one for one in getattr(record, name) if one.timestamp_ns < end_ns] for name in ("control", "worlds")
+        name: [one for one in getattr(record, name) if one.timestamp_ns < end_ns]
+        for name in ("control_states", "worlds")
     }
     return dataclasses.replace(record, host=finished(count), **columns, **messages)
 
@@ -123,7 +124,7 @@ class Reader(HTMLParser):
 
 
 def read(record: RunRecord, ended: str = "complete") -> Reader:
-    page = report_page(record, summarise(record, ended))
+    page = report_page(record, summarize_run(record, ended))
     reader = Reader(page)
     assert [i for i in reader.ids if i in SECTIONS] == SECTIONS
     assert len(page.encode()) < 3_000_000

@@ -2,7 +2,7 @@
 
 import msgspec
 
-from snakesim_hal.model.files import read_part
+from snakesim_hal.model.files import read_table_with_base
 from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import Description
 
@@ -19,5 +19,5 @@ SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, els
 
 def of_robot(name: str) -> Description:
     """Description of a shipped robot."""
-    file = msgspec.convert(read_part(name, "robots").values, RobotFile)
+    file = msgspec.convert(read_table_with_base(name, "robots").values, RobotFile)
     return describe_robot(file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16)

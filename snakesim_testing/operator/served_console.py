@@ -14,12 +14,12 @@ from snakesim_operator.features.console.web.viser_server import PageServer
 
 
 @contextmanager
-def fronted(ports: ConsolePorts, stop: StopPath | None) -> Iterator[FrontServer]:
+def running_front_server(ports: ConsolePorts, stop: StopPath | None) -> Iterator[FrontServer]:
     """Run a front server without a page server, in a thread, for as long as the context lasts.
 
     Args:
         ports: Sockets and token of the console.
-        stop: Stops the robot; None for a recording.
+        stop: Stops the robot. None for the console of a recording.
     """
     server = FrontServer(ports.browsers, ports.pages_path, ports.token, stop)
     ended = asyncio.Event()
@@ -40,15 +40,21 @@ def fronted(ports: ConsolePorts, stop: StopPath | None) -> Iterator[FrontServer]
 
 
 @contextmanager
-def served_console(
+def running_console(
     stop: StopPath | None = None,
     report: Callable[[str], None] = lambda _: None,
     answer_first: AnswerRequest = lambda _: None,
 ) -> Iterator[tuple[PageServer, str]]:
-    """Run both servers, and yield the pages' server and the address."""
+    """Run the front server and the page server of a console, and yield the page server and the console's address.
+
+    Args:
+        stop: Stops the robot. None for the console of a recording.
+        report: Gets lines about refused requests.
+        answer_first: Answers a request itself, or returns None to let the page server answer.
+    """
     with (
         open_console_ports(None) as ports,
-        fronted(ports, stop),
+        running_front_server(ports, stop),
         serve_pages(ports.pages, report, answer_first, has_stop=stop is not None) as server,
     ):
         yield server, ports.address

@@ -12,7 +12,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
-from snakesim_testing.harness.wait import LIMIT_S
+from snakesim_testing.harness.wait import TIMEOUT_S
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -104,7 +104,7 @@ class Viewer:
 def viewing(address: str) -> connect:
     """The connection of a page; `async with` it."""
     socket = address.replace("http", "ws")
-    return connect(socket, subprotocols=[PROTOCOL], compression=None, max_size=None, proxy=None, open_timeout=LIMIT_S)
+    return connect(socket, subprotocols=[PROTOCOL], compression=None, max_size=None, proxy=None, open_timeout=TIMEOUT_S)
 
 
 async def watch(address: str) -> None:

@@ -5,16 +5,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from snakesim_hal.model.files import SHIPPED
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_hal.model.files import SHIPPED_FILES_DIR
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import SNAKESIM, environment
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, make_environment
 from snakesim_testing.runs.in_process_command import snakesim
 
 
 def lab_folder(folder: Path, joints: int, scenario: str, files: Mapping[str, str]) -> Path:
     """A shorter `planar13` as snake.toml, its bench.toml, and more files by their names."""
-    snake = (SHIPPED / "robots" / "planar13.toml").read_text().replace("modules = 13", f"modules = {joints}")
+    snake = (SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text().replace("modules = 13", f"modules = {joints}")
     for name, text in {"snake.toml": snake, "bench.toml": scenario, **files}.items():
         (folder / name).write_text(text)
     return folder
@@ -23,9 +23,9 @@ def lab_folder(folder: Path, joints: int, scenario: str, files: Mapping[str, str
 @contextmanager
 def host(home: Path, backend: str) -> Iterator[str]:
     """A host, disarmed; its endpoint."""
-    endpoint = free_endpoint()
-    program = [*SNAKESIM, "start", "host", "bench.toml", "--backend", backend, "--endpoint", endpoint]
-    with subprocess.Popen(program, cwd=home, env=environment(home), stdin=subprocess.DEVNULL) as process:
+    endpoint = find_free_endpoint()
+    program = [*SNAKESIM_COMMAND, "start", "host", "bench.toml", "--backend", backend, "--endpoint", endpoint]
+    with subprocess.Popen(program, cwd=home, env=make_environment(home), stdin=subprocess.DEVNULL) as process:
         try:
             wait_until(lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host")
             yield endpoint

@@ -7,37 +7,53 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_operator.results.run_reader import SUMMARY
+from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from snakesim_operator.results.summary import RunSummary
-from snakesim_testing.harness.command import LIMIT_S, SNAKESIM, Ended, Running, call, environment, running, snakesim
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.harness.processes import nothing_left
+from snakesim_testing.harness.command import (
+    SNAKESIM_COMMAND,
+    TIMEOUT_S,
+    CompletedRun,
+    Running,
+    make_environment,
+    run_to_end,
+    running_snakesim,
+    snakesim,
+)
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.harness.processes import assert_no_process_left
 
 TOO_SLOW = "this computer is too slow: "
 __all__ = [
-    "LIMIT_S",
-    "SNAKESIM",
+    "SNAKESIM_COMMAND",
+    "TIMEOUT_S",
     "TOO_SLOW",
-    "Ended",
+    "CompletedRun",
     "Running",
-    "armed_run",
-    "background",
-    "call",
-    "environment",
+    "make_environment",
+    "read_summary",
+    "run_in_background",
+    "run_to_end",
     "run_to_summary",
-    "running",
+    "running_armed_snakesim",
+    "running_snakesim",
     "snakesim",
-    "summary_of",
 ]
 
 
 @contextmanager
-def background(
-    home: Path, *arguments: str, stdin: int | None = None, program: Sequence[str] = SNAKESIM
+def run_in_background(
+    home: Path, *arguments: str, stdin: int | None = None, program: Sequence[str] = SNAKESIM_COMMAND
 ) -> Iterator[subprocess.Popen[str]]:
-    """A command, of ours or of another program, in the background, killed at the end."""
+    """Run a command in the background, and kill it at the end of the context.
+
+    Args:
+        home: Folder in which the command runs.
+        *arguments: Arguments of the program.
+        stdin: File descriptor or subprocess constant for the input.
+        program: Command line of the program.
+    """
     with subprocess.Popen(
-        [*program, *arguments], cwd=home, env=environment(home), stdin=stdin, stdout=subprocess.PIPE, text=True
+        [*program, *arguments], cwd=home, env=make_environment(home), stdin=stdin, stdout=subprocess.PIPE, text=True
     ) as process:
         try:
             yield process
@@ -46,24 +62,24 @@ def background(
 
 
 @contextmanager
-def armed_run(out: Path, *arguments: str) -> Iterator[Running]:
-    """A run in the background, once its first line of progress shows that it is armed; it leaves no process behind."""
-    with running(out, *arguments) as run:
+def running_armed_snakesim(out: Path, *arguments: str) -> Iterator[Running]:
+    """Run `snakesim run` in the background, and yield it once it is armed. Fails if it leaves a process behind."""
+    with running_snakesim(out, *arguments) as run:
         run.wait_for(" s  ")
         yield run
         if run.process.poll() is not None:
-            nothing_left(out)
+            assert_no_process_left(out)
 
 
-def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunSummary]:
-    """`snakesim run ... --out out`, and the summary that it left, and no process."""
-    network = [] if "--router" in arguments else ["--endpoint", free_endpoint()]
-    ended = snakesim("run", *arguments, "--out", str(out), *network, cwd=out.parent, more=more)
-    assert (out / SUMMARY).is_file(), ended.printed
-    nothing_left(out)
-    return ended, summary_of(out)
+def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[CompletedRun, RunSummary]:
+    """Run `snakesim run` to its end, and return the completed run and its summary. Fails if a process is left."""
+    network = [] if "--router" in arguments else ["--endpoint", find_free_endpoint()]
+    ended = snakesim("run", *arguments, "--out", str(out), *network, cwd=out.parent, extra_env=more)
+    assert (out / SUMMARY_FILENAME).is_file(), ended.printed
+    assert_no_process_left(out)
+    return ended, read_summary(out)
 
 
-def summary_of(out: Path) -> RunSummary:
-    """What a run left."""
-    return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
+def read_summary(out: Path) -> RunSummary:
+    """Return the summary of a run, from its folder."""
+    return msgspec.json.decode((out / SUMMARY_FILENAME).read_bytes(), type=RunSummary)

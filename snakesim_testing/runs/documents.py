@@ -66,13 +66,13 @@ class Section:
         return any(info.startswith("sh") for info, _ in self.blocks)
 
 
-def sections(path: Path) -> list[Section]:
+def parse_sections(path: Path) -> list[Section]:
     """Return the sections of a Markdown document that have code blocks.
 
     A block whose info line names a file, such as "python my.py", is also one of the section's files. Each section has
     the files of the sections before it, too.
     """
-    result = [Section("")]
+    sections = [Section("")]
     block_lines: list[str] | None = None  # of the open code block; None: outside of blocks
     info = ""
     for line in path.read_text(encoding="utf-8").splitlines():
@@ -80,7 +80,7 @@ def sections(path: Path) -> list[Section]:
         if block_lines is None:
             heading = re.match(r"#+ (.*)", line)
             if heading:
-                result.append(Section(heading[1], files=dict(result[-1].files)))
+                sections.append(Section(heading[1], files=dict(sections[-1].files)))
             elif is_fence:
                 block_lines = []
                 info = line.removeprefix("```").strip()
@@ -88,15 +88,15 @@ def sections(path: Path) -> list[Section]:
             text = "\n".join(block_lines) + "\n"
             _, _, file_name = info.partition(" ")
             if "." in file_name:
-                result[-1].files[file_name] = text
-            result[-1].blocks.append((info, text))
+                sections[-1].files[file_name] = text
+            sections[-1].blocks.append((info, text))
             block_lines = None
         else:
             block_lines.append(line)
-    return [section for section in result if section.blocks]
+    return [section for section in sections if section.blocks]
 
 
-def script(section: Section) -> str:
+def make_bash_script(section: Section) -> str:
     """All commands of a section, for bash."""
     parts = [PROLOGUE]
     for number, (info, content) in enumerate(section.blocks):

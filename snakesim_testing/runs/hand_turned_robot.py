@@ -3,9 +3,9 @@
 import json
 from pathlib import Path
 
-from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
-from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.bench import lab_folder
 from snakesim_testing.runs.in_process_command import snakesim
@@ -50,12 +50,12 @@ on_route = false
 
 def make_hand_turned_folder(folder: Path) -> Path:
     """A lab's folder: robot file with a comment, scenario, backend."""
-    return lab_folder(folder, JOINTS, SCENARIO, {"held.py": text_of_the_example() + HELD})
+    return lab_folder(folder, JOINTS, SCENARIO, {"held.py": read_example_from_docs() + HELD})
 
 
 def robot(home: Path) -> RobotFile:
     """The robot file as it stands."""
-    return decode(read_part(str(home / "snake.toml"), "robots"), RobotFile)
+    return decode_table(read_table_with_base(str(home / "snake.toml"), "robots"), RobotFile)
 
 
 def seen(home: Path, endpoint: str, angle_rad: float) -> None:

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.runs.bench import lab_folder
 from snakesim_testing.runs.hand_turned_robot import JOINTS, SCENARIO
 
@@ -32,7 +32,7 @@ class SetpointLog(Workbench):
 
 
 def make_jogged_folder(folder: Path) -> Path:
-    real = text_of_the_example().replace("emulated=True", "emulated=False")
+    real = read_example_from_docs().replace("emulated=True", "emulated=False")
     return lab_folder(folder, JOINTS, SCENARIO, {"setpoint_log.py": real + SETPOINT_LOG})
 
 

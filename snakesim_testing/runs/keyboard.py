@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import SNAKESIM, Running, environment
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, Running, make_environment
 
 UP, LEFT = b"\x1b[A", b"\x1b[D"
 
@@ -23,12 +23,12 @@ class Terminal:
         self.before = termios.tcgetattr(self._theirs)
         self._printed = b""
         self.process = subprocess.Popen(
-            [*SNAKESIM, "teleop", "--endpoint", run.endpoint, "--max-speed", "0.2"],
+            [*SNAKESIM_COMMAND, "teleop", "--endpoint", run.endpoint, "--max-speed", "0.2"],
             stdin=self._theirs,
             stdout=self._theirs,
             stderr=self._theirs,
             cwd=cwd,
-            env=environment(cwd),
+            env=make_environment(cwd),
             start_new_session=True,
         )
         threading.Thread(target=self._listen, daemon=True).start()

@@ -4,11 +4,11 @@ import contextlib
 import subprocess
 from pathlib import Path
 
-from snakesim_hal.model.files import ROUTER
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_hal.model.files import ROUTER_CONFIG_PATH
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.command import SNAKESIM, Ended, environment
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, CompletedRun, make_environment
 
 SCENARIO = ("triplet", "--duration", "1")
 
@@ -18,19 +18,19 @@ class Lab:
 
     def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
         self.folder, self._stack = folder, stack
-        endpoint = free_endpoint()
+        endpoint = find_free_endpoint()
         quiet = "scouting: {multicast: {enabled: false}, gossip: {enabled: false}}"
         self.router_file, self.session = folder / "router.json5", folder / "session.json5"
-        self.router_file.write_text(ROUTER.read_text().replace("tcp/127.0.0.1:7447", endpoint))
+        self.router_file.write_text(ROUTER_CONFIG_PATH.read_text().replace("tcp/127.0.0.1:7447", endpoint))
         self.session.write_text(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {quiet}}}')
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         """One of them."""
         log = self._stack.enter_context((self.folder / f"{arguments[1]}-{Path(arguments[2]).stem}.log").open("a"))
         process = subprocess.Popen(
-            [*SNAKESIM, *arguments],
+            [*SNAKESIM_COMMAND, *arguments],
             cwd=self.folder,
-            env=environment(self.folder),
+            env=make_environment(self.folder),
             stdout=log,
             stderr=subprocess.STDOUT,
             text=True,
@@ -49,7 +49,7 @@ class Lab:
         """A service."""
         return self.start("start", "service", name, *SCENARIO, *arguments, "--session", str(self.session))
 
-    def tell(self, *arguments: str) -> Ended:
+    def tell(self, *arguments: str) -> CompletedRun:
         """An operator's command, on another machine."""
         return command.snakesim(*arguments, "--session", str(self.session), cwd=self.folder)
 

@@ -16,9 +16,9 @@ import snakesim
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.measured_force import FORCE_WINDOW_S
 from snakesim_hal.wire.messages import ControlState
-from snakesim_operator.results.metrics.force_tracking import ASKED_N, EMPTY_N
+from snakesim_operator.results.metrics.force_tracking import MIN_CONTACT_FORCE_N, MIN_DESIRED_FORCE_N
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.state.contacts import GeomPair, TouchReader
+from snakesim_sim_backend.state.contacts import GeomPair, ObstacleContactReader
 
 SCENARIOS = ("triplet", "peg_row")
 SHIPPED = (
@@ -51,16 +51,16 @@ def wave(amplitude_rad: float) -> Callable[[float, int], Floats]:
     return lambda time_s, joints: min(time_s, 1.0) * amplitude_rad * np.sin(np.pi * time_s - lag_rad)
 
 
-def measured(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.Result, Forces]:
+def run_and_measure_forces(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.Result, Forces]:
     """A run of 8 s, and the forces of all obstacles in it."""
-    with recorded() as steps:
+    with recording_contact_forces() as steps:
         result = snakesim.run(scenario, controller=controller, duration=options.pop("duration", 8), set=options)
     names = dict.fromkeys(name for found in steps for name in found)
     return result, {name: np.array([found.get(name, 0.0) for found in steps]) for name in names}
 
 
 @contextmanager
-def recorded() -> Iterator[list[dict[str, float]]]:
+def recording_contact_forces() -> Iterator[list[dict[str, float]]]:
     """Record the contact forces of simulations that run within the context.
 
     Yields:
@@ -72,7 +72,7 @@ def recorded() -> Iterator[list[dict[str, float]]]:
     def advance_and_record(self: SimBackend) -> None:
         physics = self.physics
         step = physics.step
-        touches = TouchReader(self.sim, self.data, physics.contacts)
+        touches = ObstacleContactReader(self.sim, self.data, physics.contacts)
 
         def step_and_record(count: int) -> None:
             for _ in range(count):
@@ -95,30 +95,37 @@ def _sum_by_obstacle(forces_n: Mapping[GeomPair, float], obstacle_of_geom: list[
     return force_of_obstacle
 
 
-def case(scenario: str, label: str, controller: Any, **options: Any) -> tuple[float, str]:
-    """Distance, and its row."""
-    result, forces = measured(scenario, controller, **options)
+def measure_case(scenario: str, label: str, controller: Any, **options: Any) -> tuple[float, str]:
+    """Run a controller in a scenario, and return the distance in m and a row of the table of cases.
+
+    Args:
+        scenario: Name of the scenario.
+        label: Text of the row about the controller.
+        controller: Name or class of the controller.
+        options: Changes of the scenario, by key.
+    """
+    result, forces = run_and_measure_forces(scenario, controller, **options)
     metres, joules = result.summary.advance_m or 0.0, result.summary.energy_j_per_m
     impulse_ns = STEP_S * sum(float(force.sum()) for force in forces.values())
     per_m = f"{joules:.1f} | {impulse_ns / metres:.0f}" if joules is not None else "- | -"
     return metres, f"| `{scenario}` | {label} | {metres:.2f} | {per_m} |"
 
 
-def cases(scenario: str) -> Iterator[str]:
-    """A row each: shipped controllers at the mission's speed, at a higher one, and the wave."""
+def iter_cases(scenario: str) -> Iterator[str]:
+    """Yield rows of a table: bundled controllers at the mission's speed and at a higher one, and waves."""
     for name in SHIPPED:
-        yield case(scenario, f"`{name}`", name)[1]
+        yield measure_case(scenario, f"`{name}`", name)[1]
     for name in SHIPPED if scenario == "triplet" else ():
         if name not in WITHOUT_PATH:
             label = f"`{name}`, {FASTER_M_S} m/s asked for"
-            yield case(scenario, label, name, **{"mission.speed_m_s": FASTER_M_S})[1]
-    waves = [(rad, *case(scenario, f"wave, {rad} rad", wave(rad))) for rad in AMPLITUDES_RAD]
+            yield measure_case(scenario, label, name, **{"mission.speed_m_s": FASTER_M_S})[1]
+    waves = [(rad, *measure_case(scenario, f"wave, {rad} rad", wave(rad))) for rad in AMPLITUDES_RAD]
     best = max(waves, key=lambda found: found[1])
     yield next(row for rad, _, row in waves if rad == 0.3)
     yield best[2].replace(f"{best[0]} rad", f"{best[0]} rad (of {len(waves)} tried the one that goes furthest)")
 
 
-def causes(scenario: str, controller: str, **options: Any) -> str:
+def measure_difference_causes(scenario: str, controller: str, **options: Any) -> str:
     """Run a controller, and return the row of its differences between desired and measured contact forces.
 
     Args:
@@ -126,20 +133,21 @@ def causes(scenario: str, controller: str, **options: Any) -> str:
         controller: Name of the controller.
         options: Changes of the scenario, by key.
     """
-    result, forces = measured(scenario, controller, **options)
-    states = [state for state in result.record.control if state.state == "Locomoting"]
-    desired_n, measured_n = table_of(states, forces, 0.0)  # (n_states, n_obstacles)
-    requests_force = (desired_n >= ASKED_N).any(axis=1)
+    result, forces = run_and_measure_forces(scenario, controller, **options)
+    states = [state for state in result.record.control_states if state.state == "Locomoting"]
+    desired_n, measured_n = tabulate_forces(states, forces, 0.0)  # (n_states, n_obstacles)
+    requests_force = (desired_n >= MIN_DESIRED_FORCE_N).any(axis=1)
     desired_n = desired_n[requests_force]
     measured_n = measured_n[requests_force]
     parts_n = _split_difference(desired_n, measured_n)
     fractions = " | ".join(f"{part_n / sum(parts_n):.0%}" for part_n in parts_n)
-    correlations = [correlation(*table_of(states, forces, float(shift_s))) for shift_s in SHIFTS_S]
+    correlations = [compute_correlation(*tabulate_forces(states, forces, float(shift_s))) for shift_s in SHIFTS_S]
     best = int(np.argmax(correlations))
     return (
         f"| `{scenario}` | `{controller}` | {desired_n.sum(axis=1).mean():.1f} | {measured_n.sum(axis=1).mean():.1f} "
         f"| {fractions} "
-        f"| {correlation(desired_n, measured_n):.2f} | {correlations[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
+        f"| {compute_correlation(desired_n, measured_n):.2f} "
+        f"| {correlations[best]:.2f}, {1e3 * SHIFTS_S[best]:.0f} ms |"
     )
 
 
@@ -154,9 +162,9 @@ def _split_difference(desired_n: Floats, measured_n: Floats) -> tuple[float, flo
         Sums over all states: desired without contact, measured but not desired, error of the total force, and error of
         its distribution among the obstacles.
     """
-    without_contact_n = float(desired_n[measured_n < EMPTY_N].sum())
+    without_contact_n = float(desired_n[measured_n < MIN_CONTACT_FORCE_N].sum())
     undesired_n = float(measured_n[desired_n == 0.0].sum())
-    is_common = (desired_n > 0.0) & (measured_n >= EMPTY_N)
+    is_common = (desired_n > 0.0) & (measured_n >= MIN_CONTACT_FORCE_N)
     total_error_n = 0.0
     distribution_error_n = 0.0
     for state in np.flatnonzero(is_common.any(axis=1)):
@@ -168,8 +176,17 @@ def _split_difference(desired_n: Floats, measured_n: Floats) -> tuple[float, flo
     return without_contact_n, undesired_n, total_error_n, distribution_error_n
 
 
-def table_of(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:
-    """Desired and measured forces, (n_states, n_obstacles) each; measured: mean over 50 ms, shifted by `shift_s`."""
+def tabulate_forces(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:
+    """Tabulate desired and measured contact forces by state and obstacle.
+
+    Args:
+        states: Reported states of the controller, with the desired forces.
+        forces: Measured force on each obstacle in each physics step, N.
+        shift_s: Time by which the measured forces are taken later than the states.
+
+    Returns:
+        Desired and measured forces in N, (n_states, n_obstacles) each. Measured forces are means over FORCE_WINDOW_S.
+    """
     names = sorted({*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)})
     window = round(FORCE_WINDOW_S / STEP_S)
     desired_n, measured_n = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
@@ -187,9 +204,9 @@ def table_of(states: Sequence[ControlState], forces: Forces, shift_s: float) -> 
     return desired_n, measured_n
 
 
-def correlation(desired_n: Floats, measured_n: Floats) -> float:
+def compute_correlation(desired_n: Floats, measured_n: Floats) -> float:
     """Over all push-points that are judged."""
-    judged = desired_n >= ASKED_N
+    judged = desired_n >= MIN_DESIRED_FORCE_N
     if judged.sum() < 2 or desired_n[judged].std() == 0.0 or measured_n[judged].std() == 0.0:
         return 0.0
     return float(np.corrcoef(desired_n[judged], measured_n[judged])[0, 1])
@@ -203,12 +220,12 @@ def main() -> int:
     if only != "causes":
         print(CASES, flush=True)
         for scenario in SCENARIOS:
-            for row in cases(scenario):
+            for row in iter_cases(scenario):
                 print(row, flush=True)
         print()
     if only != "cases":
         print(CAUSES, flush=True)
         for scenario in SCENARIOS:
             for controller in ("obstacle_aided", "obstacle_triplet"):
-                print(causes(scenario, controller), flush=True)
+                print(measure_difference_causes(scenario, controller), flush=True)
     return 0

@@ -11,8 +11,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, load_controller
-from snakesim_hal.model.plugins import CONTROLLERS, offer_plugin
-from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.model.plugins import CONTROLLERS, register_plugin_temporarily
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 
@@ -33,7 +33,7 @@ class Run:
         places: list[float] = []
         near: float | None = None
         for point in self.record.position_w_m[:, :2]:
-            near = route.project(point, near)
+            near = route.project_point(point, near)
             places.append(near)
         return np.array(places)
 
@@ -53,7 +53,7 @@ class Run:
         return [state.reason for state in self._reported()]
 
     def _reported(self) -> list[Any]:
-        reported = [state for state in self.record.control if state.tick in range(len(self.reports))]
+        reported = [state for state in self.record.control_states if state.tick in range(len(self.reports))]
         by_tick = {state.tick: state for state in reported}
         now = by_tick[0]
         return [now := by_tick.get(tick, now) for tick in range(len(self.reports))]
@@ -68,52 +68,65 @@ class Run:
         return found
 
 
-def _make_watched(
+def _make_recording_controller(
     controller_class: type[Controller[Any]],
-    blind: Collection[int],
-    lost: Collection[int],
+    ticks_without_world: Collection[int],
+    ticks_without_trajectory: Collection[int],
     telemetry: list[Telemetry],
-    update_us: list[float],
+    update_durations_us: list[float],
 ) -> type[Controller[Any]]:
-    """Return a controller class that does not get all of its inputs, and that records its telemetry and its run times.
+    """Return a subclass of a controller that misses some inputs, and records its telemetry and run times.
 
     Args:
-        controller_class: The controller that it extends.
-        blind: Ticks in which it gets no world model.
-        lost: Ticks in which it gets no trajectory.
-        telemetry: Gets the telemetry of each tick.
-        update_us: Gets the duration of each update in µs.
+        controller_class: The controller to extend.
+        ticks_without_world: Ticks in which the controller gets no world model.
+        ticks_without_trajectory: Ticks in which the controller gets no trajectory.
+        telemetry: List to which the telemetry of each tick is added.
+        update_durations_us: List to which the duration of each update in µs is added.
     """
 
     class Watched(controller_class):
         def update(self, observation: Observation) -> ControllerCommand:
-            if observation.tick in blind:
+            if observation.tick in ticks_without_world:
                 observation = dataclasses.replace(observation, world=None)
-            if observation.tick in lost:
+            if observation.tick in ticks_without_trajectory:
                 observation = dataclasses.replace(observation, trajectory=None)
             began = time.perf_counter()
             command = super().update(observation)  # pyright: ignore[reportAbstractUsage] - not abstract here
-            update_us.append((time.perf_counter() - began) * 1e6)
+            update_durations_us.append((time.perf_counter() - began) * 1e6)
             telemetry.append(command.telemetry)
             return command
 
     return Watched
 
 
-def configure(scenario: str, *sets: str) -> RunConfig:
-    """A shipped scenario with `--set` texts."""
-    return load(scenario, [parse_set(text) for text in sets]).config
+def load_run_config(scenario: str, *sets: str) -> RunConfig:
+    """Load a bundled scenario, with changes as `--set` takes them."""
+    return load_scenario(scenario, [parse_set_option(text) for text in sets]).config
 
 
-def run(
-    config: RunConfig, *, duration_s: float | None = None, blind: Collection[int] = (), lost: Collection[int] = ()
+def run_controller(
+    config: RunConfig,
+    *,
+    duration_s: float | None = None,
+    ticks_without_world: Collection[int] = (),
+    ticks_without_trajectory: Collection[int] = (),
 ) -> Run:
-    """Run a configuration. blind, lost: ticks at which the controller gets no world model, and no trajectory."""
+    """Run a configuration to its end, and return its record with telemetry and run times of the controller.
+
+    Args:
+        config: Configuration of the run.
+        duration_s: Duration of the run. If None, that of the configuration.
+        ticks_without_world: Ticks in which the controller gets no world model.
+        ticks_without_trajectory: Ticks in which the controller gets no trajectory.
+    """
     config = msgspec.structs.replace(config, duration_s=duration_s or config.duration_s)
     telemetry: list[Telemetry] = []
     update_us: list[float] = []
-    watched = _make_watched(load_controller(config.controller), blind, lost, telemetry, update_us)
-    with offer_plugin(CONTROLLERS, config.controller, watched):
+    watched = _make_recording_controller(
+        load_controller(config.controller), ticks_without_world, ticks_without_trajectory, telemetry, update_us
+    )
+    with register_plugin_temporarily(CONTROLLERS, config.controller, watched):
         result = simulate(config)
     assert result.summary.ended == "complete", result.summary.ended
     assert len(telemetry) == len(result.record.time_s)

@@ -7,7 +7,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_testing.sim.simulator_rig import G, lie_down, make_config
+from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body
 
 FRICTION = 0.19
 HEIGHT_M = 0.1  # of a step, and of an obstacle with a flat top
@@ -37,7 +37,7 @@ class Glider:
 
     def __init__(self, surface: str, robot: dict[str, Any], step_s: float = 0.002) -> None:
         config = make_config({"chain": {"modules": 8}} | robot, SURFACES[surface])
-        self.sim, self.data, self.physics = lie_down(config, SimSettings(timestep_s=step_s))
+        self.sim, self.data, self.physics = make_resting_body(config, SimSettings(timestep_s=step_s))
         self.model = self.sim.model
         first = self.sim.first_link_body
         links = len(self.sim.link_geoms)
@@ -50,7 +50,7 @@ class Glider:
         if surface in ("step", "top of an obstacle"):
             self.data.qpos[0] = FAR_M
             self.data.qpos[2] += HEIGHT_M
-        self.physics.begin()
+        self.physics.reset()
         self.go(0.6)
 
     @property
@@ -85,36 +85,42 @@ class Glider:
 
 
 def glide_without_mujoco(
-    velocity: Floats, coefficients: DirectionalFriction, time_s: float, step_s: float = 1e-4
+    velocity_m_s: Floats, coefficients: DirectionalFriction, duration_s: float, step_s: float = 1e-4
 ) -> Floats:
-    """Return the displacement of a body that glides along x and y without turning, (2,) in m.
+    """Integrate the motion of a body that glides over ground without turning, until it stops.
 
-    It is integrated by the classical Runge-Kutta method, until the body stops.
+    The integrator is the classical Runge-Kutta method.
 
     Args:
-        velocity: at the start, along the body and across it, in m/s.
-        coefficients: of its friction.
-        time_s: time to integrate.
-        step_s: of the integrator.
+        velocity_m_s: (2,) velocity at the start, along the body and across it.
+        coefficients: Coefficients of friction, by the direction of sliding.
+        duration_s: Maximum time to integrate.
+        step_s: Step of the integrator.
+
+    Returns:
+        (2,) displacement along the body and across it, m.
     """
-    moved = np.zeros(2)
-    velocity = np.array(velocity, dtype=np.float64)
-    for _ in range(round(time_s / step_s)):
-        if np.linalg.norm(velocity) < 2.0 * G * max(coefficients) * step_s:
+    displacement_m = np.zeros(2)
+    velocity_m_s = np.array(velocity_m_s, dtype=np.float64)
+    for _ in range(round(duration_s / step_s)):
+        if np.linalg.norm(velocity_m_s) < 2.0 * G * max(coefficients) * step_s:
             break
-        first = _decelerate(velocity, coefficients)
-        second = _decelerate(velocity + 0.5 * step_s * first, coefficients)
-        third = _decelerate(velocity + 0.5 * step_s * second, coefficients)
-        fourth = _decelerate(velocity + step_s * third, coefficients)
-        change = step_s / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
-        moved += step_s * (velocity + 0.5 * change)
-        velocity += change
-    return moved
+        first = _compute_friction_acceleration(velocity_m_s, coefficients)
+        second = _compute_friction_acceleration(velocity_m_s + 0.5 * step_s * first, coefficients)
+        third = _compute_friction_acceleration(velocity_m_s + 0.5 * step_s * second, coefficients)
+        fourth = _compute_friction_acceleration(velocity_m_s + step_s * third, coefficients)
+        velocity_change_m_s = step_s / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+        displacement_m += step_s * (velocity_m_s + 0.5 * velocity_change_m_s)
+        velocity_m_s += velocity_change_m_s
+    return displacement_m
 
 
-def _decelerate(velocity: Floats, coefficients: DirectionalFriction) -> Floats:
-    """Return the acceleration by friction, (2,) in m/s²."""
-    along = coefficients.forward if velocity[0] > 0 else coefficients.backward
+def _compute_friction_acceleration(velocity_m_s: Floats, coefficients: DirectionalFriction) -> Floats:
+    """Return the acceleration by friction, along the body and across it, (2,) in m/s²."""
+    longitudinal_coefficient = coefficients.forward if velocity_m_s[0] > 0 else coefficients.backward
     return (
-        -G * np.array([along, coefficients.sideways]) * velocity / max(float(np.linalg.norm(velocity)), TOLERANCE_M_S)
+        -G
+        * np.array([longitudinal_coefficient, coefficients.sideways])
+        * velocity_m_s
+        / max(float(np.linalg.norm(velocity_m_s)), TOLERANCE_M_S)
     )

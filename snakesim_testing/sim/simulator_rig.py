@@ -6,11 +6,11 @@ import msgspec
 from mujoco import MjData
 
 from snakesim_hal.backend import SafeSetpoints, Samples
-from snakesim_hal.model.files import read_part
-from snakesim_hal.model.scenario import RunConfig, check
+from snakesim_hal.model.files import read_table_with_base
+from snakesim_hal.model.scenario import RunConfig, validate_start_pose
 from snakesim_hal.wire.messages import Message, Mode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.model.build import SimModel, build, of_joints
+from snakesim_sim_backend.model.build import SimModel, build_sim_model, view_joint_states
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 
@@ -24,14 +24,14 @@ QUIET = {
 }
 
 
-def merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+def merge_tables(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     """`base` with the leaves of `change` put over it; a key `x!` replaces the whole of x."""
     result = dict(base)
     for key, value in change.items():
         if key.endswith("!"):
             result[key[:-1]] = value
         elif isinstance(value, dict) and isinstance(result.get(key), dict):
-            result[key] = merged(result[key], value)
+            result[key] = merge_tables(result[key], value)
         else:
             result[key] = value
     return result
@@ -45,17 +45,17 @@ def make_config(
     **top: Any,
 ) -> RunConfig:
     """A run of a straight, noiseless robot at the origin, heading along x, on flat ground of friction 0.3."""
-    quiet = merged(read_part(base_robot, "robots").values, {"sensors!": QUIET})
+    quiet = merge_tables(read_table_with_base(base_robot, "robots").values, {"sensors!": QUIET})
     table = {
         "name": "test",
         "controller": "hold",
         "services": {},
         "start": {"on_route": False},
-        "robot": merged(quiet, robot or {}),
-        "scene": merged({"name": "test", "ground": {"friction": 0.3}}, scene or {}),
+        "robot": merge_tables(quiet, robot or {}),
+        "scene": merge_tables({"name": "test", "ground": {"friction": 0.3}}, scene or {}),
     }
-    config = msgspec.convert(merged(table, top), RunConfig)
-    check(config)
+    config = msgspec.convert(merge_tables(table, top), RunConfig)
+    validate_start_pose(config)
     return config
 
 
@@ -64,7 +64,7 @@ def open_sim(config: RunConfig, **settings: Any) -> SimBackend:
     return SimBackend(config, msgspec.convert(settings, SimSettings))
 
 
-class Run:
+class SimulatorRig:
     """Drives a backend tick by tick, as the host does."""
 
     def __init__(self, config: RunConfig, **settings: Any) -> None:
@@ -84,24 +84,26 @@ class Run:
         """The samples of the present tick."""
         return self.sim.sample(self.tick, self.tick * self.config.period_ns)
 
-    def sensed(self, kind: type[MessageT]) -> MessageT:
+    def sample_only_sensor(self, kind: type[MessageT]) -> MessageT:
         """The message of the only sensor with such messages at the present tick."""
-        (message,) = (message for message in self.sample().others.values() if isinstance(message, kind))
+        (message,) = (message for message in self.sample().by_key.values() if isinstance(message, kind))
         return message
 
-    def go(self, seconds: float = 0.0) -> None:
+    def advance(self, seconds: float = 0.0) -> None:
         """At least one tick."""
         for _ in range(max(round(seconds * 1e9 / self.config.period_ns), 1)):
             self.sim.advance()
             self.tick += 1
 
 
-def lie_down(config: RunConfig, settings: SimSettings, angle_rad: float = 0.0) -> tuple[SimModel, MjData, Physics]:
+def make_resting_body(
+    config: RunConfig, settings: SimSettings, angle_rad: float = 0.0
+) -> tuple[SimModel, MjData, Physics]:
     """A body without motors on the ground, every joint at this angle."""
-    sim = build(config, settings, motors=False)
+    sim = build_sim_model(config, settings, motors=False)
     data = MjData(sim.model)
     data.qpos[2] = config.robot.module.radius_m
-    of_joints(data, config.robot.chain.modules)[0][:] = angle_rad
+    view_joint_states(data, config.robot.chain.modules)[0][:] = angle_rad
     physics = Physics(sim, data)
-    physics.begin()
+    physics.reset()
     return sim, data, physics

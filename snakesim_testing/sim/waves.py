@@ -8,7 +8,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
-from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build_sim_model
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import G, make_config
@@ -17,7 +17,7 @@ SERVO_NM_PER_RAD = 300.0
 SERVO_NM_S_PER_RAD = 10.0
 PERIODS = 6
 SKIPPED_PERIODS = 2  # at the start
-SMOOTH_M_S = 0.002  # slower slip than that rubs less in the momentum balance
+SMOOTHING_SPEED_M_S = 0.002  # in the momentum balance, friction decreases toward 0 below this sliding speed
 BALANCE_STEP_S = 0.0005
 
 
@@ -52,7 +52,7 @@ class Wave:
 
 
 @dataclass(frozen=True)
-class Track:
+class BodyTrack:
     """Center of mass and vector from tail to head at the end of every step, (steps, 2) in m."""
 
     center: Floats
@@ -63,58 +63,63 @@ class Track:
     @property
     def drift_mm_s(self) -> float:
         """Return the mean speed of the center along the mean axis of each period."""
-        steps = round(self.period_s / self.step_s)
-        found: list[float] = []
+        steps_per_period = round(self.period_s / self.step_s)
+        period_drifts_mm_s: list[float] = []
         for k in range(SKIPPED_PERIODS, PERIODS - 1):
-            axis = self.axis[k * steps : (k + 1) * steps].mean(axis=0)
-            way = self.center[(k + 1) * steps] - self.center[k * steps]
-            found.append(float(way @ axis / np.linalg.norm(axis)) / self.period_s * 1e3)
-        return float(np.mean(found))
+            axis = self.axis[k * steps_per_period : (k + 1) * steps_per_period].mean(axis=0)
+            displacement_m = self.center[(k + 1) * steps_per_period] - self.center[k * steps_per_period]
+            period_drifts_mm_s.append(float(displacement_m @ axis / np.linalg.norm(axis)) / self.period_s * 1e3)
+        return float(np.mean(period_drifts_mm_s))
 
 
-def swim(
+def simulate_wave(
     wave: Wave,
     ground: dict[str, Any],
     robot: dict[str, Any] | None = None,
     *,
     step_s: float = 0.002,
     yaw_rad: float = 0.0,
-) -> Track:
-    """Simulate `planar13` on flat ground, with joints that are held to a wave by stiff servos.
+) -> BodyTrack:
+    """Simulate `planar13` on flat ground with MuJoCo, with joints that follow a wave by stiff servos.
 
     Args:
-        wave: the wave.
-        ground: the section `[ground]` of the scene.
-        robot: what differs from `planar13`.
-        step_s: physics step.
-        yaw_rad: heading at the start.
+        wave: Joint angles as a function of time.
+        ground: Section `[ground]` of the scene.
+        robot: Differences from `planar13`, as in a robot file.
+        step_s: Physics step.
+        yaw_rad: Heading at the start.
+
+    Returns:
+        The motion of the body over PERIODS periods of the wave.
     """
     config = make_config(robot, {"ground": ground})
-    sim = build(config, SimSettings(timestep_s=step_s), motors=False)
+    sim = build_sim_model(config, SimSettings(timestep_s=step_s), motors=False)
     model, data = sim.model, mujoco.MjData(sim.model)
     assert sim.feet is not None
-    count = model.nv - FREE_DOFS
+    joint_count = model.nv - FREE_DOFS
     model.dof_damping[FREE_DOFS:], model.dof_frictionloss[FREE_DOFS:] = SERVO_NM_S_PER_RAD, 0.0
     data.qpos[2] = config.robot.module.radius_m
     data.qpos[3], data.qpos[6] = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
-    data.qpos[FREE_QPOS:] = wave.at(0.0, count)
+    data.qpos[FREE_QPOS:] = wave.at(0.0, joint_count)
     physics = Physics(sim, data)
-    physics.begin()
+    physics.reset()
     step_s = model.opt.timestep
     tail, head = sim.feet.geoms[[0, -1]]
-    steps = int(PERIODS * wave.period_s / step_s) + 1
-    center, axis = np.empty((steps, 2)), np.empty((steps, 2))
-    for k in range(steps):
-        after_s = (k + 1) * step_s
-        wanted = SERVO_NM_PER_RAD * (wave.at(after_s, count) - data.qpos[FREE_QPOS:])
-        data.qfrc_applied[FREE_DOFS:] = wanted + SERVO_NM_S_PER_RAD * wave.rates_at(after_s, count)
+    step_count = int(PERIODS * wave.period_s / step_s) + 1
+    center_m, axis_m = np.empty((step_count, 2)), np.empty((step_count, 2))
+    for k in range(step_count):
+        end_time_s = (k + 1) * step_s
+        position_torques_nm = SERVO_NM_PER_RAD * (wave.at(end_time_s, joint_count) - data.qpos[FREE_QPOS:])
+        data.qfrc_applied[FREE_DOFS:] = position_torques_nm + SERVO_NM_S_PER_RAD * wave.rates_at(
+            end_time_s, joint_count
+        )
         physics.step(1)
-        center[k] = data.subtree_com[0, :2]
-        axis[k] = (data.geom_xpos[head] - data.geom_xpos[tail])[:2]
-    return Track(center, axis, step_s, wave.period_s)
+        center_m[k] = data.subtree_com[0, :2]
+        axis_m[k] = (data.geom_xpos[head] - data.geom_xpos[tail])[:2]
+    return BodyTrack(center_m, axis_m, step_s, wave.period_s)
 
 
-def momentum_balance(
+def integrate_momentum_balance(
     wave: Wave,
     coefficients: DirectionalFriction,
     viscous_s_per_m: complex = 0.0,
@@ -122,82 +127,109 @@ def momentum_balance(
     *,
     in_the_middle: bool = False,
     separate_limits: bool = False,
-) -> Track:
-    """Compute the same without MuJoCo: links of prescribed angles in the plane, friction at the feet, momentum.
+) -> BodyTrack:
+    """Compute the motion of a snake without MuJoCo, by a momentum balance in the plane with prescribed joint angles.
 
-    Angles are about +z, tail first. Each link has its middle, mass and inertia. Every foot has half of the weight of
-    both of its links, and their mean direction. Friction is smoothed below 2 mm/s.
+    Vectors in the plane are complex numbers, angles are about +z, and links are numbered from the tail. The ground
+    contacts are at the joints and the ends of the body: each has half of the weight of its links, and their mean
+    direction. Friction is smoothed below SMOOTHING_SPEED_M_S.
 
     Args:
-        wave: the wave.
-        coefficients: of dry friction, by the direction of sliding.
-        viscous_s_per_m: along the link, and as imaginary part across it.
-        step_s: of the integrator.
-        in_the_middle: each link rubs in its middle, as with wheels there, and not at its ends.
-        separate_limits: friction along the link and across it do not limit each other, as with wheels that roll.
+        wave: Joint angles as a function of time.
+        coefficients: Coefficients of dry friction, by the direction of sliding.
+        viscous_s_per_m: Viscous friction over the normal force: along the link, and as imaginary part across it.
+        step_s: Step of the integrator.
+        in_the_middle: Whether the ground contacts are in the middle of each link, as those of wheels there.
+        separate_limits: Whether friction along the link and across it do not limit each other, as with rolling wheels.
+
+    Returns:
+        The motion of the body over PERIODS periods of the wave.
     """
     robot = make_config().robot
     lengths, masses = np.array(robot.link_lengths_m), np.array(robot.link_masses_kg)
-    ends = lengths + 2 * robot.module.radius_m
-    turning_kg_m2 = masses * (3 * robot.module.radius_m**2 + ends**2) / 12  # as of a cylinder, about its middle
+    capsule_lengths = lengths + 2 * robot.module.radius_m
+    link_inertias_kg_m2 = (
+        masses * (3 * robot.module.radius_m**2 + capsule_lengths**2) / 12
+    )  # as of a cylinder, about its middle
     loads_n = 0.5 * G * (np.append(masses, 0.0) + np.append(0.0, masses))
-    count = len(lengths) - 1
+    joint_count = len(lengths) - 1
     pose, momentum = np.zeros(3), np.zeros(3)
-    steps = int(PERIODS * wave.period_s / step_s) + 1
-    center, axis = np.empty((steps, 2)), np.empty((steps, 2))
-    for k in range(steps):
+    step_count = int(PERIODS * wave.period_s / step_s) + 1
+    center, axis = np.empty((step_count, 2)), np.empty((step_count, 2))
+    for k in range(step_count):
         time_s = k * step_s
-        headings = pose[2] + np.append(0.0, np.cumsum(wave.at(time_s, count)))
-        own_rates = np.append(0.0, np.cumsum(wave.rates_at(time_s, count)))
+        headings = pose[2] + np.append(0.0, np.cumsum(wave.at(time_s, joint_count)))
+        link_rates = np.append(0.0, np.cumsum(wave.rates_at(time_s, joint_count)))
         directions = np.exp(1j * headings)
-        along = directions * lengths
-        swing = 1j * own_rates * along
-        feet = complex(pose[0], pose[1]) + np.append(0.0, np.cumsum(along))
-        feet_rates = np.append(0.0, np.cumsum(swing))  # in a base that stands still
-        middles, middle_rates = feet[:-1] + 0.5 * along, feet_rates[:-1] + 0.5 * swing
-        place = complex(np.sum(masses * middles) / masses.sum())
-        arms = middles - place
-        base = complex(pose[0], pose[1])
-        own = np.sum(masses * middle_rates)
-        own_spin = np.sum(masses * (np.conj(arms) * middle_rates).imag) + np.sum(turning_kg_m2 * own_rates)
-        spin = (momentum[2] - own_spin) / np.sum(masses * np.abs(arms) ** 2 + turning_kg_m2)
-        speed = (complex(momentum[0], momentum[1]) - own) / masses.sum() - 1j * spin * (place - base)
-        velocities = speed + 1j * spin * (feet - base) + feet_rates
+        link_vectors = directions * lengths
+        link_end_velocities = 1j * link_rates * link_vectors
+        joint_positions = complex(pose[0], pose[1]) + np.append(0.0, np.cumsum(link_vectors))
+        joint_velocities_in_base = np.append(0.0, np.cumsum(link_end_velocities))  # in a base that stands still
+        link_centers, center_velocities_in_base = (
+            joint_positions[:-1] + 0.5 * link_vectors,
+            joint_velocities_in_base[:-1] + 0.5 * link_end_velocities,
+        )
+        center_of_mass = complex(np.sum(masses * link_centers) / masses.sum())
+        lever_arms = link_centers - center_of_mass
+        base_position = complex(pose[0], pose[1])
+        internal_momentum = np.sum(masses * center_velocities_in_base)
+        internal_angular_momentum = np.sum(masses * (np.conj(lever_arms) * center_velocities_in_base).imag) + np.sum(
+            link_inertias_kg_m2 * link_rates
+        )
+        yaw_rate = (momentum[2] - internal_angular_momentum) / np.sum(
+            masses * np.abs(lever_arms) ** 2 + link_inertias_kg_m2
+        )
+        base_velocity = (complex(momentum[0], momentum[1]) - internal_momentum) / masses.sum() - 1j * yaw_rate * (
+            center_of_mass - base_position
+        )
+        velocities = base_velocity + 1j * yaw_rate * (joint_positions - base_position) + joint_velocities_in_base
         tangents = np.append(directions, 0.0) + np.append(0.0, directions)
         tangents /= np.abs(tangents)
-        points = feet
+        contact_points = joint_positions
         if in_the_middle:
-            velocities = speed + 1j * spin * (middles - base) + middle_rates
+            velocities = base_velocity + 1j * yaw_rate * (link_centers - base_position) + center_velocities_in_base
             tangents = directions
-            points = middles
+            contact_points = link_centers
         weights_n = G * masses if in_the_middle else loads_n
-        rub = (
+        friction_n = (
             weights_n
             * tangents
-            * brake(velocities * np.conj(tangents), coefficients, viscous_s_per_m, separate_limits=separate_limits)
+            * compute_friction_ratio(
+                velocities * np.conj(tangents), coefficients, viscous_s_per_m, separate_limits=separate_limits
+            )
         )
-        momentum += step_s * np.array([rub.sum().real, rub.sum().imag, np.sum((np.conj(points - place) * rub).imag)])
-        pose += step_s * np.array([speed.real, speed.imag, spin])
-        center[k] = place.real, place.imag
-        axis[k] = (feet[-1] - feet[0]).real, (feet[-1] - feet[0]).imag
-    return Track(center, axis, step_s, wave.period_s)
+        momentum += step_s * np.array(
+            [
+                friction_n.sum().real,
+                friction_n.sum().imag,
+                np.sum((np.conj(contact_points - center_of_mass) * friction_n).imag),
+            ]
+        )
+        pose += step_s * np.array([base_velocity.real, base_velocity.imag, yaw_rate])
+        center[k] = center_of_mass.real, center_of_mass.imag
+        axis[k] = (joint_positions[-1] - joint_positions[0]).real, (joint_positions[-1] - joint_positions[0]).imag
+    return BodyTrack(center, axis, step_s, wave.period_s)
 
 
-def brake(
-    velocities: Any, coefficients: DirectionalFriction, viscous_s_per_m: complex, *, separate_limits: bool = False
+def compute_friction_ratio(
+    velocities_m_s: Any, coefficients: DirectionalFriction, viscous_s_per_m: complex, *, separate_limits: bool = False
 ) -> Any:
-    """Return the force of friction on what slides, divided by its normal force; all complex, along the link and across.
+    """Return the friction force divided by the normal force, complex: along the link, and across it.
 
     Args:
-        velocities: of what slides, in m/s.
-        coefficients: of dry friction.
-        viscous_s_per_m: along the link, and as imaginary part across it.
-        separate_limits: friction along the link and across it do not limit each other.
+        velocities_m_s: Sliding velocities: along the link, and as imaginary part across it.
+        coefficients: Coefficients of dry friction.
+        viscous_s_per_m: Viscous friction over the normal force: along the link, and as imaginary part across it.
+        separate_limits: Whether friction along the link and across it do not limit each other.
     """
-    along, across = velocities.real, velocities.imag
-    of_along = np.where(along > 0, coefficients.forward, coefficients.backward)
-    dry = (of_along * along + 1j * coefficients.sideways * across) / np.sqrt(np.abs(velocities) ** 2 + SMOOTH_M_S**2)
+    along, across = velocities_m_s.real, velocities_m_s.imag
+    longitudinal_coefficient = np.where(along > 0, coefficients.forward, coefficients.backward)
+    dry_friction = (longitudinal_coefficient * along + 1j * coefficients.sideways * across) / np.sqrt(
+        np.abs(velocities_m_s) ** 2 + SMOOTHING_SPEED_M_S**2
+    )
     if separate_limits:
-        dry_along = of_along * along / np.sqrt(along**2 + SMOOTH_M_S**2)
-        dry = dry_along + 1j * coefficients.sideways * across / np.sqrt(across**2 + SMOOTH_M_S**2)
-    return -dry - viscous_s_per_m.real * along - 1j * viscous_s_per_m.imag * across
+        dry_longitudinal = longitudinal_coefficient * along / np.sqrt(along**2 + SMOOTHING_SPEED_M_S**2)
+        dry_friction = dry_longitudinal + 1j * coefficients.sideways * across / np.sqrt(
+            across**2 + SMOOTHING_SPEED_M_S**2
+        )
+    return -dry_friction - viscous_s_per_m.real * along - 1j * viscous_s_per_m.imag * across

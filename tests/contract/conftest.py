@@ -10,7 +10,7 @@ from snakesim_can_backend.protocol.definitions import Frame, parse_node
 from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
-from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily, DrivesOfModules
+from snakesim_testing.benches.emulated_drives import DrivesOfAnyType, ModuleDrives
 from snakesim_testing.benches.homing_drives import HomingBackend
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
@@ -66,21 +66,31 @@ IN_REAL_TIME: Any = InRealTime
 def pytest_snakesim_benches() -> list[Bench]:
     """Simulator, also with a camera; CAN on a bus inside the process, or on the kernel's with modules as processes."""
     if os.environ.get(VCAN):  # `make test-can`
-        return [Bench("can-vcan", "can", sets=ON_VCAN, mute=cut_off)]
+        return [Bench("can-vcan", "can", overrides=ON_VCAN, mute_joint=cut_off)]
     return [
         Bench("sim", "sim"),
-        Bench("sim-camera", "sim", sets=LOOKS_AHEAD),
-        Bench("sim-position", "sim", sets=POSITION_ONLY),
-        Bench("can-virtual", "can", mute=cut_off, drives=DrivesOfModules),
-        Bench("odrive", "odrive", mute=cut_drive_off, drives=DrivesOfAnyFamily),
-        Bench("moteus", "moteus", mute=cut_drive_off, drives=DrivesOfAnyFamily),
-        Bench("cia402", "cia402", mute=cut_drive_off, drives=DrivesOfAnyFamily),
-        Bench("dynamixel", "dynamixel", mute=cut_drive_off, drives=DrivesOfAnyFamily),
-        Bench("feetech", "feetech", mute=cut_drive_off, drives=DrivesOfAnyFamily),
-        Bench("minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute=mute_joint, drives=KitDrives),
-        Bench("homing-driver", HomingBackend, mute=mute_joint, drives=KitDrives),
-        Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off, drives=DrivesOfAnyFamily),
-        Bench("threads", IN_REAL_TIME, sets=ALL_FAMILIES, mute=cut_drive_off, drives=DrivesOfAnyFamily),
+        Bench("sim-camera", "sim", overrides=LOOKS_AHEAD),
+        Bench("sim-position", "sim", overrides=POSITION_ONLY),
+        Bench("can-virtual", "can", mute_joint=cut_off, make_emulated_drives=ModuleDrives),
+        Bench("odrive", "odrive", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench("moteus", "moteus", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench("cia402", "cia402", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench("dynamixel", "dynamixel", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench("feetech", "feetech", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench(
+            "minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute_joint=mute_joint, make_emulated_drives=KitDrives
+        ),
+        Bench("homing-driver", HomingBackend, mute_joint=mute_joint, make_emulated_drives=KitDrives),
+        Bench(
+            "mixed", "mixed", overrides=HEAD_OF_SERVOS, mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType
+        ),
+        Bench(
+            "threads",
+            IN_REAL_TIME,
+            overrides=ALL_FAMILIES,
+            mute_joint=cut_drive_off,
+            make_emulated_drives=DrivesOfAnyType,
+        ),
     ]
 
 
@@ -101,23 +111,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def cut_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's module."""
-    process_frame = backend.modules.reading.process_frame
+    process_frame = backend.modules.module_reports.process_frame
 
     def receive(frame: Frame) -> None:
         if parse_node(frame.id) != joint + 1:
             process_frame(frame)
 
-    backend.modules.reading.process_frame = receive
+    backend.modules.module_reports.process_frame = receive
 
 
 def cut_drive_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's drive."""
     bus = next(bus for bus in backend._drives.buses if joint in bus.spec.joints)
     drives, silent = bus.drives, bus.spec.joints.index(joint)
-    handle_answer = drives.handle_answer
+    handle_response = drives.handle_response
 
     def heard(i: int, said: Any) -> None:
         if i != silent:
-            handle_answer(i, said)
+            handle_response(i, said)
 
-    drives.handle_answer = heard
+    drives.handle_response = heard

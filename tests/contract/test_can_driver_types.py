@@ -19,14 +19,14 @@ from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.drive_type import DriverTypeBackend
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.programs.preflight import with_backend_modes
+from snakesim_hal.programs.preflight import apply_backend_modes
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.feetech import registers as feetech
 from snakesim_serial_backend.feetech.backend import FeetechBackend
-from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily
+from snakesim_testing.benches.emulated_drives import DrivesOfAnyType
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 4
@@ -97,7 +97,7 @@ FAMILIES = {
     "dynamixel": Family(
         DynamixelBackend,
         lambda emulator: emulator.servos,
-        lambda servo: servo.on and servo.table[at.WATCHDOG] != at.TRIPPED,
+        lambda servo: servo.is_torque_on and servo.table[at.WATCHDOG] != at.TRIPPED,
         lambda emulator, joint: (
             emulator.servos[joint].table[at.GAINS : at.GAINS + 6],
             emulator.servos[joint].table[at.WATCHDOG],
@@ -108,7 +108,7 @@ FAMILIES = {
     "feetech": Family(
         FeetechBackend,
         lambda emulator: emulator.servos,
-        lambda servo: servo.on,
+        lambda servo: servo.is_torque_on,
         lambda emulator, joint: emulator.servos[joint].table[feetech.TORQUE_ENABLE : feetech.GOALS],
         "held its last angle",
         "overheating",
@@ -123,8 +123,8 @@ class Robot(DriveRig):
 
     def __init__(self, driver_type: Family, **settings: Any) -> None:
         self.driver_type = driver_type
-        config = run_config(backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
-        config = with_backend_modes(config, driver_type.backend)
+        config = make_run_config(backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
+        config = apply_backend_modes(config, driver_type.backend)
         fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": driver_type.bring_up_s}
         super().__init__(config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings)))
 
@@ -134,7 +134,7 @@ class Robot(DriveRig):
 
     def freeze_host(self, seconds: float) -> None:
         """Time passes at the drives, and the driver does nothing meanwhile."""
-        DrivesOfAnyFamily(self.backend).freeze_driver(seconds, lambda _seconds: None)
+        DrivesOfAnyType(self.backend).freeze_driver(seconds, lambda _seconds: None)
         self.tick += round(seconds * self.config.rate_hz)
 
     def following(self) -> list[bool]:
@@ -181,7 +181,7 @@ def test_drive_error_persists_until_reset_and_is_reported_again(
     assert robot.following() == [False] * JOINTS
     assert [fault.joint for fault in robot.run(CLEARED, "disarmed")] == ["joint_2"], "reset while it was still hot"
     robot.go_wrong("overheat:joint_2@0-9", begins=False)
-    robot.emulator.body.thermal.winding_c[:] = 20.0
+    robot.emulator.body.thermal.winding_temperature_c[:] = 20.0
     robot.run(5, "fault")
     assert robot.run(CLEARED, "disarmed") == []
     assert robot.run(60, "armed") == []
@@ -236,7 +236,7 @@ def test_drives_stop_by_watchdog_when_driver_is_gone(
     """With the joint's own torque limit: a lower one that an ODrive has kept is in odrive/test_limits.py."""
     robot.limit_nm = robot.config.robot.limits.torque_nm
     robot.run(20, "armed")
-    robot.backend._clock.robot_ns += 190_000_000
+    robot.backend._clock.robot_time_ns += 190_000_000
     robot.emulator()
     assert robot.following() == [False] * JOINTS
     faults = robot.run(SHOWN, "armed")
@@ -379,7 +379,9 @@ def test_bus_log_is_read_by_python_can_as_sent(driver_type: Family, tmp_path: Pa
 def test_what_drives_cannot_do_is_refused_before_the_start(driver_type: Family, dotted: dict[str, Any]) -> None:
     name = driver_type.backend.name
     fixed = {"backend": name, "robot__chain__modules": JOINTS, "rate_hz": 100}
-    config = run_config(**fixed | dotted | ({"rate_hz": driver_type.too_fast_hz} if dotted.get("rate_hz") == 0 else {}))
+    config = make_run_config(
+        **fixed | dotted | ({"rate_hz": driver_type.too_fast_hz} if dotted.get("rate_hz") == 0 else {})
+    )
     with raises_error(
         ConfigError,
         code=("bus/invalid-channel", "bus/overloaded", "drive/unsupported-setting", "drive/watchdog-too-short"),

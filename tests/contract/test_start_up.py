@@ -16,7 +16,7 @@ SECOND = 50  # periods
 
 
 def open_bench(*sets: str) -> Bench:
-    return Bench("homing", HomingBackend, sets=sets, drives=KitDrives)
+    return Bench("homing", HomingBackend, overrides=sets, make_emulated_drives=KitDrives)
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def unmet(rig: Rig) -> str:
 def test_drives_home_at_the_start_and_are_armed_then(rig: Rig) -> None:
     assert all(extras.homed for extras in emulator_of(rig).extras)
     assert rig.faults == []
-    rig.cruise()
+    rig.arm_and_move_joint()
 
 
 def test_drive_that_may_not_move_at_the_start_blocks_arming() -> None:
@@ -51,28 +51,28 @@ def test_drive_that_may_not_move_at_the_start_blocks_arming() -> None:
 
 
 def test_restarted_drive_does_not_know_its_position_and_homes_after_reset(rig: Rig) -> None:
-    rig.cruise()
+    rig.arm_and_move_joint()
     rig.backend.inject(parse_injection("reboot:joint_1@0"), begins=True)
-    rig.idle(SECOND)
+    rig.wait_periods(SECOND)
     assert rig.authority.state == "fault"
     assert "position unknown" in unmet(rig)
-    rig.idle(SECOND)
+    rig.wait_periods(SECOND)
     assert not emulator_of(rig).extras[0].homed, "it homes without the operator"
     rig.reset()
-    rig.idle(5)
+    rig.wait_periods(5)
     assert "joint_1 (drive 1): homing, 0.1 of 2 s" in unmet(rig)
-    rig.idle(SECOND)
+    rig.wait_periods(SECOND)
     assert "joint_1" not in unmet(rig)
-    rig.cruise()
+    rig.arm_and_move_joint()
 
 
 def test_homing_that_fails_names_step_and_reason(rig: Rig) -> None:
     emulator = emulator_of(rig)
     emulator.without_index.add(1)
     rig.backend.inject(parse_injection("reboot:joint_2@0"), begins=True)
-    rig.idle(2 * SECOND)
+    rig.wait_periods(2 * SECOND)
     rig.reset()
-    rig.idle(3 * SECOND)
+    rig.wait_periods(3 * SECOND)
     assert rig.authority.state == "fault"
     assert "joint_2 (drive 2): homing failed: no index found" in unmet(rig)
     assert "drive_not_ready" in {fault.what for fault in rig.faults}
@@ -80,60 +80,60 @@ def test_homing_that_fails_names_step_and_reason(rig: Rig) -> None:
 
 def test_emergency_stop_ends_homing(rig: Rig) -> None:
     rig.backend.inject(parse_injection("reboot:joint_1@0"), begins=True)
-    rig.idle(SECOND)
+    rig.wait_periods(SECOND)
     rig.reset()
-    rig.idle(5)
+    rig.wait_periods(5)
     assert emulator_of(rig).extras[0].homing_until_us is not None
-    rig.estop()
-    rig.idle(3)
+    rig.trigger_estop()
+    rig.wait_periods(3)
     assert emulator_of(rig).extras[0].homing_until_us is None
     assert "homing was aborted: emergency stop" in unmet(rig)
     rig.reset()
-    rig.idle(2 * SECOND)
-    rig.cruise()
+    rig.wait_periods(2 * SECOND)
+    rig.arm_and_move_joint()
 
 
 def test_brakes_close_before_torque_is_off(rig: Rig) -> None:
     emulator = emulator_of(rig)
-    rig.cruise()
+    rig.arm_and_move_joint()
     assert all(extras.brake_open for extras in emulator.extras)
     emulator.dropped.clear()
     rig.disarm()
-    rig.idle(SECOND // 2)
+    rig.wait_periods(SECOND // 2)
     assert not any(extras.brake_open for extras in emulator.extras)
-    assert not any(KitDrives(rig.backend).enabled())
+    assert not any(KitDrives(rig.backend).list_enabled())
     assert emulator.dropped == []
 
 
 def test_safe_torque_off_needs_its_release_and_a_reset(rig: Rig) -> None:
     emulator = emulator_of(rig)
-    rig.cruise()
+    rig.arm_and_move_joint()
     emulator.torque_off.add(2)
-    rig.idle(5)
+    rig.wait_periods(5)
     assert "safe_torque_off" in {fault.what for fault in rig.faults}
     assert rig.authority.state == "fault"
     rig.reset()
-    rig.idle(SECOND // 2)
+    rig.wait_periods(SECOND // 2)
     assert rig.authority.state == "fault", "reset while the input is active"
     emulator.torque_off.clear()
-    rig.idle(SECOND // 2)
+    rig.wait_periods(SECOND // 2)
     assert rig.authority.state == "fault", "no reset by the release alone"
     rig.reset()
-    rig.idle(SECOND // 2)
-    rig.cruise()
+    rig.wait_periods(SECOND // 2)
+    rig.arm_and_move_joint()
 
 
 def test_limit_switch_stops_and_allows_motion_away_alone(rig: Rig) -> None:
     emulator = emulator_of(rig)
-    rig.cruise()
+    rig.arm_and_move_joint()
     emulator.at_upper.add(0)
-    rig.idle(5)
+    rig.wait_periods(5)
     assert [(fault.what, fault.joint) for fault in rig.faults] == [("limit_switch", "joint_1")]
-    rig.idle(SECOND)
+    rig.wait_periods(SECOND)
     rig.reset()
-    rig.idle(SECOND // 2)
+    rig.wait_periods(SECOND // 2)
     rig.arm()
-    into = rig.drive({0: (Mode.VELOCITY, 0.3)}, SECOND // 2)
+    into = rig.command_joints({0: (Mode.VELOCITY, 0.3)}, SECOND // 2)
     assert into.angle_rad[-1, 0] - into.angle_rad[0, 0] < 0.02
-    away = rig.drive({0: (Mode.VELOCITY, -0.3)}, SECOND // 2)
+    away = rig.command_joints({0: (Mode.VELOCITY, -0.3)}, SECOND // 2)
     assert away.angle_rad[-1, 0] - away.angle_rad[0, 0] < -0.05

@@ -14,7 +14,7 @@ import pytest
 from snakesim_testing.benches.driver_mutants import DRIVER_MUTANTS
 from snakesim_testing.benches.mutant import Mutant
 from snakesim_testing.benches.mutants import MUTANTS
-from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.benches.workbench import read_example_from_docs
 
 ROOT = Path(__file__).parents[2]
 SUITE = ROOT / "snakesim_testing" / "contract"
@@ -78,7 +78,7 @@ def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
-    (tmp_path / "workbench.py").write_text(text_of_the_example())
+    (tmp_path / "workbench.py").write_text(read_example_from_docs())
     given = ["--snakesim-backend", "./workbench.py:Workbench", "--snakesim-mute", "./workbench.py:mute"]
     ran = run_suite(*given, "--snakesim-table", "table.md", "-q", cwd=tmp_path)
     assert ran.returncode == 0, ran.stdout

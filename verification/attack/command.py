@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from snakesim_testing.harness import command
-from snakesim_testing.harness.command import Ended
+from snakesim_testing.harness.command import CompletedRun
 from snakesim_testing.harness.command import Running as Run
 
 LIMIT_S = 60.0
@@ -22,16 +22,18 @@ def _machine(home: Path) -> dict[str, str]:
     return {"HOME": str(home), **{name: str(folder) for name, folder in folders.items()}}
 
 
-def snakesim(home: Path, *arguments: str, limit_s: float = LIMIT_S, inside: Sequence[str] = ()) -> Ended:
+def snakesim(home: Path, *arguments: str, limit_s: float = LIMIT_S, inside: Sequence[str] = ()) -> CompletedRun:
     """Run a command to its end. inside: a prefix that runs it somewhere else."""
-    return command.snakesim(*arguments, cwd=home, limit_s=limit_s, more=_machine(home), inside=inside)
+    return command.snakesim(*arguments, cwd=home, limit_s=limit_s, extra_env=_machine(home), command_prefix=inside)
 
 
 def running(
     home: Path, *arguments: str, name: str = "run", endpoint: str | None = "free", inside: Sequence[str] = ()
 ) -> AbstractContextManager[Run]:
     """A run in the background, as `snakesim_testing.harness.command.running` has it."""
-    return command.running(home / name, *arguments, endpoint=endpoint, more=_machine(home), inside=inside)
+    return command.running_snakesim(
+        home / name, *arguments, endpoint=endpoint, extra_env=_machine(home), command_prefix=inside
+    )
 
 
 def steering(text: str) -> list[str]:

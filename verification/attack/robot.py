@@ -72,7 +72,7 @@ def joined(run: Run) -> Stranger:
         return run.process.poll() is not None
 
     found = wait_until(join, f"a network at {run.endpoint}")
-    assert isinstance(found, Stranger), run.how_it_ended()
+    assert isinstance(found, Stranger), run.describe_ending()
     found.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
     return found
 

@@ -10,7 +10,7 @@ from typing import Any
 import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_testing.harness.wait import LIMIT_S, wait_until
+from snakesim_testing.harness.wait import TIMEOUT_S, wait_until
 from verification.attack.means import wire
 
 KEPT = 2000
@@ -119,12 +119,12 @@ class Stranger:
             if wire.ROWS[key].kind == "stream":
                 kept.clear()
 
-    def newest(self, key: str, limit_s: float = LIMIT_S) -> Any:
+    def newest(self, key: str, limit_s: float = TIMEOUT_S) -> Any:
         """The newest message at a key; waits for the first one."""
         self.receive(key)
         return self.until(lambda: self._heard[key], f"something on {key}", limit_s)[-1].message
 
-    def next(self, key: str, limit_s: float = LIMIT_S) -> Any:
+    def next(self, key: str, limit_s: float = TIMEOUT_S) -> Any:
         """A message at a key that comes from now on."""
         self.receive(key)
         now = time.monotonic()
@@ -224,7 +224,7 @@ class Stranger:
             **changes,
         }
 
-    def recover(self, limit_s: float = LIMIT_S) -> None:
+    def recover(self, limit_s: float = TIMEOUT_S) -> None:
         """Have the robot armed and following its controller, whatever happened to it."""
         self.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
         if self.lifecycle() == "armed" and self.follows():  # the next status may take a fifth of a second
@@ -243,7 +243,7 @@ class Stranger:
             time.sleep(0.05)
         raise AssertionError(f"not armed within {limit_s:g} s: {self.status()['reason']}; {last}")
 
-    def stand_by(self, limit_s: float = LIMIT_S) -> None:
+    def stand_by(self, limit_s: float = TIMEOUT_S) -> None:
         """Have the robot disarmed and ready to arm; a busy machine may have stopped it meanwhile."""
         deadline = time.monotonic() + limit_s
         while time.monotonic() < deadline:

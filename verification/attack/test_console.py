@@ -16,7 +16,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from snakesim_testing.harness.page import CAMERA, STOP, Page, ask, flood, origin_of
-from snakesim_testing.harness.processes import processes_of, processes_with
+from snakesim_testing.harness.processes import find_processes_of_run, find_processes_with
 from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import address
 from verification.attack.effort import Record, effort
@@ -190,7 +190,9 @@ def console_mb(robot: Robot) -> float:
 
 def pages_pid(robot: Robot) -> int:
     """Process id of the console's page server, where viser is."""
-    return next(pid for pid, line in processes_of(robot.run.out) if "snakesim_operator.features.console\0" in line)
+    return next(
+        pid for pid, line in find_processes_of_run(robot.run.out) if "snakesim_operator.features.console\0" in line
+    )
 
 
 def test_c6_pages_of_other_origins_are_refused(robot: Robot, at: str) -> None:
@@ -273,7 +275,7 @@ def test_c9_without_the_token_nothing_is_answered(robot: Robot, at: str) -> None
         assert viewer.controls[button].get("visible", True)
         stops(robot, lambda: viewer.click(STOP))
     robot.unharmed(health)
-    command_lines = [line for _, line in processes_with("cmdline", "snakesim_operator.features.console")]
+    command_lines = [line for _, line in find_processes_with("cmdline", "snakesim_operator.features.console")]
     assert command_lines and not any(token in line for line in command_lines), "every user reads command lines"
 
 

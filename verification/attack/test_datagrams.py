@@ -6,7 +6,7 @@ import socket
 import time
 from pathlib import Path
 
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.attack.command import STANDING, address
 from verification.attack.effort import effort
 from verification.attack.robot import standing
@@ -40,7 +40,7 @@ def wrong_poses() -> list[bytes]:
 
 
 def test_a7_no_datagram_at_the_pose_port_ends_the_host(tmp_path: Path) -> None:
-    port = address(free_endpoint())[1]
+    port = address(find_free_endpoint())[1]
     pose = f'backends.can.pose_listen="127.0.0.1:{port}"'
     with standing(tmp_path, *STANDING, "--backend", "can", "--set", pose) as robot:
         before = robot.health()

@@ -179,7 +179,7 @@ def test_a8_a_forged_status_moves_nothing(robot: Robot, lifecycle: str) -> None:
     with Stranger(robot.endpoint) as stranger, repeating(lambda: stranger.put("hal/status", forged), EVERY_S):
         time.sleep(FORGED_S)
         assert operator.next("hal/clock")["arm_session"] == armings
-        stopped = robot.run.tell("estop")
+        stopped = robot.run.run_tool("estop")
     operator.forget()
     assert operator.next("hal/clock")["lifecycle"] == "estop", stopped.printed
 

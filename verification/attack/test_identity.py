@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.attack.command import STANDING, running, snakesim
 from verification.attack.effort import FULL, effort
 from verification.attack.means import datagrams
@@ -64,7 +64,7 @@ def test_a2_a_second_answer_is_an_impostor(
     operator.until(lambda: operator.lifecycle() == before, before)
     arguments = {"arm": ["robot", "arm", "planar13", "sim"], "estop": ["estop"]}.get(tool, ["robot", tool])
     with impostor(routed, "hal/estop" if tool == "estop" else "hal/lifecycle", lies):
-        ended = routed.run.tell(*arguments)
+        ended = routed.run.run_tool(*arguments)
     if tool == "estop" and ended.code == 0:  # confirmed past the network, by the stop port of a run of this user
         assert operator.next("hal/clock")["lifecycle"] == "estop", ended.printed
         return
@@ -81,7 +81,7 @@ def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: Robot) -> No
     with impostor(robot, "hal/lifecycle", answer) as stranger:
         forged = {**operator.status(), "lifecycle": "disarmed", "reason": "disarmed on request"}
         stranger.latch("hal/status", forged)
-        ended = robot.run.tell("robot", "disarm")
+        ended = robot.run.run_tool("robot", "disarm")
     assert ended.code == 1 and "impostor" in ended.printed, f"the robot is {operator.lifecycle()}: {ended.printed}"
 
 
@@ -98,14 +98,14 @@ def test_a2_frozen_host_is_not_stopped_by_another_answer(
     routed: Robot, tool: str, key: str, lies: dict[str, Any], word: str, _time: int
 ) -> None:
     with impostor(routed, key, lies), frozen_host(routed):
-        ended = routed.run.tell(*(["estop"] if tool == "estop" else ["robot", tool]))
+        ended = routed.run.run_tool(*(["estop"] if tool == "estop" else ["robot", tool]))
     assert ended.code == 1 and word not in ended.printed, f"exit code {ended.code}: {ended.printed}"
 
 
 @pytest.mark.parametrize("how", ["false_stop_port_and_frozen_host", *["impostor", "impostor_and_frozen_host"] * FULL])
 def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, how: str) -> None:
     """The command is typed on another computer: all that it knows is the router's address, where anybody may answer."""
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     answer = lie("estop", "emergency stop by root; reset it to continue")
     with (
         zenoh.open(settings("", "router", listen=endpoint)),
@@ -127,5 +127,5 @@ def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, 
 
 def test_a2_a_frozen_host_gives_no_answer(routed: Robot) -> None:
     with frozen_host(routed):
-        ended = routed.run.tell("estop")
+        ended = routed.run.run_tool("estop")
     assert ended.code == 1 and "planar13" in ended.printed and "planar13: stopped" not in ended.printed, ended.printed

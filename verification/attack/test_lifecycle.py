@@ -46,7 +46,7 @@ def test_a12_a_request_without_a_name_is_not_anonymous(robot: Robot) -> None:
 def test_a13_stop_outlives_run_and_folder_until_reset(tmp_path: Path) -> None:
     with running(tmp_path, *STANDING, name="one") as run, joined(run) as operator:
         operator.recover()
-        assert run.tell("estop").code == 0
+        assert run.run_tool("estop").code == 0
         assert run.interrupt() == 130
     with running(tmp_path, *STANDING, name="two") as run, joined(run) as operator:
         with pytest.raises(AssertionError, match="not within"):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.attack.command import HOLDING, running, steering
 from verification.attack.effort import Record, effort
 from verification.attack.means import wire
@@ -78,7 +78,9 @@ def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot
 
 def printed_safely(robot: Robot, before: str) -> None:
     """Nothing that a person reads has control characters, or lines that a stranger has written."""
-    told = {f"snakesim {tool}": robot.run.tell(*tool.split()).printed for tool in ("status", "estop", "robot reset")}
+    told = {
+        f"snakesim {tool}": robot.run.run_tool(*tool.split()).printed for tool in ("status", "estop", "robot reset")
+    }
     for who, said in {**told, "the run": robot.run.printed()[len(before) :]}.items():
         assert not steering(said), f"{who} prints {said!r}"
         assert not any(line.startswith("planar13: armed - all is well") for line in said.splitlines()), said
@@ -90,8 +92,8 @@ def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robo
         stranger.ask("hal/estop", {"requester": EVIL})
     robot.operator.until(lambda: robot.operator.lifecycle() == "estop", "the stop")
     robot.run.wait_for("evil")
-    assert "evil" in robot.run.tell("status").out
-    echoed = robot.run.tell("topic", "echo", "hal/status", "--count", "1")
+    assert "evil" in robot.run.run_tool("status").out
+    echoed = robot.run.run_tool("topic", "echo", "hal/status", "--count", "1")
     assert EVIL in json.loads(echoed.out)["message"]["reason"] and not steering(echoed.printed), echoed.printed
     printed_safely(robot, said)
 
@@ -169,7 +171,7 @@ def test_false_robots_do_not_keep_a_stop_from_real_one(robot: Robot, record_prop
     with Stranger(robot.endpoint) as stranger:
         tokens = [stranger.session.liveliness().declare_token(f"robot_{i}/alive/hal") for i in range(effort(100, 1000))]
         asked_s = time.monotonic()
-        ended = robot.run.tell("estop", limit_s=STATUS_S)
+        ended = robot.run.run_tool("estop", limit_s=STATUS_S)
         took_s = operator.stopped_at(asked_s, 5.0) - asked_s
         for token in tokens:
             token.undeclare()
@@ -185,11 +187,11 @@ def test_false_robots_do_not_keep_a_stop_from_real_one(robot: Robot, record_prop
 @pytest.mark.parametrize("mode", ["router", pytest.param("peer", marks=pytest.mark.slow)])
 def test_stranger_joining_as_router_or_peer_changes_nothing(robot: Robot, mode: str) -> None:
     before = robot.health()
-    with Stranger(robot.endpoint, mode=mode, listen=free_endpoint()) as stranger:
+    with Stranger(robot.endpoint, mode=mode, listen=find_free_endpoint()) as stranger:
         stranger.receive("hal/clock")
         stranger.until(lambda: stranger.heard("hal/clock"), "the clock")
         robot.stays("armed", 1.0)
-        assert robot.run.tell("estop").code == 0
+        assert robot.run.run_tool("estop").code == 0
     operator = robot.operator
     operator.recover()
     robot.unharmed(before)
@@ -197,7 +199,7 @@ def test_stranger_joining_as_router_or_peer_changes_nothing(robot: Robot, mode: 
 
 def test_the_hosts_zenoh_cannot_be_configured_by_a_stranger(robot: Robot) -> None:
     """A Zenoh router has an administration space; nobody may write there."""
-    bait = free_endpoint()
+    bait = find_free_endpoint()
     with Stranger(robot.endpoint) as stranger:
         answers = [
             str(reply.ok.key_expr) for reply in stranger.session.get("@/**", timeout=1.0) if reply.ok is not None

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_testing.harness.bad_plugins import BAD
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.harness.processes import nothing_left
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.harness.processes import assert_no_process_left
 from verification.attack.command import snakesim
 from verification.attack.effort import FULL
 
@@ -52,10 +52,10 @@ def test_a_plugin_that_misbehaves_stops_its_robot_only(tmp_path: Path, who: str,
         tmp_path,
         *("run", "triplet", "--controller", chosen["controller"], "--backend", chosen["backend"]),
         *("--clock-mode", "realtime", "--set", "rate_hz=50", "--duration", "60"),
-        *("--out", str(out), "--endpoint", free_endpoint()),
+        *("--out", str(out), "--endpoint", find_free_endpoint()),
     )
     summary = json.loads((out / "summary.json").read_bytes())
     assert ended.code == 1 and words in summary["ended"], ended.printed
     assert summary["duration_s"] < 60
-    nothing_left(out, 20.0)
+    assert_no_process_left(out, 20.0)
     assert sum(file.stat().st_size for file in out.iterdir()) < 200 * 2**20

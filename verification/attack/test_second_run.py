@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import HOLDING, STANDING, Run, running, snakesim
 from verification.attack.effort import effort
@@ -47,7 +47,7 @@ def test_a1_second_run_at_same_endpoint_does_not_arm_robot(robot: Robot, tmp_pat
 @pytest.mark.slow
 def test_a1_second_run_at_router_endpoint_does_not_arm_robot(tmp_path: Path) -> None:
     """Nobody holds the router's UDP port, so only that somebody listens there can tell the second run."""
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with (
         zenoh.open(settings("", "router", listen=endpoint)),
         running(tmp_path, *STANDING, "--router", endpoint, endpoint=endpoint) as first,

@@ -98,10 +98,10 @@ def test_impostor_blocks_confirmation_but_not_the_stop(robot: Robot) -> None:
         stranger.pretend("hal/estop", answer)
         stranger.pretend("hal/lifecycle", answer)
         asked_s = time.monotonic()
-        ended = robot.run.tell("estop")
+        ended = robot.run.run_tool("estop")
         assert robot.operator.stopped_at(asked_s, 3.0) and ended.code == 0, ended.printed  # its own stop port says so
         assert "WARNING: 2 answered in its name" in ended.printed
-        assert robot.run.tell("robot", "reset").code == 1
+        assert robot.run.run_tool("robot", "reset").code == 1
 
 
 def test_anybody_may_release_the_lease_which_stops_the_robot(robot: Robot) -> None:

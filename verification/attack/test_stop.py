@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.attack.command import snakesim, steering
 from verification.attack.effort import FULL, Record, effort
 from verification.attack.means import datagrams
@@ -55,7 +55,7 @@ def test_a4_the_command_stops_the_robot_under(robot: Robot, name: str, _time: in
     with FLOODS[name](robot):
         time.sleep(FLOODED_S)
         before, asked_s = operator.lifecycle(), time.monotonic()
-        ended = robot.run.tell("estop")
+        ended = robot.run.run_tool("estop")
         try:
             took_s = operator.stopped_at(asked_s, COMMAND_S) - asked_s
         except AssertionError:
@@ -141,7 +141,7 @@ def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: Robot) ->
     before = robot.health()
     for who in (b"", b"\xff\xfe\x80", b"\x1b[2J\r\nplanar13: armed", b"x" * 65, b"x" * 60_000, "é".encode() * 64):
         datagrams.ask(robot.endpoint, datagrams.stop(who), 0.2)
-    printed = robot.run.tell("status").printed + robot.run.printed()
+    printed = robot.run.run_tool("status").printed + robot.run.printed()
     assert not steering(printed), printed
     assert "\nplanar13: armed" not in printed.partition("planar13: ")[2], printed
     assert datagrams.ask(robot.endpoint, datagrams.stop("after it"), 2.0) is not None, "no answer any more"
@@ -150,7 +150,7 @@ def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: Robot) ->
 
 @pytest.mark.parametrize("knows_nonce", [False, True], ids=["wrong_nonce", "right_nonce"])
 def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(robot: Robot, knows_nonce: bool) -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with datagrams.false_port(endpoint, knows_nonce=knows_nonce):
         ended = snakesim(robot.run.home, "estop", "--endpoint", endpoint)
     assert ended.code == 1, ended.printed
@@ -163,6 +163,6 @@ def test_a4_a_stop_keeps_trying_while_the_network_is_shut(robot: Robot) -> None:
         opens = threading.Timer(1.5, shut.close)  # the tool is at it by then
         opens.start()
         asked_s = time.monotonic()
-        ended = robot.run.tell("estop")
+        ended = robot.run.run_tool("estop")
         opens.join()
     assert robot.operator.stopped_at(asked_s, 1.0) and ended.code == 0, ended.printed

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base import arithmetic
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.runs.command import SNAKESIM, Ended, call, environment
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, CompletedRun, make_environment, run_to_end
 from verification.golden import GOLDEN, SECONDS
 
 pytestmark = pytest.mark.e2e
@@ -28,7 +28,7 @@ COMPUTERS: dict[str, dict[str, str]] = {
 }
 OWN = arithmetic.find_differing_parts(arithmetic.measure_arithmetic())
 common = pytest.mark.skipif(
-    not arithmetic.common_environment() or bool(OWN),
+    not arithmetic.make_common_arithmetic_env() or bool(OWN),
     reason=f"the digests of this computer are its own: {' and '.join(OWN) or 'without AVX2 and FMA'}",
 )
 IN_ONE_PROCESS = ["tests/system/runs", "tests/system/recordings", "tests/system/commands", "-m", "not slow and not e2e"]
@@ -38,26 +38,28 @@ IN_REAL_TIME = ["tests/system/runs/test_run.py", "tests/system/recordings/test_r
 PROGRAM = """
 import sys
 import numpy
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.run.in_process import simulate
 
-result = simulate(load(sys.argv[1], [parse_set(f"duration_s={sys.argv[2]}")]).config)
+result = simulate(load_scenario(sys.argv[1], [parse_set_option(f"duration_s={sys.argv[2]}")]).config)
 print(result.summary.command_digest, len(result.record.time_s))
 """
 
 
 def on(computer: Mapping[str, str], folder: Path) -> dict[str, str]:
     """The environment of a user there, who has heard nothing of ours."""
-    ours = environment(folder)
-    return {name: value for name, value in ours.items() if name not in arithmetic.common_environment()} | dict(computer)
+    ours = make_environment(folder)
+    return {name: value for name, value in ours.items() if name not in arithmetic.make_common_arithmetic_env()} | dict(
+        computer
+    )
 
 
-def run(folder: Path, *arguments: str, computer: Mapping[str, str] | None = None) -> Ended:
-    typed = [*SNAKESIM, "run", *arguments, "--duration", str(SECONDS), "--no-record", "--out", "run"]
-    return call(typed, folder, on(computer or {}, folder))
+def run(folder: Path, *arguments: str, computer: Mapping[str, str] | None = None) -> CompletedRun:
+    typed = [*SNAKESIM_COMMAND, "run", *arguments, "--duration", str(SECONDS), "--no-record", "--out", "run"]
+    return run_to_end(typed, folder, on(computer or {}, folder))
 
 
-def digest_in(ended: Ended) -> str:
+def digest_in(ended: CompletedRun) -> str:
     assert "command digest" in ended.out, ended.out + ended.err
     return ended.out.partition("command digest")[2].partition("\n")[0].strip()
 
@@ -85,9 +87,9 @@ def test_it_is_that_of_every_computer(tmp_path: Path, computer: str) -> None:
 @common
 @pytest.mark.parametrize("computer", ["SkylakeX", pytest.param("plain NumPy", marks=pytest.mark.slow)])
 def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
-    ended = run(tmp_path, "triplet", "--endpoint", free_endpoint(), computer=COMPUTERS[computer])
+    ended = run(tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer])
     if " is gone: " in ended.out:  # a computer that stands for seconds loses a process, and the run is no whole one
-        ended = run(tmp_path, "triplet", "--endpoint", free_endpoint(), computer=COMPUTERS[computer])
+        ended = run(tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer])
     assert digest_in(ended) == GOLDEN["triplet"], ended.out + ended.err
 
 
@@ -99,16 +101,18 @@ def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
 def test_and_that_of_a_program_that_imported_numpy_first(tmp_path: Path, computer: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
     typed = [sys.executable, "program.py", "peg_row", str(SECONDS)]
-    ended = call(typed, tmp_path, on(COMPUTERS[computer], tmp_path))
+    ended = run_to_end(typed, tmp_path, on(COMPUTERS[computer], tmp_path))
     digest, ticks = ended.out.split() or pytest.fail(ended.err)
     assert digest.startswith(GOLDEN["peg_row"]) and int(ticks) == 100 * SECONDS
 
 
 @common
 def test_what_such_a_program_did_wrong_is_raised_there(tmp_path: Path) -> None:
-    wrong = PROGRAM.replace('[parse_set(f"duration_s={sys.argv[2]}")]', '[parse_set("clock_mode=realtime")]')
+    wrong = PROGRAM.replace(
+        '[parse_set_option(f"duration_s={sys.argv[2]}")]', '[parse_set_option("clock_mode=realtime")]'
+    )
     (tmp_path / "program.py").write_text(wrong)
-    ended = call([sys.executable, "program.py", "triplet"], tmp_path, on(COMPUTERS["Nehalem"], tmp_path))
+    ended = run_to_end([sys.executable, "program.py", "triplet"], tmp_path, on(COMPUTERS["Nehalem"], tmp_path))
     assert ended.code == 1 and "errors.ConfigError" in ended.err and "must be 'lockstep'" in ended.err
 
 
@@ -116,14 +120,14 @@ def test_what_such_a_program_did_wrong_is_raised_there(tmp_path: Path) -> None:
 def test_other_c_library_marks_digest_as_local(tmp_path: Path) -> None:
     """glibc has sines for processors with FMA, and others."""
     other = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
-    typed = [*SNAKESIM, "run", "triplet", "--in-process", "--duration", "0.3", "--out", "run"]
-    ended = call(typed, tmp_path, on(other, tmp_path))
+    typed = [*SNAKESIM_COMMAND, "run", "triplet", "--in-process", "--duration", "0.3", "--out", "run"]
+    ended = run_to_end(typed, tmp_path, on(other, tmp_path))
     own = "its own: NumPy and C library round otherwise than on most computers with NumPy 2.2 to 2.4"
     assert ended.code == 0 and digest_in(ended).endswith(f", {own}"), ended.out + ended.err
-    told = call([*SNAKESIM, "recording", "info", "run"], tmp_path, on({}, tmp_path))
+    told = run_to_end([*SNAKESIM_COMMAND, "recording", "info", "run"], tmp_path, on({}, tmp_path))
     assert own in told.out
-    assert call([*typed[:-1], "usual"], tmp_path, on({}, tmp_path)).code == 0
-    compared = call([*SNAKESIM, "study", "compare", "run", "usual"], tmp_path, on({}, tmp_path))
+    assert run_to_end([*typed[:-1], "usual"], tmp_path, on({}, tmp_path)).code == 0
+    compared = run_to_end([*SNAKESIM_COMMAND, "study", "compare", "run", "usual"], tmp_path, on({}, tmp_path))
     assert "description.arithmetic.C library" in compared.out, compared.out + compared.err
 
 

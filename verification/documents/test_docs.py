@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 
 from snakesim_testing.runs import documents
-from snakesim_testing.runs.command import environment
-from snakesim_testing.runs.documents import REPOSITORY, Section, needs_uv, sections
+from snakesim_testing.runs.command import make_environment
+from snakesim_testing.runs.documents import REPOSITORY, Section, needs_uv, parse_sections
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
 
 def typed_in(page: str) -> list[Section]:
     """The sections of a page in which something is to be typed."""
-    return [section for section in sections(REPOSITORY / page) if section.has_commands]
+    return [section for section in parse_sections(REPOSITORY / page) if section.has_commands]
 
 
 TOUR = (
@@ -38,7 +38,7 @@ EVALUATION = [
     for section in typed_in(f"docs/how-to/{page}.md")
 ]
 JOINT_MODULES = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
-HIL = [section for section in sections(JOINT_MODULES) if section.title == "1. Anywhere"]  # needs no CAN
+HIL = [section for section in parse_sections(JOINT_MODULES) if section.title == "1. Anywhere"]  # needs no CAN
 CONTROLLERS, ROBOTS, SCENES, URDF = (
     typed_in(f"docs/{page}.md") for page in ("reference/controllers", "how-to/robots", "how-to/scenes", "how-to/urdf")
 )
@@ -67,7 +67,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
     process = subprocess.Popen(
         [*prefix, "bash", "typed.sh"],
         cwd=cwd,
-        env=environment(cwd / "state", PATH=path),
+        env=make_environment(cwd / "state", PATH=path),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -96,7 +96,7 @@ def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     for name, content in section.files.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(content, encoding="utf-8")
-    typed(documents.script(section), folder, apart())
+    typed(documents.make_bash_script(section), folder, apart())
 
 
 @needs_uv
@@ -115,10 +115,10 @@ def test_the_readme_as_printed(tmp_path: Path) -> None:
     install, quick_start = README
     for name, content in quick_start.files.items():
         (clone / name).write_text(content, encoding="utf-8")
-    printed = documents.script(install)
+    printed = documents.make_bash_script(install)
     assert "\nmake demo" in printed and "\nmake test" in printed
     script = printed.replace("\nmake test", "\nmake test-unit WORKERS=0 ARGS='--collect-only -q'")
-    output = typed(script + "\n" + documents.script(quick_start), clone, [])
+    output = typed(script + "\n" + documents.make_bash_script(quick_start), clone, [])
     assert "report:" in output and (clone / "runs" / "demo" / "report.html").is_file()
     assert "tests collected" in output
     assert (clone / "first.html").is_file()

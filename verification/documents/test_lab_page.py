@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.lab.machines import NET, Machine, connected
-from snakesim_testing.runs.documents import REPOSITORY, sections
+from snakesim_testing.lab.machines import NET, Machine, connect_machines
+from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 pytestmark = [
     pytest.mark.e2e,
@@ -23,13 +23,13 @@ pytestmark = [
     pytest.mark.timeout(600),
     pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root"),
 ]
-BLOCKS = [block for section in sections(REPOSITORY / "docs" / "how-to" / "lab.md") for block in section.blocks]
+BLOCKS = [block for section in parse_sections(REPOSITORY / "docs" / "how-to" / "lab.md") for block in section.blocks]
 LIMIT_S = 120.0
 
 
 def test_a_new_lab_step_by_step(tmp_path: Path) -> None:
     with ExitStack() as stack:
-        machines = connected(["hub", "robot1", "ws1", "laptop"], stack)
+        machines = connect_machines(["hub", "robot1", "ws1", "laptop"], stack)
         for number, (info, script) in enumerate(BLOCKS):
             where = info.rpartition(" on ")[2]
             if info == "sh by hand":

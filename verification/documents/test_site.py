@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, chromium
+from snakesim_testing.operator.browser import CHROMIUM, MISSING, open_chromium
 from snakesim_testing.runs.documents import REPOSITORY
 
 SITE = REPOSITORY / "build" / "docs"
@@ -29,7 +29,7 @@ def test_the_site_is_searched_from_a_folder_without_a_network() -> None:
     loaded = re.compile(r"""<(?:script|link|img|iframe)[^>]*(?:src|href)=["']?(?:https?:)?//""")
     assert not [page for page in SITE.rglob("*.html") if loaded.search(page.read_text())]
     assert not [page for page in SITE.rglob("*.html") if "<code>``" in page.read_text()]  # a block taken for a text
-    with chromium() as browser:
+    with open_chromium() as browser:
         tab = browser.open(f"file://{SITE}/docs/concepts/safety.html")
         tab.wait_for("Safety")
         tab.wait_until_loaded()

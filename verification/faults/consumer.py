@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from snakesim_hal.base.process import die_with_parent
+from snakesim_hal.base.process import set_parent_death_signal
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
@@ -21,7 +21,7 @@ STUCK = "stuck"
 def main() -> None:
     """Until killed."""
     kind, endpoint, namespace = sys.argv[1:]
-    die_with_parent()
+    set_parent_death_signal()
     was_reported: list[bool] = []
 
     def sleeps(_arrival: Arrival) -> None:

@@ -25,18 +25,23 @@ from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_settings import make_body
+from snakesim_drivers.kit.drive_settings import make_emulated_body
 from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypePart
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
-from snakesim_hal.base.process import SERVICE_PRIORITY, die_with_parent, on_stop_signal, tune_garbage_collector
+from snakesim_hal.base.process import (
+    SERVICE_PRIORITY,
+    call_on_stop_signals,
+    set_parent_death_signal,
+    tune_garbage_collector,
+)
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
-from snakesim_hal.model.scenario import RunConfig, load
-from snakesim_hal.programs.preflight import backend_settings
-from snakesim_serial_backend.emulation import named
+from snakesim_hal.model.plugins import BACKENDS, load_plugin
+from snakesim_hal.model.scenario import RunConfig, load_scenario
+from snakesim_hal.programs.preflight import decode_backend_settings
+from snakesim_serial_backend.emulation import create_named_ptys
 from snakesim_serial_backend.servo_backend import ServoBackend
 from snakesim_serial_backend.wire import Pty
-from snakesim_testing.benches.emulated_drives import enabled_drives
+from snakesim_testing.benches.emulated_drives import list_enabled_drives
 
 PAUSE_S = 0.0005
 READY = "drives ready"
@@ -59,11 +64,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--pose", required=True)
     parser.add_argument("--parent", type=int, required=True)
     arguments = parser.parse_args(argv)
-    die_with_parent(arguments.parent)
+    set_parent_death_signal(arguments.parent)
     running = [True]
-    on_stop_signal(running.clear)
+    call_on_stop_signals(running.clear)
     with ExitStack() as opened, arguments.notes.open("w", buffering=1) as notes:
-        drives = open_drives(load(arguments.config).config, arguments.pose, opened)
+        drives = open_drives(load_scenario(arguments.config).config, arguments.pose, opened)
         tune_garbage_collector()
         with contextlib.suppress(OSError):  # real drives do not wait for a busy computer
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SERVICE_PRIORITY))
@@ -80,12 +85,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
     """Open the buses of a configuration, and put its drives on them."""
-    backend: Any = find_plugin(BACKENDS, config.backend)
-    settings = backend_settings(config, backend)
+    backend: Any = load_plugin(BACKENDS, config.backend)
+    settings = decode_backend_settings(config, backend)
     if backend is CanBackend:
         return _modules(config, settings, pose, opened)
-    parts: list[DriverTypePart] = backend.split_by_driver_type(config, settings)
-    body, clock = make_body(config, settings, config.backend, pose), DriverClock(config)
+    parts: list[DriverTypePart] = backend.group_joints_by_driver_type(config, settings)
+    body, clock = make_emulated_body(config, settings, config.backend, pose), DriverClock(config)
     emulators = [_emulator(part, body.select(list(part.joints)), clock, opened) for part in parts]
 
     def run() -> None:
@@ -95,7 +100,7 @@ def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
     def enabled() -> list[bool]:
         found: dict[int, bool] = {}
         for part, emulator in zip(parts, emulators, strict=True):
-            found |= dict(zip(part.joints, enabled_drives(emulator), strict=True))
+            found |= dict(zip(part.joints, list_enabled_drives(emulator), strict=True))
         return [found[joint] for joint in range(len(found))]
 
     return Drives(run, enabled)
@@ -110,7 +115,7 @@ def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, open
         context = CanEmulatorContext(joints, part.settings, body, [wire] * len(joints), clock.now_ns)
         return opened.enter_context(closing(driver_type.emulator_class(context)))
     assert issubclass(driver_type, ServoBackend), f"no emulator of {driver_type.name} as a process"
-    ptys: list[Pty] = opened.enter_context(named([Path(part.ports[0])]))
+    ptys: list[Pty] = opened.enter_context(create_named_ptys([Path(part.ports[0])]))
     return driver_type.make_emulator(joints, part.settings, body, ptys * len(joints), clock)
 
 

@@ -68,7 +68,7 @@ class Observer:
                 (keys.JOINTS, JointState),
             )
         }
-        self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
+        self._descriptions = session.declare_latched_reader(keys.DESCRIPTION, Description)
         self._description: Description | None = None
         session.on_latched_arrival(keys.STATUS, self._inbox.put)
         for key in (keys.APPLIED, keys.CLOCK, keys.JOINTS, keys.JOINT_COMMAND):
@@ -178,7 +178,7 @@ class Observer:
         why = ""
         for _ in range(MAX_REQUESTS):
             try:
-                return self.session.request(key, request, timeout_s=2.0)
+                return self.session.send_request(key, request, timeout_s=2.0)
             except NotConnectedError as error:
                 why = str(error)
         raise TrialError(f"{why}, requested {MAX_REQUESTS} times")
@@ -218,11 +218,12 @@ class Observer:
         self._make_ready(limit_s)
         robot = self.description()
         self.forget()
-        request = LifecycleRequest(
-            action="arm", robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
-        )
-        if not self.ask(keys.LIFECYCLE, request).ok:
-            return False
+        if self.state() != "armed":
+            request = LifecycleRequest(
+                action="arm", robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
+            )
+            if not self.ask(keys.LIFECYCLE, request).ok:
+                return False
 
         def follows() -> bool:
             return self.state() == "armed" and any(h.message.sequence is not None for h in self.applied)
@@ -231,13 +232,19 @@ class Observer:
         return self.state() != "fault"
 
     def _make_ready(self, limit_s: float) -> None:
-        """Reset until no further fault is reported: a fault of the meantime is reported after the reset."""
+        """Reset until no further fault is reported: a fault of the meantime is reported after the reset.
+
+        The robot may be armed already: a flooded router can lose the response to an earlier request that armed it.
+        """
         deadline = time.monotonic() + limit_s
-        while self.status is None or not self.status.ready_to_arm:
+        while self.status is None or not (self.status.ready_to_arm or self.state() == "armed"):
             self.reset()
             left_s = max(deadline - time.monotonic(), 0.1)
             self.until(
-                lambda: self.status is not None and (self.status.ready_to_arm or self.state() in ("fault", "estop")),
+                lambda: (
+                    self.status is not None
+                    and (self.status.ready_to_arm or self.state() in ("armed", "fault", "estop"))
+                ),
                 "ready to arm",
                 left_s,
             )

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.model.scenario import Override, RunConfig, load, write_config
+from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, write_config
 from snakesim_hal.network.session import Link, open_session
 from snakesim_operator.run import children
 from snakesim_operator.run.children import Child
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.faults.host_watch import HostWatch, urgently
 from verification.faults.observer import Observer, TrialError
 from verification.faults.row import Request, Trial
@@ -30,7 +30,7 @@ def configuration(backend: str, **dotted: Any) -> RunConfig:
     """The triplet in real time at 100 Hz, for as long as anybody likes; `__` in a name stands for the dot."""
     values = {"backend": backend, "clock_mode": "realtime", "duration_s": 3600.0, **dotted}
     overrides = [Override(name.replace("__", "."), value, f"--{name}") for name, value in values.items()]
-    return load("triplet", overrides).config
+    return load_scenario("triplet", overrides).config
 
 
 class Robot:
@@ -39,7 +39,7 @@ class Robot:
     def __init__(self, folder: Path, config: RunConfig, *, endpoint: str | None = None, router: bool = False) -> None:
         """router: another process listens at the endpoint."""
         self.folder, self.config, self.router = folder, config, router
-        self.endpoint = endpoint or free_endpoint()
+        self.endpoint = endpoint or find_free_endpoint()
         self.running: dict[str, Child] = {}
         self._stack = ExitStack()
         self.host = HostWatch()  # of the first host
@@ -54,7 +54,7 @@ class Robot:
         for child in self.running.values():
             with contextlib.suppress(ProcessLookupError):
                 child.process.send_signal(signal.SIGCONT)
-        children.stop_all(list(self.running.values()))
+        children.stop_children(list(self.running.values()))
         self._stack.close()
 
     def start(self, name: str) -> Child:
@@ -78,7 +78,7 @@ class Robot:
             module = ["snakesim_hal.programs.service_program", name, *common]
         log = self._stack.enter_context((self.folder / f"{name}.log").open("ab", buffering=0))
         state = {"XDG_STATE_HOME": str(self.folder)}  # what outlives a run must not outlive this one
-        self.running[name] = children.start_child(name, module, log.write, inherits=inherits, more=state)
+        self.running[name] = children.start_child(name, module, log.write, pass_fds=inherits, extra_env=state)
         return self.running[name]
 
     def start_all(self) -> None:

@@ -8,8 +8,8 @@ from typing import Literal
 
 import msgspec
 
-Backend = Literal["sim", "can", "both", "odrive", "moteus", "dynamixel", "mixed"]
-DRIVE_TYPES: tuple[Backend, ...] = ("can", "odrive", "moteus", "dynamixel", "mixed")
+Backend = Literal["sim", "can", "both", "odrive", "moteus", "cia402", "dynamixel", "feetech", "mixed"]
+DRIVE_TYPES: tuple[Backend, ...] = ("can", "odrive", "moteus", "cia402", "dynamixel", "feetech", "mixed")
 
 # Where a row is measured: in this process's environment, in network namespaces, or in a virtual machine with SocketCAN.
 Environment = Literal["here", "namespaces", "guest"]

@@ -148,6 +148,6 @@ def _tick(run: Loop, stranger: Stranger, words: Counter[str]) -> None:
     run.run(1)
     words.update(f"fault {fault.what}" for fault in run.faults[reported:])
     samples = run.samples[-1]
-    for message in (samples.joints, *samples.others.values()):
+    for message in (samples.joints, *samples.by_key.values()):
         assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
     del run.samples[:-1]

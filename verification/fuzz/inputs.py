@@ -18,16 +18,16 @@ import msgspec
 import pytest
 
 from snakesim_can_backend.emulator import faults as twin_faults
-from snakesim_drivers.motion_capture.mocap import MAX_BYTES, MocapReceiver
+from snakesim_drivers.motion_capture.mocap import MAX_DATAGRAM_BYTES, MocapReceiver
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP, EstopLatch
 from snakesim_hal.model import fault_kinds as injection
 from snakesim_hal.model import files, scenario
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scene import SceneFile
-from snakesim_hal.network.local_registry import LocalRobot, local_robots
-from snakesim_hal.network.router import router_settings
-from snakesim_hal.network.stop_port import REQUEST, open_stop_port, request_stop, serve_stops
+from snakesim_hal.network.local_registry import LocalRobot, list_local_robots
+from snakesim_hal.network.router import read_router_settings
+from snakesim_hal.network.stop_port import REQUEST_HEADER, open_stop_port, request_stop, start_stop_server
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import EstopRequest, Pose
 from snakesim_operator.results.last_run import read_last_run
@@ -120,13 +120,13 @@ def mocap() -> Iterator[Input]:
         def reading(payload: bytes) -> str:
             nonlocal now_ns
             now_ns += 10_000_000
-            before = receiver.refused.copy()
+            before = receiver.rejected_count_by_reason.copy()
             stranger.sendto(payload, (host, int(port)))
             pose = receiver.read_newest(now_ns // 10_000_000, now_ns)
             if pose is not None:
                 assert Decoder(Pose).decode(encode(pose), format_encoding(Pose)) == pose
                 return "a pose"
-            return next(iter(receiver.refused - before), "no velocity yet")
+            return next(iter(receiver.rejected_count_by_reason - before), "no velocity yet")
 
         def take(payload: bytes) -> str:
             word = reading(payload)
@@ -135,7 +135,7 @@ def mocap() -> Iterator[Input]:
             return word
 
         poses = [*map(_pose, (1, 10**7, 10**9)), _pose(10**8, reported=False)]
-        yield Input("motion capture", poses, take, MAX_BYTES + 100)
+        yield Input("motion capture", poses, take, MAX_DATAGRAM_BYTES + 100)
 
 
 @contextmanager
@@ -151,7 +151,7 @@ def stop_port() -> Iterator[Input]:
         heard.append(who)
         reply("stopped")
 
-    serve_stops(opened, "worm", stop)
+    start_stop_server(opened, "worm", stop)
     with opened, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
 
         def take(payload: bytes) -> str:
@@ -165,7 +165,9 @@ def stop_port() -> Iterator[Input]:
             heard.clear()
             return "a stop" if heard_now else "no stop yet"
 
-        yield Input("stop port", [REQUEST + bytes(16) + who for who in (b"", b"a person", b"x" * 64)], take, 60_000)
+        yield Input(
+            "stop port", [REQUEST_HEADER + bytes(16) + who for who in (b"", b"a person", b"x" * 64)], take, 60_000
+        )
 
 
 def _pose(timestamp_ns: int, *, reported: bool = True) -> bytes:
@@ -185,7 +187,12 @@ def texts() -> list[Input]:
         return take
 
     return [
-        Input("--set", FLAGS, typed(lambda text: scenario.load("triplet", [scenario.parse_set(text)])), LARGEST // 8),
+        Input(
+            "--set",
+            FLAGS,
+            typed(lambda text: scenario.load_scenario("triplet", [scenario.parse_set_option(text)])),
+            LARGEST // 8,
+        ),
         Input(
             "a fault",
             FAULTS,
@@ -204,7 +211,7 @@ def written(folder: Path) -> list[Input]:
     """Files that people write, and those that the product keeps for itself."""
 
     def shipped(kind: str) -> list[bytes]:
-        return [files.find_file(name, kind).read_bytes() for name in files.list_shipped(kind)]
+        return [files.resolve_file_path(name, kind).read_bytes() for name in files.list_shipped_names(kind)]
 
     def file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], str]:
         def take(payload: bytes) -> str:
@@ -222,7 +229,7 @@ def written(folder: Path) -> list[Input]:
     def live(path: Path) -> object:
         with path.open("rb") as held:
             fcntl.flock(held, fcntl.LOCK_EX)  # as by a run that lives
-            return local_robots() or None
+            return list_local_robots() or None
 
     (folder / "snakesim" / "live").mkdir(parents=True, exist_ok=True)
     robot = LocalRobot(
@@ -237,14 +244,18 @@ def written(folder: Path) -> list[Input]:
     config = (folder / "record" / "config.json").read_bytes()
     return [
         Input(
-            "a robot file", shipped("robots"), file("r.toml", lambda p: files.decode(files.read_table(p), RobotFile))
+            "a robot file",
+            shipped("robots"),
+            file("r.toml", lambda p: files.decode_table(files.read_table(p), RobotFile)),
         ),
         Input(
-            "a scene file", shipped("scenes"), file("s.toml", lambda p: files.decode(files.read_table(p), SceneFile))
+            "a scene file",
+            shipped("scenes"),
+            file("s.toml", lambda p: files.decode_table(files.read_table(p), SceneFile)),
         ),
-        Input("a scenario", shipped("scenarios"), file("x.toml", lambda p: scenario.load(str(p)))),
-        Input("config.json", [config], file("x.json", lambda p: scenario.load(str(p)))),
-        Input("router.json5", [files.ROUTER.read_bytes()], file("router.json5", router_settings)),
+        Input("a scenario", shipped("scenarios"), file("x.toml", lambda p: scenario.load_scenario(str(p)))),
+        Input("config.json", [config], file("x.json", lambda p: scenario.load_scenario(str(p)))),
+        Input("router.json5", [files.ROUTER_CONFIG_PATH.read_bytes()], file("router.json5", read_router_settings)),
         Input(ESTOP, [b'{"requester":"a person","tick":7}'], file(ESTOP, latch)),
         Input(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: read_last_run())),
         Input("a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)),

@@ -22,9 +22,9 @@ from snakesim_hal.run_log.black_box import read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
-from snakesim_testing.harness.processes import parts_of, processes_of
+from snakesim_testing.harness.processes import find_processes_of_run, find_run_processes
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import LIMIT_S, Running, running
+from snakesim_testing.runs.command import TIMEOUT_S, Running, running_snakesim
 from verification.fuzz.vitals import Vitals, complaints, vitals
 from verification.fuzz.writer import Sent
 
@@ -77,9 +77,9 @@ class Watcher:
     """Looks at a run again and again."""
 
     def __init__(self, session: Session, out: Path) -> None:
-        self._statuses = session.latched_reader(keys.STATUS, Status)
+        self._statuses = session.declare_latched_reader(keys.STATUS, Status)
         self._out = out
-        self._parts = parts_of(out)
+        self._parts = find_run_processes(out)
         self._status: Status | None = None
         wait_until(lambda: self.status() is not None, "a status")
 
@@ -149,11 +149,11 @@ def fuzz(out: Path, request: Request) -> Verdict:
                 fuzzed = watcher.stretch(lambda: stranger.poll() is None)
                 if fuzzed.failure:
                     stranger.kill()
-                said, _ = stranger.communicate(timeout=LIMIT_S)
+                said, _ = stranger.communicate(timeout=TIMEOUT_S)
             if stranger.returncode == 0:
                 sent = msgspec.json.decode(said, type=Sent)
         run.interrupt()
-    wait_until(lambda: not processes_of(out), "all processes of the run gone")
+    wait_until(lambda: not find_processes_of_run(out), "all processes of the run gone")
     record = msgspec.json.decode((out / HOST_RECORD).read_bytes(), type=HostRecord)
     failure = [*(f"in a log: {line}" for line in complaints(out)), *_foreign(out, record)]
     if quiet.failure:
@@ -166,7 +166,7 @@ def fuzz(out: Path, request: Request) -> Verdict:
 @contextmanager
 def running_and_joined(out: Path, robot: str, *arguments: str) -> Iterator[tuple[Running, Session]]:
     """A run, and a session on its network; what the run said when it does not come up."""
-    with running(out, *arguments) as run:
+    with running_snakesim(out, *arguments) as run:
         run.wait_for("network:")
         with open_session(Link(run.endpoint, robot)) as session:
             yield run, session

@@ -11,14 +11,17 @@ from msgspec.msgpack import Ext
 
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, JointCommand, JointState, LeaseRequest, LifecycleRequest, Message
-from snakesim_testing.hal.small_robots import LEASE_NS, command, description, state
-from snakesim_testing.hal.strategies import Place, places, plain_example, poisons, replaced
+from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command, make_joint_state
+from snakesim_testing.hal.strategies import Place, iter_places, list_invalid_values, make_plain_example, replace_at
 from verification.fuzz.texts import flipped
 
-ROBOT = description()
+ROBOT = make_description()
 REAL: dict[type[Message], list[Message]] = {
-    JointState: [state(ROBOT, 0.1)],
-    JointCommand: [command(ROBOT, 0.1, sequence=10**6), command(ROBOT, 0.1, lease_epoch=2, torque_limit_nm=[1.0] * 3)],
+    JointState: [make_joint_state(ROBOT, 0.1)],
+    JointCommand: [
+        make_joint_command(ROBOT, 0.1, sequence=10**6),
+        make_joint_command(ROBOT, 0.1, lease_epoch=2, torque_limit_nm=[1.0] * 3),
+    ],
     LeaseRequest: [
         LeaseRequest(action=action, holder="control", epoch=1) for action in ("acquire", "renew", "release")
     ],
@@ -100,8 +103,8 @@ def seeds() -> list[Seed]:
     """At least one of every message that may stand alone on the wire."""
     found: list[Seed] = []
     for message in VERSIONS:
-        plain = plain_example(message)
-        found.append(Seed(message, plain, encode(plain), list(places(plain, inspect.type_info(message)))))
+        plain = make_plain_example(message)
+        found.append(Seed(message, plain, encode(plain), list(iter_places(plain, inspect.type_info(message)))))
         for real in REAL.get(message, []):
             plain: dict[str, Any] = {name: getattr(real, name) for name in real.__struct_fields__}
             found.append(Seed(message, plain, encode(real), [((name,), inspect.AnyType()) for name in plain]))
@@ -147,9 +150,9 @@ class Maker:
 
     def _confused(self, seed: Seed) -> bytes:
         at, info = self._rng.choice(seed.places)
-        wrong = poisons(info)
+        wrong = list_invalid_values(info)
         value = self._rng.choice(wrong) if wrong and self._rng.random() < 0.5 else self._rng.choice(WEIRD)
-        return encode(replaced(seed.plain, at, value))
+        return encode(replace_at(seed.plain, at, value))
 
     def _lost(self, seed: Seed) -> bytes:
         return encode({name: value for name, value in seed.plain.items() if self._rng.random() < 0.8})

@@ -14,9 +14,9 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_operator.recording.chunks import HEAD, unpack_chunk
-from snakesim_operator.recording.message import RECORDING
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_operator.recording.chunks import RECORD_HEADER, unpack_chunk
+from snakesim_operator.recording.message import RECORDING_FILENAME
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.operator.damaged_recordings import Span, chunks, flipped, packed, recorded, spans
 from verification.fuzz.forked import Forked, forked
 
@@ -91,8 +91,8 @@ def foreign(chance: random.Random, content: bytes) -> bytes:
             packed(bytes(60_000_000)) * chance.choice((1, 30)),
             packed(b"abc", "lz4", b"no such thing"),
             packed(b"abc", "snappy"),
-            packed(HEAD.pack(Opcode.MESSAGE, 2**40)),
-            HEAD.pack(chance.randrange(256), chance.choice(ABSURD)) + bytes(40),
+            packed(RECORD_HEADER.pack(Opcode.MESSAGE, 2**40)),
+            RECORD_HEADER.pack(chance.randrange(256), chance.choice(ABSURD)) + bytes(40),
         )
     )
     return content[:at] + made + content[at:]
@@ -101,8 +101,8 @@ def foreign(chance: random.Random, content: bytes) -> bytes:
 def forged(chance: random.Random, content: bytes) -> bytes:
     """A chunk that is whole, with messages that are not: other bytes, times, numbers and channels."""
     span: Span = chance.choice(chunks(content))
-    data = unpack_chunk(content[span.begin + HEAD.size : span.end])
-    places = [one.begin + HEAD.size for one in spans(data, magic=0) if one.opcode == Opcode.MESSAGE]
+    data = unpack_chunk(content[span.begin + RECORD_HEADER.size : span.end])
+    places = [one.begin + RECORD_HEADER.size for one in spans(data, magic=0) if one.opcode == Opcode.MESSAGE]
     for at in chance.sample(places, min(len(places), chance.choice((1, 5, 50)))):
         what = chance.randrange(4)
         if what == 0:
@@ -112,7 +112,7 @@ def forged(chance: random.Random, content: bytes) -> bytes:
         elif what == 2:
             struct.pack_into("<Q", data, at + 6, chance.choice((*ABSURD, 10**9, 2**61)))
         else:
-            length = HEAD.unpack_from(data, at - HEAD.size)[1]
+            length = RECORD_HEADER.unpack_from(data, at - RECORD_HEADER.size)[1]
             for _ in range(chance.choice((1, 8))):
                 data[at + 22 + chance.randrange(max(length - 22, 1))] = chance.randrange(256)
     return content[: span.begin] + packed(bytes(data)) + content[span.end :]
@@ -144,7 +144,7 @@ class Verdict:
 def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> Verdict:
     """So many damaged copies, each into all commands, or so many of them in turn."""
     recorded(folder / "run", 0.6, 40_000)
-    content, verdict = (folder / "run" / RECORDING).read_bytes(), Verdict()
+    content, verdict = (folder / "run" / RECORDING_FILENAME).read_bytes(), Verdict()
     names = [name for name in COMMANDS if name != TRUTH]
     with forked(folder) as snakesim:
         for number in range(copies):
@@ -165,7 +165,7 @@ def _try(
         folder.mkdir()
         (folder / SPOILT).write_bytes(spoilt)
         (folder / WHOLE).write_bytes(content)
-        more = ["--endpoint", free_endpoint()] if name == "replay" else []
+        more = ["--endpoint", find_free_endpoint()] if name == "replay" else []
         outcome = snakesim(folder, *COMMANDS[name], *more)
         verdict.codes.setdefault(name, Counter())[outcome.code] += 1
         verdict.longest_cpu_s = max(verdict.longest_cpu_s, outcome.cpu_s)

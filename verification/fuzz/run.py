@@ -19,7 +19,7 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     Message,
 )
-from snakesim_testing.hal.authority_rig import Rig, armed
+from snakesim_testing.hal.authority_rig import AuthorityRig, make_armed_rig
 from snakesim_testing.hal.small_robots import PERIOD_NS
 from verification.fuzz.payloads import Maker
 from verification.fuzz.vitals import vitals
@@ -46,44 +46,44 @@ class Report:
         return self.resident_mb[-1] - self.resident_mb[0]
 
 
-def taken(hal: Rig, message: Message) -> str:
+def taken(hal: AuthorityRig, message: Message) -> str:
     """What became of a message to a HAL without a network, in a word."""
     authority = hal.authority
     answer: Answer
     match message:
         case JointCommand():
-            return authority.offer_command(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0) or "accepted"
+            return authority.process_command(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0) or "accepted"
         case JointState():
-            authority.observe(message)
+            authority.observe_joints(message)
             return "observed"
         case LeaseRequest():
-            answer = authority.on_lease(message, hal.now_ns)
+            answer = authority.handle_lease_request(message, hal.now_ns)
         case LifecycleRequest():
-            answer = authority.on_lifecycle(message, hal.now_ns)
+            answer = authority.handle_lifecycle_request(message, hal.now_ns)
         case EstopRequest():
-            answer = authority.on_estop(message, hal.tick)
+            answer = authority.handle_estop_request(message, hal.tick)
         case _:
             return "not for a HAL"
     assert ANSWERS.decode(encode(answer), format_encoding(Answer)) == answer
     return "yes" if answer.ok else "no"
 
 
-def pass_tick(hal: Rig) -> None:
+def pass_tick(hal: AuthorityRig) -> None:
     """The end of a tick."""
     hal.now_ns += PERIOD_NS // 4
     hal.tick += 1
-    hal.authority.check_deadlines(hal.now_ns, hal.tick)
-    assert all(abs(target) <= 5.0 for target in hal.authority.decide().setpoints.target)
+    hal.authority.latch_faults_and_expire_lease(hal.now_ns, hal.tick)
+    assert all(abs(target) <= 5.0 for target in hal.authority.compute_setpoints().setpoints.target)
 
 
 def run(payloads: int, seed: int) -> Report:
     """Raises whatever a decoder or the authority raises that it must not."""
     maker, report = Maker(random.Random(seed)), Report()
     decoders: dict[type[Message], Decoder[Any]] = {message: Decoder(message) for message in VERSIONS}
-    hal = armed()
+    hal = make_armed_rig()
     for number in range(payloads):
         if number % PER_ROBOT == 0:
-            hal = armed()
+            hal = make_armed_rig()
         sample = maker.make()
         outcomes = report.outcomes.setdefault(sample.kind, Counter())
         try:

@@ -76,7 +76,7 @@ class Withholding:
 
 def _is_known(request: FaultRequest) -> bool:
     try:
-        injection.check_injection(Injection(request.kind, request.target))
+        injection.validate_and_complete_injection(Injection(request.kind, request.target))
     except ConfigError:
         return False
     return True

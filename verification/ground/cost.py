@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 
 from snakesim_sim_backend.laws.version import LawsVersion
-from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build_sim_model
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
@@ -24,13 +24,13 @@ class TimedSnake:
 
     def __init__(self, robot: dict[str, Any], scene: dict[str, Any], laws: LawsVersion) -> None:
         config = make_config(robot, scene)
-        sim = build(config, SimSettings(), motors=False, laws=laws)
+        sim = build_sim_model(config, SimSettings(), motors=False, laws=laws)
         self._model = sim.model
         self._data = mujoco.MjData(sim.model)
         self._data.qpos[2] = config.robot.module.radius_m
         self._count = config.robot.chain.modules
         self._physics = Physics(sim, self._data)
-        self._physics.begin()
+        self._physics.reset()
         self._model.dof_damping[FREE_DOFS:] = 10.0
         self._step_count = 0
         self._step(WARM_UP_STEPS)

@@ -8,7 +8,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_testing.sim.gliding import FRICTION, SURFACES, Glider, glide_without_mujoco
 from snakesim_testing.sim.simulator_rig import G
-from snakesim_testing.sim.waves import Wave, momentum_balance, swim
+from snakesim_testing.sim.waves import Wave, integrate_momentum_balance, simulate_wave
 from verification.ground.cost import measure_medians_us
 from verification.ground.wheeled import ROLLING_FRICTION, TIRE_FRICTION, WHEELS, WheeledSnake
 
@@ -61,8 +61,8 @@ def compare_waves() -> list[str]:
     rows = ["| Law | Wave | Simulator, mm/s | Momentum balance, mm/s |", "|---|---|---|---|"]
     for law, (robot, ground, coefficients, viscous) in laws.items():
         for name, wave in WAVES.items():
-            ours = swim(wave, ground, robot).drift_mm_s
-            balance = momentum_balance(wave, coefficients, viscous).drift_mm_s
+            ours = simulate_wave(wave, ground, robot).drift_mm_s
+            balance = integrate_momentum_balance(wave, coefficients, viscous).drift_mm_s
             rows.append(f"| {law} | {name} | {ours:+.2f} | {balance:+.2f} |")
     return rows
 
@@ -121,9 +121,9 @@ def compare_wheels() -> list[str]:
         f"{creep_mm_s:.6f} | 0 | 0 |",
     ]
     for name, wave in WAVES.items():
-        ours = swim(wave, CLOTH, ON_WHEELS).drift_mm_s
-        middle = momentum_balance(wave, ROLLING, in_the_middle=True).drift_mm_s
-        separate = momentum_balance(wave, ROLLING, in_the_middle=True, separate_limits=True).drift_mm_s
+        ours = simulate_wave(wave, CLOTH, ON_WHEELS).drift_mm_s
+        middle = integrate_momentum_balance(wave, ROLLING, in_the_middle=True).drift_mm_s
+        separate = integrate_momentum_balance(wave, ROLLING, in_the_middle=True, separate_limits=True).drift_mm_s
         of_bodies = bodies.swim(wave).drift_mm_s
         rows.append(f"| drift of {name}, mm/s | {of_bodies:+.1f} | {ours:+.1f} | {middle:+.1f} | {separate:+.1f} |")
     return rows

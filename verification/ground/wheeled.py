@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from snakesim_testing.sim.simulator_rig import G, make_config
-from snakesim_testing.sim.waves import PERIODS, SERVO_NM_PER_RAD, SERVO_NM_S_PER_RAD, Track, Wave
+from snakesim_testing.sim.waves import PERIODS, SERVO_NM_PER_RAD, SERVO_NM_S_PER_RAD, BodyTrack, Wave
 
 TIRE_FRICTION = 0.6
 WHEEL_RADIUS_M = 0.03
@@ -80,7 +80,7 @@ class WheeledSnake:
                 conaffinity=0,
             )
 
-    def swim(self, wave: Wave) -> Track:
+    def swim(self, wave: Wave) -> BodyTrack:
         """Let the joints follow a wave."""
         data = self.data
         mujoco.mj_resetData(self.model, data)
@@ -97,7 +97,7 @@ class WheeledSnake:
             head_w = data.xpos[head] + self.lengths_m[-1] * data.xmat[head].reshape(3, 3)[:, 0]
             center[k] = data.subtree_com[tail, :2]
             axis[k] = (head_w - data.xpos[tail])[:2]
-        return Track(center, axis, STEP_S, wave.period_s)
+        return BodyTrack(center, axis, STEP_S, wave.period_s)
 
     def coast(self, speed_m_s: float, time_s: float) -> float:
         """Return the mean deceleration of the straight snake that rolls forward, in m/s²."""

@@ -19,11 +19,11 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from snakesim_operator.base.extras import BRINGS
-from snakesim_testing.benches.workbench import text_of_the_example
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_operator.base.extras import PACKAGES_BY_EXTRA
+from snakesim_testing.benches.workbench import read_example_from_docs
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Ended, call, environment
+from snakesim_testing.runs.command import CompletedRun, make_environment, run_to_end
 from snakesim_testing.runs.documents import REPOSITORY, UV, leave_out, needs_uv
 from verification.installation.distributions import required
 
@@ -46,8 +46,8 @@ def run(*command: object, cwd: Path, **more: str) -> str:
     return done.out
 
 
-def ended(*command: object, cwd: Path, **more: str) -> Ended:
-    return call(command, cwd, {**environment(cwd), "UV_OFFLINE": "1", **more}, 100.0)
+def ended(*command: object, cwd: Path, **more: str) -> CompletedRun:
+    return run_to_end(command, cwd, {**make_environment(cwd), "UV_OFFLINE": "1", **more}, 100.0)
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def check(installed: Installed, dependencies: Path, home: Path) -> None:
     names = {str(path.relative_to(library / "snakesim_hal" / "schemas")) for path in published}
     wanted = {str(path.relative_to(SCHEMAS)) for path in SCHEMAS.rglob("*.*")}
     assert names == wanted and all(path.is_file() for path in published)
-    flags = ("--controller", "hold", "--duration", "0.2", "--out", "run", "--endpoint", free_endpoint())
+    flags = ("--controller", "hold", "--duration", "0.2", "--out", "run", "--endpoint", find_free_endpoint())
     run(command, "run", "triplet", *flags, cwd=work, **more)
     assert (work / "run" / "report.html").is_file()
 
@@ -168,7 +168,7 @@ on_route = false
 [services.control]
 """
 WORKBENCH = ("alone.toml", "--backend", "./workbench.py:Workbench")
-Run = Callable[..., Ended]  # of one command, in an environment of its own
+Run = Callable[..., CompletedRun]  # of one command, in an environment of its own
 
 
 def lent(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
@@ -200,15 +200,15 @@ def at_work(command: Path, home: Path, **more: str) -> Run:
     work = home / "work"
     work.mkdir()
     (work / "alone.toml").write_text(ALONE)
-    (work / "workbench.py").write_text(text_of_the_example())
+    (work / "workbench.py").write_text(read_example_from_docs())
     return lambda *words: ended(command, *words, cwd=work, **more)
 
 
 def stops_and_arms(snakesim: Run) -> None:
     """Host and controller with a backend from a file, and a person at it."""
-    ran = snakesim("run", *WORKBENCH, "--no-record", "--out", "run", "--endpoint", free_endpoint())
+    ran = snakesim("run", *WORKBENCH, "--no-record", "--out", "run", "--endpoint", find_free_endpoint())
     assert ran.code == 0 and "report:  not written" in ran.out and "snakesim[record]" in ran.out, ran
-    at = ("--endpoint", free_endpoint())
+    at = ("--endpoint", find_free_endpoint())
     stays = threading.Thread(
         target=snakesim,
         args=("run", *WORKBENCH, "--clock-mode", "realtime", "--duration", "8", "--stay", "--no-record", *at),
@@ -231,7 +231,7 @@ def drives_modules(snakesim: Run) -> None:
         "backend.physics_model=inertia",
         "--no-record",
         "--endpoint",
-        free_endpoint(),
+        find_free_endpoint(),
     )
     ran = snakesim("run", "alone.toml", *drives)
     assert ran.code == 0, ran
@@ -300,8 +300,8 @@ def test_each_extra_brings_what_is_said_of_it() -> None:
     for package, names in packages_distributions().items():
         for name in names:
             imported_of.setdefault(name.lower(), set()).add(package)
-    assert {*Requirement(asked["all"][0]).extras} == {*asked} - {"all"} == {*BRINGS}
-    for extra, packages in BRINGS.items():
+    assert {*Requirement(asked["all"][0]).extras} == {*asked} - {"all"} == {*PACKAGES_BY_EXTRA}
+    for extra, packages in PACKAGES_BY_EXTRA.items():
         needed = [one for line in asked[extra] if (one := Requirement(line)).name != "snakesim"]
         names = {one.name.lower() for one in needed}
         names |= {name for one in needed for name in one.extras if name in imported_of}  # dask[distributed]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.programs.commands import Command, Commands
-from snakesim_testing.runs.command import Ended, call, environment
+from snakesim_testing.runs.command import CompletedRun, make_environment, run_to_end
 from snakesim_testing.runs.documents import REPOSITORY
 
 pytestmark = pytest.mark.e2e
@@ -55,8 +55,8 @@ def test_all_else_works_without(rooms: list[str], tmp_path: Path) -> None:
     library, work = without(rooms, tmp_path / "library"), tmp_path / "work"
     work.mkdir()
 
-    def run(*words: str) -> Ended:
-        return call([sys.executable, *words], work, {**environment(work), "PYTHONPATH": str(library)}, 100.0)
+    def run(*words: str) -> CompletedRun:
+        return run_to_end([sys.executable, *words], work, {**make_environment(work), "PYTHONPATH": str(library)}, 100.0)
 
     imported = run("-c", IMPORT_ALL)
     assert imported.code == 0 and str(library) in imported.out, imported.out + imported.err

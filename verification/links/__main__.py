@@ -54,7 +54,7 @@ def held(condition: Condition, trials: int) -> str:
     armed_s: list[float] = []
     ended: list[str] = []
     with tempfile.TemporaryDirectory() as folder, lab(Path(folder), f"rate_hz={condition.rate_hz}") as made:
-        made.link.make(loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s)
+        made.link.set_quality(loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s)
         for _ in range(trials):
             try:
                 made.arm(ARM_LIMIT_S)

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from snakesim_hal.model.scenario import RunConfig, load, parse_set, write_config
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, write_config
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.wire.messages import LifecycleRequest, Status
-from snakesim_testing.lab.machines import Machine, Radio, radio, wire
-from snakesim_testing.runs.command import SNAKESIM
+from snakesim_testing.lab.machines import Machine, RadioLink, connect_by_cable, connect_by_radio
+from snakesim_testing.runs.command import SNAKESIM_COMMAND
 
 SCENARIO = "triplet"
 CHANGES = ("clock_mode=realtime", "duration_s=86400")
@@ -26,12 +26,16 @@ class Lab:
 
     def __init__(self, folder: Path, stack: ExitStack, *changes: str) -> None:
         self.folder = folder
-        self.config: RunConfig = load(SCENARIO, [parse_set(text) for text in (*CHANGES, *changes)]).config
+        self.config: RunConfig = load_scenario(
+            SCENARIO, [parse_set_option(text) for text in (*CHANGES, *changes)]
+        ).config
         self._saved = folder / "config.json"
         write_config(self.config, self._saved)
         self.router_machine, self.robot, self.workstation = (Machine(stack) for _ in range(3))
-        wire(self.router_machine, self.robot, "robot", "10.77.1")
-        self.link: Radio = stack.enter_context(radio(self.router_machine, self.workstation, "workstation", "10.77.2"))
+        connect_by_cable(self.router_machine, self.robot, "robot", "10.77.1")
+        self.link: RadioLink = stack.enter_context(
+            connect_by_radio(self.router_machine, self.workstation, "workstation", "10.77.2")
+        )
         os.environ["XDG_STATE_HOME"] = str(folder)
         self.start_router()
         self.host = self._start_host()
@@ -43,7 +47,7 @@ class Lab:
                 "--router",
                 "tcp/10.77.2.1:7447",
             )
-            self.workstation.module(*arguments, log=folder / f"{name}.log")
+            self.workstation.start_module(*arguments, log=folder / f"{name}.log")
 
     def start_router(self) -> None:
         """A new router."""
@@ -54,13 +58,13 @@ class Lab:
             "tcp/0.0.0.0:7447",
             "--insecure",
         )
-        self._router = self.router_machine.module(*arguments, log=self.folder / "router.log", hurried=True)
+        self._router = self.router_machine.start_module(*arguments, log=self.folder / "router.log", hurried=True)
 
     def record(self) -> Path:
         """Start a recorder beside the controller, that reads everything; its file."""
         out = self.folder / "recording.mcap"
         arguments = ("record", "--out", str(out), "--router", "tcp/10.77.2.1:7447")
-        self.workstation.start(*SNAKESIM, *arguments, log=self.folder / "recorder.log")
+        self.workstation.start(*SNAKESIM_COMMAND, *arguments, log=self.folder / "recorder.log")
         return out
 
     def kill_router(self) -> None:
@@ -73,7 +77,7 @@ class Lab:
         with its:
             arguments = ("snakesim_hal.programs.host_program", str(self._saved), "--router", "tcp/10.77.1.1:7447")
             out = ("--out", str(self.folder), "--parent-socket", str(its.fileno()))
-            self.robot.module(*arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()])
+            self.robot.start_module(*arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()])
         return StarterEnd(ours)
 
     @property

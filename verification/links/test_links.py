@@ -35,10 +35,10 @@ def armed(made: Lab) -> None:
 
 def test_cut_link_stops_robot_and_restored_one_allows_arming(robot: Lab) -> None:
     armed(robot)
-    robot.link.make(cut=True)
+    robot.link.set_quality(cut=True)
     assert robot.until(lambda status: status.lifecycle == "fault", "stopped") < STOP_LIMIT_S
     time.sleep(3.0)  # longer than the session between router and workstation lives
-    robot.link.make()
+    robot.link.set_quality()
     robot.arm()
 
 
@@ -52,13 +52,13 @@ def test_dead_router_stops_robot_and_new_one_allows_arming(robot: Lab) -> None:
 
 
 def test_a_link_with_some_delay_keeps_the_robot_armed(robot: Lab) -> None:
-    robot.link.make(delay_s=0.005)
+    robot.link.set_quality(delay_s=0.005)
     try:
         armed(robot)
         time.sleep(1.0)
         assert robot.status is not None and robot.status.lifecycle == "armed"
     finally:
-        robot.link.make()
+        robot.link.set_quality()
 
 
 def test_slow_link_overloaded_by_images_stops_nothing(tmp_path: Path) -> None:

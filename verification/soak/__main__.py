@@ -14,7 +14,7 @@ import msgspec
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, LifecycleRequest, Message
-from snakesim_testing.harness.processes import processes_of
+from snakesim_testing.harness.processes import find_processes_of_run
 from snakesim_testing.harness.wait import wait_until
 from verification.faults.observer import TrialError
 from verification.fuzz.network import running_and_joined
@@ -175,7 +175,7 @@ class Operator:
         give_up = time.monotonic() + RECOVERY_S
         while True:
             try:
-                return self._watch.session.request(key, request, timeout_s=5.0)
+                return self._watch.session.send_request(key, request, timeout_s=5.0)
             except NotConnectedError as error:
                 if time.monotonic() > give_up:
                     return Answer(ok=False, reason=str(error), refusal="no_answer")
@@ -218,9 +218,9 @@ def soak(out: Path, minutes: float, seed: int, backend: str) -> Soak:
         found.violations += health.judge()
         found.health, found.heard = health.in_words(), watch.counts
     try:
-        wait_until(lambda: not processes_of(out), "all processes gone", 10.0)
+        wait_until(lambda: not find_processes_of_run(out), "all processes gone", 10.0)
     except AssertionError:
-        found.violations += [f"left behind: {pid} {line[:200]!r}" for pid, line in processes_of(out)]
+        found.violations += [f"left behind: {pid} {line[:200]!r}" for pid, line in find_processes_of_run(out)]
     found.violations += [
         f"in a log: {line}" for line in complaints(out) if any(word in line for word in ONLY_BEHIND_THE_ROBOT)
     ]

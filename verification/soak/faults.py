@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_hal.model.fault_kinds import KINDS, Injection, TargetType, check_injection
+from snakesim_hal.model.fault_kinds import FAULT_KINDS, Injection, TargetType, validate_and_complete_injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
 
@@ -53,8 +53,8 @@ class Event:
     @property
     def end_request(self) -> FaultRequest | None:
         """How a person ends it; None when it ends by itself, or has no end."""
-        about = KINDS[Injection(self.request.kind, self.request.target).target_type][self.request.kind]
-        if about.once or self.request.for_s is not None:
+        about = FAULT_KINDS[Injection(self.request.kind, self.request.target).target_type][self.request.kind]
+        if about.is_instantaneous or self.request.for_s is not None:
             return None
         return FaultRequest(kind=self.request.kind, target=self.request.target, end=True)
 
@@ -88,20 +88,22 @@ class Dice:
         dice = self._random
         while True:
             sort = dice.choice(SORTS)
-            kind = dice.choice(list(KINDS[sort]))
+            kind = dice.choice(list(FAULT_KINDS[sort]))
             target = dice.choice(self._targets[sort])
-            amount = dice.choice(AMOUNTS[kind]) if kind in AMOUNTS and KINDS[sort][kind].amount is not None else None
+            amount = (
+                dice.choice(AMOUNTS[kind]) if kind in AMOUNTS and FAULT_KINDS[sort][kind].amount is not None else None
+            )
             lasts_s, pause_s, by_itself = dice.choice(LASTS_S), dice.uniform(0.5, 3.0), dice.random() < 0.5
             if (sort, kind) in self._impossible or (kind == "corrupt" and target not in SPOILT_KEYS):
                 continue
-            injection = check_injection(Injection(kind, target, 0.0, lasts_s, amount))
-            once = injection.about.once
+            injection = validate_and_complete_injection(Injection(kind, target, 0.0, lasts_s, amount))
+            once = injection.kind_info.is_instantaneous
             by_itself |= (kind, target) == ("freeze", "host")  # nobody can ask for its end
             request = FaultRequest(
                 kind=kind, target=target, amount=amount, for_s=lasts_s if by_itself and not once else None
             )
             follows, names = _follows(injection)
-            return Event(number, pause_s, request, injection.part, 0.0 if once else lasts_s, follows, names)
+            return Event(number, pause_s, request, injection.executing_part, 0.0 if once else lasts_s, follows, names)
 
 
 def _follows(injection: Injection) -> tuple[Follows, tuple[str, ...]]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snakesim_testing.harness.processes import parts_of
+from snakesim_testing.harness.processes import find_run_processes
 from verification.fuzz.vitals import Vitals, vitals
 
 EVERY_S = 2.0
@@ -42,7 +42,7 @@ class Health:
         if now < self._due_s:
             return
         self._due_s = now + EVERY_S
-        found = parts_of(self._out)
+        found = find_run_processes(self._out)
         for name, pid in found.items():
             seen = vitals(pid)
             if seen is not None:

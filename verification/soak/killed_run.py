@@ -19,10 +19,10 @@ from snakesim_hal.network.stop_port import request_stop
 from snakesim_hal.run_log.host_record import HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
-from snakesim_operator.results.run_reader import SUMMARY
+from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from snakesim_operator.results.summary import RunSummary
-from snakesim_testing.harness.command import running
-from snakesim_testing.harness.processes import parts_of, processes_with
+from snakesim_testing.harness.command import running_snakesim
+from snakesim_testing.harness.processes import find_processes_with, find_run_processes
 
 Moment = Literal["starting", "arm_session", "armed", "stopping", "resetting", "interrupted", "ending"]
 MOMENTS: tuple[Moment, ...] = get_args(Moment)
@@ -126,7 +126,7 @@ class KilledRun:
 
     def go(self) -> Outcome:
         """Carry it out, wait for the end, and gather what is left."""
-        with running(self._out, *self._trial.arguments(), more={MARK: self._mark}) as run:
+        with running_snakesim(self._out, *self._trial.arguments(), extra_env={MARK: self._mark}) as run:
             self._process, self._endpoint = run.process, run.endpoint
             try:
                 with contextlib.ExitStack() as stack:
@@ -166,8 +166,8 @@ class KilledRun:
     def _join(self, stack: contextlib.ExitStack) -> bool:
         with contextlib.suppress(NotConnectedError):
             session = stack.enter_context(open_session(Link(self._endpoint, ROBOT), connect_timeout_s=0.2))
-            self._statuses = session.latched_reader(keys.STATUS, Status)
-            self._clocks = session.reader(keys.CLOCK, Clock)
+            self._statuses = session.declare_latched_reader(keys.STATUS, Status)
+            self._clocks = session.declare_reader(keys.CLOCK, Clock)
             self._session = session
         return self._session is not None
 
@@ -223,7 +223,7 @@ class KilledRun:
             self._outcome.interrupted |= name == SUPERVISOR and number in (signal.SIGINT, signal.SIGTERM)
 
     def _pid(self, name: str) -> int | None:
-        return self._process.pid if name == SUPERVISOR else parts_of(self._out).get(name)
+        return self._process.pid if name == SUPERVISOR else find_run_processes(self._out).get(name)
 
     def _interrupt(self) -> None:
         self._signal(SUPERVISOR, signal.SIGCONT)
@@ -242,14 +242,14 @@ class KilledRun:
                 host, _, port = self._endpoint.removeprefix("tcp/").rpartition(":")
                 self._outcome.stop_answered = request_stop(host, int(port), "kills", 3.0) is not None
             elif self._session is not None:
-                answer = self._session.request(keys.ESTOP, EstopRequest(requester="kills"), 3.0)
+                answer = self._session.send_request(keys.ESTOP, EstopRequest(requester="kills"), 3.0)
                 self._outcome.stop_answered = answer.ok
 
     def _ask_to_reset(self) -> None:
         if self._session is not None:
             with contextlib.suppress(NotConnectedError):
                 request = LifecycleRequest(action="reset", requester="kills")
-                self._outcome.reset_answered = self._session.request(keys.LIFECYCLE, request, 3.0).ok
+                self._outcome.reset_answered = self._session.send_request(keys.LIFECYCLE, request, 3.0).ok
 
     # --- after it ---------------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class KilledRun:
             self._process.kill()
             self._process.wait()
         deadline = time.monotonic() + GONE_LIMIT_S
-        while (left := processes_with("environ", f"{MARK}={self._mark}\0")) and time.monotonic() < deadline:
+        while (left := find_processes_with("environ", f"{MARK}={self._mark}\0")) and time.monotonic() < deadline:
             time.sleep(0.02)
         for pid, line in left:
             self._outcome.left_behind.append(f"{pid} {line[:200]}".replace("\0", " "))
@@ -282,5 +282,5 @@ class KilledRun:
         with contextlib.suppress(FileNotFoundError):
             outcome.record = msgspec.json.decode((self._out / HOST_RECORD).read_bytes(), type=HostRecord)
         with contextlib.suppress(FileNotFoundError):
-            outcome.summary = msgspec.json.decode((self._out / SUMMARY).read_bytes(), type=RunSummary)
+            outcome.summary = msgspec.json.decode((self._out / SUMMARY_FILENAME).read_bytes(), type=RunSummary)
         outcome.stop_kept = any(self._folder.glob("snakesim/robots/*/estop.json"))

@@ -7,13 +7,13 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Description, Fault, Mode, Status
-from snakesim_testing.hal.small_robots import description, state, status
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_status
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from verification.soak.faults import Dice
 from verification.soak.watch import Watch
 
-ROBOT = description()  # 5 rad/s at 100 Hz, and 0.3 rad from the measured angle at most
+ROBOT = make_description()  # 5 rad/s at 100 Hz, and 0.3 rad from the measured angle at most
 
 
 def applied(tick: int, target: float) -> AppliedCommand:
@@ -28,7 +28,9 @@ def applied(tick: int, target: float) -> AppliedCommand:
 
 
 def stopped(why: str, *causes: str) -> Status:
-    return status(tick=1, lifecycle="fault", reason=why, faults=[Fault(tick=1, what="hot", cause=c) for c in causes])
+    return make_status(
+        tick=1, lifecycle="fault", reason=why, faults=[Fault(tick=1, what="hot", cause=c) for c in causes]
+    )
 
 
 @pytest.mark.parametrize(
@@ -41,20 +43,20 @@ def stopped(why: str, *causes: str) -> Status:
     ],
 )
 def test_set_points_are_judged(targets: list[float], measured: list[float], found: str | None) -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
-        hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
+        hal.declare_latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
         watch = Watch(session)
-        watch.joints = {tick: state(ROBOT, angle, tick=tick) for tick, angle in enumerate(measured)}
+        watch.joints = {tick: make_joint_state(ROBOT, angle, tick=tick) for tick, angle in enumerate(measured)}
         for tick, target in enumerate(targets):
             watch.judge(applied(tick, target))
         assert any(found in violation for violation in watch.violations) if found else watch.violations == []
 
 
 def test_a_fault_that_is_not_explained_is_found() -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
-        watch, teller = Watch(session), hal.latched_publisher(keys.STATUS, Status)
+        watch, teller = Watch(session), hal.declare_latched_publisher(keys.STATUS, Status)
         for reported in (stopped("too hot", "too hot"), stopped("too hot"), stopped("", "too hot")):
             watch.status = None
             teller.put(reported)

@@ -27,16 +27,22 @@ class _WaveGait(Gait[GaitParametersT]):
 
     def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
-        self._yaw = self.find_joints("yaw")
-        self._pitch = self.find_joints("pitch")
-        self._from_head = np.arange(len(robot.joints))[::-1]  # (n_joints,), 0 at the head
+        self._yaw_joints = self.find_joints("yaw")
+        self._pitch_joints = self.find_joints("pitch")
+        self._joints_from_head = np.arange(len(robot.joints))[::-1]  # (n_joints,), 0 at the head
 
-    def _wave(self, joints: list[int], phase_rad: float, lag_rad: float) -> Floats:
-        """Return sin(phase - lag n) for joints that are n joints behind the head, (len(joints),).
+    def _compute_wave(self, joints: list[int], phase_rad: float, lag_rad: float) -> Floats:
+        """Compute sin(phase - lag n) for joints that are n joints behind the head; this wave travels to the tail.
 
-        The wave travels from the head to the tail.
+        Args:
+            joints: Indices of the joints, from the tail.
+            phase_rad: Phase of the wave at the head.
+            lag_rad: Phase of a joint behind the joint ahead of it.
+
+        Returns:
+            (len(joints),) values from -1 to 1.
         """
-        return np.sin(phase_rad - lag_rad * self._from_head[joints])
+        return np.sin(phase_rad - lag_rad * self._joints_from_head[joints])
 
 
 class SidewindingParameters(GaitParameters, frozen=True, kw_only=True):
@@ -69,12 +75,14 @@ class Sidewinding(_WaveGait[SidewindingParameters]):
 
     Parameters = SidewindingParameters
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        reference_rad = self.make_straight()
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        reference_rad = self.make_straight_angles_rad()
         lag_rad = self.parameters.lag_rad
-        reference_rad[self._yaw] = self.parameters.yaw_rad * self._wave(self._yaw, phase_rad, lag_rad)
-        reference_rad[self._pitch] = self.parameters.pitch_rad * self._wave(
-            self._pitch, phase_rad + 0.5 * math.pi, lag_rad
+        reference_rad[self._yaw_joints] = self.parameters.yaw_rad * self._compute_wave(
+            self._yaw_joints, phase_rad, lag_rad
+        )
+        reference_rad[self._pitch_joints] = self.parameters.pitch_rad * self._compute_wave(
+            self._pitch_joints, phase_rad + 0.5 * math.pi, lag_rad
         )
         return reference_rad
 
@@ -100,10 +108,10 @@ class Rolling(_WaveGait[RollingParameters]):
 
     Parameters = RollingParameters
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        reference_rad = self.make_straight()
-        reference_rad[self._yaw] = abs(self.parameters.bend_rad) * math.sin(phase_rad)
-        reference_rad[self._pitch] = self.parameters.bend_rad * math.cos(phase_rad)
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        reference_rad = self.make_straight_angles_rad()
+        reference_rad[self._yaw_joints] = abs(self.parameters.bend_rad) * math.sin(phase_rad)
+        reference_rad[self._pitch_joints] = self.parameters.bend_rad * math.cos(phase_rad)
         return reference_rad
 
 
@@ -135,18 +143,20 @@ class RaisedHead(_WaveGait[RaisedHeadParameters]):
     The body behind lies in a wave of its yaw joints, because a straight round body would roll over.
     """
 
-    _reason_to_stay = "it lifts its head, looks around, and travels nowhere"
+    _no_travel_reason = "it lifts its head, looks around, and travels nowhere"
 
     Parameters = RaisedHeadParameters
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        reference_rad = self.make_straight()
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        reference_rad = self.make_straight_angles_rad()
         # Positive pitch bends the head down. With one pitch joint only, nothing keeps the head level.
-        lift_joint = self._pitch[0] if len(self._pitch) == 1 else self._pitch[-2]
-        if len(self._pitch) > 1:
-            reference_rad[self._pitch[-1]] = self.parameters.lift_rad
+        lift_joint = self._pitch_joints[0] if len(self._pitch_joints) == 1 else self._pitch_joints[-2]
+        if len(self._pitch_joints) > 1:
+            reference_rad[self._pitch_joints[-1]] = self.parameters.lift_rad
         reference_rad[lift_joint] = -self.parameters.lift_rad
-        reference_rad[self._yaw] = self.parameters.stance_rad * self._wave(self._yaw, 0.0, self.parameters.lag_rad)
-        foremost_yaw_joint = self._yaw[-1]
+        reference_rad[self._yaw_joints] = self.parameters.stance_rad * self._compute_wave(
+            self._yaw_joints, 0.0, self.parameters.lag_rad
+        )
+        foremost_yaw_joint = self._yaw_joints[-1]
         reference_rad[foremost_yaw_joint] = self.parameters.look_rad * math.sin(phase_rad)
         return reference_rad

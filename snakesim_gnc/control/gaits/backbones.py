@@ -22,7 +22,7 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, GaitParametersT, Seconds
-from snakesim_gnc.control.gaits.body_curve import PHASES, BodyCurve
+from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_gnc.control.gaits.chain_fit import Backbone, KeyframeWaves, sample_by_arc_length
 from snakesim_gnc.control.gaits.serpenoid import Wavelength
 from snakesim_hal.base.arrays import Floats
@@ -31,10 +31,10 @@ from snakesim_hal.controller import ControllerCommand, Observation
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import bounded, from_zero
 
-DENSE_POINTS = 400  # of a curve, for its arc length
-MAX_DISTANCE = 0.05  # of a node from its place on the curve, in body lengths
+DENSE_POINT_COUNT = 400  # of a curve, for its arc length
+MAX_DEVIATION_RATIO = 0.05  # of a node from its place on the curve, in body lengths
 FIT_STEPS_PER_TICK = 3  # each takes about 0.5 ms
-FITTING = "it fits its joints to its curve"
+FITTING_REASON = "it fits its joints to its curve"
 MIN_ARC_RAD = 1e-3  # the bend of a straight body, as an arc
 
 
@@ -75,44 +75,48 @@ class _BackboneGait(Gait[GaitParametersT]):
 
     def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
-        self._places = find_node_fractions(robot)
+        self._point_fractions = compute_node_fractions(robot)
         self._length_m = sum(link.length_m for link in robot.links)
-        self._waves = KeyframeWaves(robot, self.find_backbone)
+        self._keyframe_waves = KeyframeWaves(robot, self.compute_backbone)
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Fit first, and then advance the gait while motion is requested."""
-        if not self._reason_to_hold and not self._waves.fit(FIT_STEPS_PER_TICK):
-            return self.hold(observation, FITTING)
+        if not self._hold_reason and not self._keyframe_waves.advance_fit(FIT_STEPS_PER_TICK):
+            return self.hold_and_report(observation, FITTING_REASON)
         return super().update(observation)
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        return self._waves.find_angles_rad(phase_rad)
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        return self._keyframe_waves.compute_joint_angles_rad(phase_rad)
 
     @abstractmethod
-    def find_backbone(self, phase_rad: float) -> Backbone:
+    def compute_backbone(self, phase_rad: float) -> Backbone:
         """Return the curve at a phase."""
 
-    def check_fit(self, setting: str) -> None:
-        """Fit at once, and check that the joints can form the curve.
+    def fit_and_validate(self, parameter_label: str) -> None:
+        """Fit the joints to the curve immediately, and check that the joints can form the curve.
 
         Args:
-            setting: what bends the body most, for the error, such as "control.bend_rad of 2 rad".
+            parameter_label: Name and value of the parameter that bends the body most, for the error message, such as
+                "control.bend_rad of 2 rad".
 
         Raises:
-            ConfigError: a node is far from the curve, or a joint turns beyond its limits.
+            ConfigError: A point of the body is too far from the curve, or a joint turns beyond its limits.
         """
-        if self._reason_to_hold:
-            return
-        self._waves.fit()
-        if self._waves.max_distance_m > MAX_DISTANCE * self._length_m:
+        if self._hold_reason:
+            return  # a robot without the necessary joints holds its pose, so there is nothing to fit
+        self._keyframe_waves.advance_fit()
+        deviation_m = self._keyframe_waves.max_deviation_m
+        max_deviation_m = MAX_DEVIATION_RATIO * self._length_m
+        if deviation_m > max_deviation_m:
             raise ConfigError(
-                f"{setting} makes a curve that the joints of this robot cannot form: a node of the body is "
-                f"{1e3 * self._waves.max_distance_m:.0f} mm from it, and {1e3 * MAX_DISTANCE * self._length_m:.0f} mm "
+                f"{parameter_label} makes a curve that the joints of this robot cannot form: a node of the body is "
+                f"{1e3 * deviation_m:.0f} mm from it, and {1e3 * max_deviation_m:.0f} mm "
                 "are allowed: reduce this parameter, or make the waves longer",
                 code="python/invalid-argument",
             )
-        shapes_rad = np.array([self._waves.find_angles_rad(phase) for phase in PHASES])
-        BodyCurve(self.robot, "yaw").check_limits(shapes_rad, setting)
+        shapes_rad = np.array([self._keyframe_waves.compute_joint_angles_rad(phase) for phase in CHECKED_PHASES_RAD])
+        # The limits of all joints are checked, whatever axis the curve has.
+        BodyCurve(self.robot, "yaw").check_limits(shapes_rad, parameter_label)
 
 
 class BackboneSidewinding(_BackboneGait[BackboneSidewindingParameters]):
@@ -128,10 +132,10 @@ class BackboneSidewinding(_BackboneGait[BackboneSidewindingParameters]):
             curve.check_wavelength(
                 parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it"
             )
-        cls(robot, parameters).check_fit(f"control.half_width of {parameters.half_width:g}")
+        cls(robot, parameters).fit_and_validate(f"control.half_width of {parameters.half_width:g}")
 
-    def find_backbone(self, phase_rad: float) -> Backbone:
-        return find_helix(self._places, self._length_m, self.parameters, phase_rad)
+    def compute_backbone(self, phase_rad: float) -> Backbone:
+        return compute_helix(self._point_fractions, self._length_m, self.parameters, phase_rad)
 
 
 class BackboneRolling(_BackboneGait[BackboneRollingParameters]):
@@ -142,72 +146,85 @@ class BackboneRolling(_BackboneGait[BackboneRollingParameters]):
     @classmethod
     def check(cls, robot: Description, parameters: BackboneRollingParameters) -> None:
         """Check that the joints can form the arc. Raises ConfigError."""
-        cls(robot, parameters).check_fit(f"control.bend_rad of {parameters.bend_rad:g} rad")
+        cls(robot, parameters).fit_and_validate(f"control.bend_rad of {parameters.bend_rad:g} rad")
 
-    def find_backbone(self, phase_rad: float) -> Backbone:
-        return find_arc(self._places, self._length_m, self.parameters.bend_rad, phase_rad)
+    def compute_backbone(self, phase_rad: float) -> Backbone:
+        return compute_arc(self._point_fractions, self._length_m, self.parameters.bend_rad, phase_rad)
 
 
-def find_node_fractions(robot: Description) -> Floats:
+def compute_node_fractions(robot: Description) -> Floats:
     """Return where the tail end, the joints and the head end are, as fractions of the body from the tail."""
     ends_m = np.cumsum([link.length_m for link in robot.links])
     return np.concatenate(([0.0], ends_m / ends_m[-1]))
 
 
-def find_helix(
-    places: Floats, length_m: float, parameters: BackboneSidewindingParameters, phase_rad: float
+def compute_helix(
+    point_fractions: Floats, length_m: float, parameters: BackboneSidewindingParameters, phase_rad: float
 ) -> Backbone:
     """Return the helix of sidewinding, from the tail to the head.
 
     Args:
-        places: (n,) fractions of the body from the tail.
-        length_m: of the body.
-        parameters: of the helix.
-        phase_rad: phi.
+        point_fractions: (n,) fractions of the body from the tail.
+        length_m: Length of the body.
+        parameters: Width, height and wavelength of the helix.
+        phase_rad: phi, the phase of the gait.
     """
     width = parameters.half_width
     height = parameters.half_height
     # Along one wave of arc length lambda: find the wavelength along the axis by bisection on the mean stretch.
     axis_wavelength = _find_axis_wavelength(parameters.wavelength, width, height)
     axis_length = axis_wavelength / parameters.wavelength
-    p = np.linspace(-0.6, 0.6, DENSE_POINTS) * axis_length
-    angle = math.tau * p / axis_wavelength + phase_rad
-    dense = np.stack([p, width * np.sin(angle), height * np.cos(angle)], axis=1)
-    steps = np.linalg.norm(np.diff(dense, axis=0), axis=1)
-    arc = np.concatenate(([0.0], np.cumsum(steps)))
-    begin = 0.5 * (arc[-1] - 1.0)
-    nodes = sample_by_arc_length(dense, (begin + places) / arc[-1])
-    return Backbone(length_m * nodes, np.array([0.0, 0.0, 1.0]))
+    p = np.linspace(-0.6, 0.6, DENSE_POINT_COUNT) * axis_length
+    angles_rad = math.tau * p / axis_wavelength + phase_rad
+    dense_points = np.stack([p, width * np.sin(angles_rad), height * np.cos(angles_rad)], axis=1)
+    segment_lengths = np.linalg.norm(np.diff(dense_points, axis=0), axis=1)
+    arc_lengths = np.concatenate(([0.0], np.cumsum(segment_lengths)))
+    start_arc_length = 0.5 * (arc_lengths[-1] - 1.0)
+    points = sample_by_arc_length(dense_points, (start_arc_length + point_fractions) / arc_lengths[-1])
+    return Backbone(length_m * points, np.array([0.0, 0.0, 1.0]))
 
 
-def find_arc(places: Floats, length_m: float, bend_rad: float, phase_rad: float) -> Backbone:
+def compute_arc(point_fractions: Floats, length_m: float, bend_rad: float, phase_rad: float) -> Backbone:
     """Return the arc of rolling, from the tail to the head, and the roll of its middle.
 
     Args:
-        places: (n,) fractions of the body from the tail.
-        length_m: of the body.
-        bend_rad: of the whole body.
+        point_fractions: (n,) fractions of the body from the tail.
+        length_m: Length of the body.
+        bend_rad: Angle between the tangents at tail and head; negative to roll to the other side.
         phase_rad: phi, the roll of the middle link.
     """
     arc_rad = max(abs(bend_rad), MIN_ARC_RAD)
     radius_m = length_m / arc_rad
-    angles = arc_rad * (places - 0.5)
-    nodes = np.stack([radius_m * np.sin(angles), radius_m * (1.0 - np.cos(angles)), np.zeros_like(angles)], axis=1)
+    angles_rad = arc_rad * (point_fractions - 0.5)
+    points = np.stack(
+        [radius_m * np.sin(angles_rad), radius_m * (1.0 - np.cos(angles_rad)), np.zeros_like(angles_rad)], axis=1
+    )
     roll_rad = math.copysign(phase_rad, bend_rad)
     roll_normal = np.array([0.0, -math.sin(roll_rad), math.cos(roll_rad)])
-    return Backbone(nodes, roll_normal)
+    return Backbone(points, roll_normal)
 
 
 def _find_axis_wavelength(arc_wavelength: float, width: float, height: float) -> float:
-    """Return the wavelength along the axis of a helix, by that along its arc. Both are fractions of the body."""
-    angles = np.linspace(0.0, math.tau, DENSE_POINTS)
-    low = 0.0
-    high = arc_wavelength
+    """Find the wavelength along the axis of a helix from the wavelength along its arc, by bisection.
+
+    Args:
+        arc_wavelength: Wavelength along the arc, as a fraction of the body length.
+        width: Half width of the helix, as a fraction of the body length.
+        height: Half height of the helix, as a fraction of the body length.
+
+    Returns:
+        Wavelength along the axis, as a fraction of the body length.
+    """
+    angles_rad = np.linspace(0.0, math.tau, DENSE_POINT_COUNT)
+    min_wavelength = 0.0
+    max_wavelength = arc_wavelength
     for _ in range(40):
-        middle = 0.5 * (low + high)
-        loop = np.stack([middle * angles / math.tau, width * np.sin(angles), height * np.cos(angles)], axis=1)
-        if np.linalg.norm(np.diff(loop, axis=0), axis=1).sum() > arc_wavelength:
-            high = middle
+        middle_wavelength = 0.5 * (min_wavelength + max_wavelength)
+        wave_points = np.stack(
+            [middle_wavelength * angles_rad / math.tau, width * np.sin(angles_rad), height * np.cos(angles_rad)], axis=1
+        )
+        if np.linalg.norm(np.diff(wave_points, axis=0), axis=1).sum() > arc_wavelength:
+            max_wavelength = middle_wavelength
         else:
-            low = middle
-    return 0.5 * (low + high)
+            min_wavelength = middle_wavelength
+    return 0.5 * (min_wavelength + max_wavelength)

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, TypeVar
 
 import numpy as np
 
-from snakesim_gnc.control.bumpless import BumplessReference
+from snakesim_gnc.control.bumpless import BumplessFollower
 from snakesim_gnc.control.gaits.body_curve import DIRECTIONS
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
@@ -37,7 +37,7 @@ class Gait(Controller[GaitParametersT]):
     _required_axes: ClassVar[tuple[Axis, ...]] = ("pitch", "yaw")
     """Axes of which the robot needs a joint. A robot without one holds its pose and reports the reason."""
 
-    _reason_to_stay: ClassVar[str] = ""
+    _no_travel_reason: ClassVar[str] = ""
     """Why the gait does not travel; empty for a gait that travels."""
 
     _blends_after_hold: ClassVar[bool] = True
@@ -48,49 +48,57 @@ class Gait(Controller[GaitParametersT]):
 
     def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
-        self._bumpless = BumplessReference(robot, parameters.blend_s)
+        self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
         self._phase_rad = 0.0
-        self._holding = False  # in the tick before
-        self._reason_to_hold = explain_missing_joints(robot, self._required_axes)
+        self._is_holding = False  # in the tick before
+        self._hold_reason = explain_missing_joints(robot, self._required_axes)
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Advance the gait while motion is requested; a robot without the necessary joints holds its pose."""
-        if self._reason_to_hold or not is_motion_requested(observation):
-            return self.hold(observation, self._reason_to_hold)
-        passed_rad = math.tau * observation.period_s / self.parameters.period_s
-        self._phase_rad += find_travel_sign(observation) * passed_rad
-        reference_rad = self.find_reference_rad(observation, self._phase_rad)
-        restarted = self._holding and self._blends_after_hold
-        self._holding = False
-        setpoints = self._bumpless.follow(observation, reference_rad, restarted=restarted)
+        if self._hold_reason or not is_motion_requested(observation):
+            return self.hold_and_report(observation, self._hold_reason)
+        phase_step_rad = math.tau * observation.period_s / self.parameters.period_s
+        self._phase_rad += get_travel_sign(observation) * phase_step_rad
+        reference_rad = self.compute_reference_rad(observation, self._phase_rad)
+        may_have_jumped = self._is_holding and self._blends_after_hold
+        self._is_holding = False
+        setpoints = self._bumpless_follower.make_setpoints(observation, reference_rad, may_have_jumped=may_have_jumped)
         telemetry = Telemetry(
-            reason=self._reason_to_stay, reference_rad=reference_rad.tolist(), custom=self.list_custom_numbers()
+            reason=self._no_travel_reason, reference_rad=reference_rad.tolist(), custom=self.list_custom_telemetry()
         )
         return ControllerCommand(setpoints, telemetry)
 
-    def hold(self, observation: Observation, reason: str) -> ControllerCommand:
-        """Keep every joint at its last reference, or at its pose if there was none. The reason is reported."""
-        self._holding = True
-        return self._bumpless.hold_pose(observation, reason)
+    def hold_and_report(self, observation: Observation, reason: str) -> ControllerCommand:
+        """Keep every joint at its last reference, or at its measured angle if it had none, and report the reason."""
+        self._is_holding = True
+        return self._bumpless_follower.hold_pose(observation, reason)
 
     @abstractmethod
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        """Return the angles of all joints, (n_joints,) tail to head, at a phase. It is called once a tick."""
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        """Compute the reference angles of all joints at a phase. It is called once a tick.
 
-    def list_custom_numbers(self) -> dict[str, float]:
-        """Return numbers of this tick for the telemetry, by names that end in their unit."""
+        Args:
+            observation: The inputs of this tick.
+            phase_rad: Phase of the gait, which grows by 2 pi in each period.
+
+        Returns:
+            (n_joints,) angles in rad, tail to head.
+        """
+
+    def list_custom_telemetry(self) -> dict[str, float]:
+        """Return additional values of this tick for the telemetry, by names that end in the unit."""
         return {}
 
     def find_joints(self, axis: Axis) -> list[int]:
         """Return the indices of all joints with an axis, tail to head."""
         return [i for i, joint in enumerate(self.robot.joints) if joint.axis == axis]
 
-    def make_straight(self) -> Floats:
+    def make_straight_angles_rad(self) -> Floats:
         """Return the angles of a straight body, (n_joints,)."""
         return np.zeros(len(self.robot.joints))
 
 
-def find_travel_sign(observation: Observation) -> float:
+def get_travel_sign(observation: Observation) -> float:
     """Return 1.0 for a trajectory that leads forward, and -1.0 for one that leads backward."""
     if observation.trajectory is None:
         return 1.0
@@ -99,8 +107,8 @@ def find_travel_sign(observation: Observation) -> float:
 
 def explain_missing_joints(robot: Description, required_axes: tuple[Axis, ...]) -> str:
     """Return why a robot cannot move by a gait that needs joints with these axes; empty if it can."""
-    present = {joint.axis for joint in robot.joints}
-    directions = [DIRECTIONS[axis] for axis in required_axes if axis not in present]
+    available_axes = {joint.axis for joint in robot.joints}
+    directions = [DIRECTIONS[axis] for axis in required_axes if axis not in available_axes]
     if not directions:
         return ""
     return f"this robot has no joints that turn {' and '.join(directions)}"

@@ -23,23 +23,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Axis, Description
 
 GROUP_LINKS = 6  # links that are fitted together: three yaw and three pitch joints
 FINAL_STEPS = 8  # Gauss-Newton steps of all joints, in the first keyframe
-NEXT_STEPS = 2  # the same in each other keyframe, from the one before it
+STEPS_PER_NEXT_KEYFRAME = 2  # the same in each other keyframe, from the one before it
 ROLL_WEIGHT = 1.0  # w
 ANGLE_WEIGHT = 0.02  # v
 DAMPING = 1e-6  # of a step, relative to the squared link length
-KEYFRAMES = 16
+KEYFRAME_COUNT = 16
 
 
 @dataclass(frozen=True)
 class Backbone:
     """A curve at one phase, as the places that the nodes of a chain should have."""
 
-    nodes: Floats  # (n_joints + 2, 3) m, tail end to head end
+    node_positions: Floats  # (n_joints + 2, 3) m, tail end to head end
     roll_normal: Floats  # (3,) unit vector that the middle link's y axis must be perpendicular to
 
 
@@ -49,8 +49,8 @@ class ChainFit:
     def __init__(self, robot: Description) -> None:
         self._axes: list[Axis] = [joint.axis for joint in robot.joints]
         self._lengths_m = np.array([link.length_m for link in robot.links])
-        self._link_m = float(self._lengths_m.mean())
-        self._middle = len(self._axes) // 2
+        self._mean_link_length_m = float(self._lengths_m.mean())
+        self._middle_link = len(self._axes) // 2
 
         # The state of the fit.
         self.angles_rad = np.zeros(len(self._axes))
@@ -58,84 +58,104 @@ class ChainFit:
         self._rotation = np.eye(3)
 
     def fit_first(self, backbone: Backbone) -> Iterator[None]:
-        """Fit from the tail to the head, group after group, and then all joints together. Yields after each step."""
-        self._position = backbone.nodes[0].copy()
-        self._rotation = _find_first_rotation(backbone)
+        """Fit the chain to a curve from the tail to the head, group after group, and then all joints together.
+
+        Yields:
+            None after each Gauss-Newton step.
+        """
+        self._position = backbone.node_positions[0].copy()
+        self._rotation = _compute_initial_rotation(backbone)
         self.angles_rad = np.zeros(len(self._axes))
         joint_count = len(self._axes)
         for end in range(2, joint_count + 1):
-            self._improve(backbone, max(end - GROUP_LINKS, 0), end)
+            self._do_gauss_newton_step(backbone, max(end - GROUP_LINKS, 0), end)
             yield
         for _ in range(FINAL_STEPS):
-            self._improve(backbone, 0, joint_count)
+            self._do_gauss_newton_step(backbone, 0, joint_count)
             yield
 
     def fit_next(self, backbone: Backbone) -> Iterator[None]:
-        """Fit a curve that differs little from the last one. Yields after each step."""
-        for _ in range(NEXT_STEPS):
-            self._improve(backbone, 0, len(self._axes))
+        """Fit the chain to a curve that differs little from the last one.
+
+        Yields:
+            None after each Gauss-Newton step.
+        """
+        for _ in range(STEPS_PER_NEXT_KEYFRAME):
+            self._do_gauss_newton_step(backbone, 0, len(self._axes))
             yield
 
-    def find_nodes(self) -> Floats:
-        """Return the nodes of the fitted chain, (n_joints + 2, 3) m."""
-        origins, rotations = self._find_frames()
+    def compute_node_positions(self) -> Floats:
+        """Compute tail end, joints and head end of the fitted chain, (n_joints + 2, 3) in m."""
+        origins, rotations = self._compute_link_frames()
         return np.vstack([origins, origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]])
 
-    def _find_frames(self) -> tuple[Floats, Floats]:
-        return link_frames(self._position, self._rotation, self.angles_rad, self._axes, self._lengths_m.tolist())
+    def _compute_link_frames(self) -> tuple[Floats, Floats]:
+        return compute_link_frames(
+            self._position, self._rotation, self.angles_rad, self._axes, self._lengths_m.tolist()
+        )
 
-    def _improve(self, backbone: Backbone, first: int, end: int) -> None:
-        """Do one Gauss-Newton step of the joints `first` to `end`, and of the base if the group begins at the tail."""
-        origins, rotations = self._find_frames()
-        nodes = np.vstack([origins, origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]])[: end + 2]
-        with_base = first == 0
-        pivots = origins[first + 1 : end + 1]  # (k, 3) of the joints
-        columns = [0 if axis == "pitch" else 1 for axis in self._axes[first:end]]
+    def _do_gauss_newton_step(self, backbone: Backbone, first_joint: int, end_joint: int) -> None:
+        """Do one Gauss-Newton step of a group of joints, and of the base if the group begins at the tail.
+
+        Args:
+            backbone: The curve that the chain is fitted to.
+            first_joint: Index of the first joint of the group, from the tail.
+            end_joint: Index after the last joint of the group.
+        """
+        origins, rotations = self._compute_link_frames()
+        points = np.vstack([origins, origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]])[: end_joint + 2]
+        includes_base = first_joint == 0
+        pivots = origins[first_joint + 1 : end_joint + 1]  # (k, 3) of the joints
+        columns = [0 if axis == "pitch" else 1 for axis in self._axes[first_joint:end_joint]]
         axes = np.array(
-            [rotations[first + 1 + k][:, 2 if column else 1] for k, column in enumerate(columns)]
+            [rotations[first_joint + 1 + k][:, 2 if column else 1] for k, column in enumerate(columns)]
         )  # (k, 3) of rotation, unit
 
         # Derivatives of the nodes and of the middle link's y axis by rotations about points.
-        angles = self.angles_rad[first:end]
-        turned = np.cross(axes[:, None, :], nodes[None, :, :] - pivots[:, None, :])  # (k, n, 3)
-        behind = np.arange(len(nodes))[None, :] <= np.arange(first + 1, end + 1)[:, None]
-        turned[behind] = 0.0
-        rolled = np.cross(axes, rotations[self._middle][:, 1])  # (k, 3)
-        rolled[np.arange(first, end) >= self._middle] = 0.0
-        residual = [(nodes - backbone.nodes[: end + 2]).ravel()]
-        rows = [turned.reshape(len(angles), -1).T]
-        if with_base:
-            base_turned = np.cross(np.eye(3)[:, None, :], nodes[None, :, :] - self._position)  # (3, n, 3)
-            base_moved = np.broadcast_to(np.eye(3)[:, None, :], (3, len(nodes), 3))
-            rows[0] = np.hstack([rows[0], base_turned.reshape(3, -1).T, base_moved.reshape(3, -1).T])
-        width = rows[0].shape[1]
+        angles = self.angles_rad[first_joint:end_joint]
+        point_derivatives = np.cross(axes[:, None, :], points[None, :, :] - pivots[:, None, :])  # (k, n, 3)
+        is_behind_joint = np.arange(len(points))[None, :] <= np.arange(first_joint + 1, end_joint + 1)[:, None]
+        point_derivatives[is_behind_joint] = 0.0
+        middle_y_derivatives = np.cross(axes, rotations[self._middle_link][:, 1])  # (k, 3)
+        middle_y_derivatives[np.arange(first_joint, end_joint) >= self._middle_link] = 0.0
+        residuals = [(points - backbone.node_positions[: end_joint + 2]).ravel()]
+        rows = [point_derivatives.reshape(len(angles), -1).T]
+        if includes_base:
+            base_rotation_derivatives = np.cross(
+                np.eye(3)[:, None, :], points[None, :, :] - self._position
+            )  # (3, n, 3)
+            base_translation_derivatives = np.broadcast_to(np.eye(3)[:, None, :], (3, len(points), 3))
+            rows[0] = np.hstack(
+                [rows[0], base_rotation_derivatives.reshape(3, -1).T, base_translation_derivatives.reshape(3, -1).T]
+            )
+        unknown_count = rows[0].shape[1]
 
         # The roll, once the chain reaches its middle.
-        if end > self._middle:
-            weight_m = ROLL_WEIGHT * self._link_m
-            roll_row = np.zeros(width)
-            roll_row[: len(angles)] = weight_m * rolled @ backbone.roll_normal
-            if with_base:
-                middle_y = rotations[self._middle][:, 1]
+        if end_joint > self._middle_link:
+            weight_m = ROLL_WEIGHT * self._mean_link_length_m
+            roll_row = np.zeros(unknown_count)
+            roll_row[: len(angles)] = weight_m * middle_y_derivatives @ backbone.roll_normal
+            if includes_base:
+                middle_y = rotations[self._middle_link][:, 1]
                 roll_row[len(angles) : len(angles) + 3] = (
                     weight_m * np.cross(np.eye(3), middle_y) @ backbone.roll_normal
                 )
             rows.append(roll_row[None, :])
-            residual.append(np.array([weight_m * rotations[self._middle][:, 1] @ backbone.roll_normal]))
+            residuals.append(np.array([weight_m * rotations[self._middle_link][:, 1] @ backbone.roll_normal]))
 
         # The angles.
-        weight_m = ANGLE_WEIGHT * self._link_m
-        rows.append(np.hstack([weight_m * np.eye(len(angles)), np.zeros((len(angles), width - len(angles)))]))
-        residual.append(weight_m * angles)
+        weight_m = ANGLE_WEIGHT * self._mean_link_length_m
+        rows.append(np.hstack([weight_m * np.eye(len(angles)), np.zeros((len(angles), unknown_count - len(angles)))]))
+        residuals.append(weight_m * angles)
 
         jacobian = np.vstack(rows)
-        normal = jacobian.T @ jacobian + DAMPING * self._link_m**2 * np.eye(width)
-        step = -np.linalg.solve(normal, jacobian.T @ np.concatenate(residual))
-        self.angles_rad[first:end] += step[: len(angles)]
-        if with_base:
-            turned_base: Floats = np.array(step[len(angles) : len(angles) + 3], dtype=np.float64)
-            self._rotation = _rotate(turned_base) @ self._rotation
-            self._position = self._position + step[len(angles) + 3 :]
+        normal_matrix = jacobian.T @ jacobian + DAMPING * self._mean_link_length_m**2 * np.eye(unknown_count)
+        solution_step = -np.linalg.solve(normal_matrix, jacobian.T @ np.concatenate(residuals))
+        self.angles_rad[first_joint:end_joint] += solution_step[: len(angles)]
+        if includes_base:
+            base_rotation_step: Floats = np.array(solution_step[len(angles) : len(angles) + 3], dtype=np.float64)
+            self._rotation = _make_rotation(base_rotation_step) @ self._rotation
+            self._position = self._position + solution_step[len(angles) + 3 :]
 
 
 class KeyframeWaves:
@@ -144,85 +164,97 @@ class KeyframeWaves:
     The fit takes some tens of milliseconds, so a controller distributes its steps over control cycles.
     """
 
-    def __init__(self, robot: Description, find_backbone: Callable[[float], Backbone], phases: int = KEYFRAMES) -> None:
-        """Prepare the fit.
+    def __init__(
+        self, robot: Description, compute_backbone: Callable[[float], Backbone], phase_count: int = KEYFRAME_COUNT
+    ) -> None:
+        """Prepare to fit the joints of a robot to the keyframes of a gait; `advance_fit` does the steps.
 
         Args:
-            robot: description of the robot.
-            find_backbone: returns the curve at a phase in rad; it must have the period 2 pi.
-            phases: number of keyframes, which must be even.
+            robot: Description of the robot.
+            compute_backbone: Returns the curve at a phase in rad; it must have the period 2 pi.
+            phase_count: Number of keyframes, which must be even.
         """
-        self.fitted = False
-        self.keyframes_rad = np.zeros((phases, len(robot.joints)))
-        self.max_distance_m = 0.0  # of any node from its place on the curve
+        self.is_fitted = False
+        self.keyframes_rad = np.zeros((phase_count, len(robot.joints)))
+        self.max_deviation_m = 0.0  # of any node from its place on the curve
         self._chain = ChainFit(robot)
-        self._find_backbone = find_backbone
+        self._compute_backbone = compute_backbone
         self._steps = self._fit_keyframes()
-        self._orders: Floats = np.arange(phases // 2 + 1.0)
+        self._orders: Floats = np.arange(phase_count // 2 + 1.0)
         self._cosines: Floats = np.zeros((len(self._orders), len(robot.joints)))
         self._sines: Floats = np.zeros_like(self._cosines)
 
-    def fit(self, steps: int | None = None) -> bool:
-        """Do some steps of the fit, or all that are left, and return whether the keyframes are complete."""
-        done = 0
-        while not self.fitted and done != steps:
-            if next(self._steps, "finished") == "finished":
-                self._extract_waves()
-            done += 1
-        return self.fitted
+    def advance_fit(self, steps: int | None = None) -> bool:
+        """Do some steps of the fit, and compute the Fourier series when all keyframes are complete.
 
-    def find_angles_rad(self, phase_rad: float) -> Floats:
-        """Return the angles of all joints at a phase, (n_joints,); the keyframes must be complete."""
-        turned: Floats = self._orders * phase_rad
-        angles_rad: Floats = np.cos(turned) @ self._cosines + np.sin(turned) @ self._sines
+        Args:
+            steps: Maximum number of Gauss-Newton steps; None to complete the fit.
+
+        Returns:
+            Whether the keyframes are complete.
+        """
+        done_count = 0
+        while not self.is_fitted and done_count != steps:
+            if next(self._steps, "finished") == "finished":
+                self._compute_fourier_series()
+            done_count += 1
+        return self.is_fitted
+
+    def compute_joint_angles_rad(self, phase_rad: float) -> Floats:
+        """Evaluate the Fourier series of all joints at a phase, (n_joints,) in rad. The fit must be complete."""
+        order_phases_rad: Floats = self._orders * phase_rad
+        angles_rad: Floats = np.cos(order_phases_rad) @ self._cosines + np.sin(order_phases_rad) @ self._sines
         return angles_rad
 
     def _fit_keyframes(self) -> Iterator[None]:
+        """Fit the chain at each phase, starting from the fit before it. Yields None after each Gauss-Newton step."""
         chain = self._chain
-        phases = len(self.keyframes_rad)
-        for number in range(phases):
-            backbone = self._find_backbone(2.0 * np.pi * number / phases)
-            yield from chain.fit_next(backbone) if number else chain.fit_first(backbone)
-            self.keyframes_rad[number] = chain.angles_rad
-            distances_m = np.linalg.norm(chain.find_nodes() - backbone.nodes, axis=1)
-            self.max_distance_m = max(self.max_distance_m, float(distances_m.max()))
+        phase_count = len(self.keyframes_rad)
+        for keyframe_index in range(phase_count):
+            backbone = self._compute_backbone(2.0 * np.pi * keyframe_index / phase_count)
+            yield from chain.fit_next(backbone) if keyframe_index else chain.fit_first(backbone)
+            self.keyframes_rad[keyframe_index] = chain.angles_rad
+            distances_m = np.linalg.norm(chain.compute_node_positions() - backbone.node_positions, axis=1)
+            self.max_deviation_m = max(self.max_deviation_m, float(distances_m.max()))
 
-    def _extract_waves(self) -> None:
+    def _compute_fourier_series(self) -> None:
         """Compute the Fourier series. The highest order of an even number of keyframes has no sine."""
-        phases = len(self.keyframes_rad)
-        series = np.fft.rfft(self.keyframes_rad, axis=0) / phases
+        phase_count = len(self.keyframes_rad)
+        series = np.fft.rfft(self.keyframes_rad, axis=0) / phase_count
         series[1:-1] *= 2.0
         self._cosines = np.array(series.real, dtype=np.float64)
         self._sines = np.array(-series.imag, dtype=np.float64)
-        self.fitted = True
+        self.is_fitted = True
 
 
-def sample_by_arc_length(points: Floats, places: Sequence[float] | Floats) -> Floats:
+def sample_by_arc_length(points: Floats, fractions: Sequence[float] | Floats) -> Floats:
     """Return the points of a curve at fractions of its arc length.
 
     Args:
         points: (n, 3) dense points of the curve.
-        places: (m,) fractions, 0 at the first point.
+        fractions: (m,) fractions of the arc length, 0 at the first point and 1 at the last.
 
     Returns:
-        (m, 3).
+        (m, 3) points of the curve.
     """
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    arc = np.concatenate(([0.0], np.cumsum(steps)))
-    return np.stack([np.interp(np.asarray(places) * arc[-1], arc, points[:, k]) for k in range(3)], axis=1)
+    segment_lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    arc_lengths = np.concatenate(([0.0], np.cumsum(segment_lengths)))
+    return np.stack(
+        [np.interp(np.asarray(fractions) * arc_lengths[-1], arc_lengths, points[:, k]) for k in range(3)], axis=1
+    )
 
 
-def _find_first_rotation(backbone: Backbone) -> Floats:
-    """Return a base whose x axis is along the beginning of the curve, and whose y axis is as the roll wants it."""
-    x = backbone.nodes[1] - backbone.nodes[0]
+def _compute_initial_rotation(backbone: Backbone) -> Floats:
+    """Return a rotation matrix whose x axis is along the start of the curve, and whose y axis fits the roll normal."""
+    x = backbone.node_positions[1] - backbone.node_positions[0]
     x /= np.linalg.norm(x)
     y = np.cross(backbone.roll_normal, x)
     y /= np.linalg.norm(y)
     return np.stack([x, y, np.cross(x, y)], axis=1).astype(np.float64)
 
 
-def _rotate(vector: Floats) -> Floats:
-    """Return the rotation by a vector (3,), whose length is the angle in rad (Rodrigues)."""
+def _make_rotation(vector: Floats) -> Floats:
+    """Return the matrix (3, 3) of the rotation about a vector (3,), whose length is the angle in rad (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:
         return np.eye(3)

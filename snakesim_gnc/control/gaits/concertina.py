@@ -22,7 +22,7 @@ import numpy as np
 from msgspec import Meta
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds
-from snakesim_gnc.control.gaits.body_curve import PHASES, BodyCurve
+from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import Description
@@ -45,15 +45,15 @@ class ConcertinaParameters(GaitParameters, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
 
-def find_fold_fractions(phase_rad: float) -> tuple[float, float]:
+def compute_fold_fractions(phase_rad: float) -> tuple[float, float]:
     """Return u_f and u_r, 0 for an extended half to 1 for a folded one, at a phase of the cycle."""
-    step = 3.0 * (phase_rad / math.tau % 1.0)
-    rise = 0.5 - 0.5 * math.cos(math.pi * (step % 1.0))
-    if step < 1.0:
-        return rise, 1.0 - rise
-    if step < 2.0:
-        return 1.0, rise
-    return 1.0 - rise, 1.0
+    cycle_step = 3.0 * (phase_rad / math.tau % 1.0)
+    rising_fraction = 0.5 - 0.5 * math.cos(math.pi * (cycle_step % 1.0))
+    if cycle_step < 1.0:
+        return rising_fraction, 1.0 - rising_fraction
+    if cycle_step < 2.0:
+        return 1.0, rising_fraction
+    return 1.0 - rising_fraction, 1.0
 
 
 class Concertina(Gait[ConcertinaParameters]):
@@ -67,19 +67,19 @@ class Concertina(Gait[ConcertinaParameters]):
         """Check that the joints can form the folds. Raises ConfigError."""
         curve = BodyCurve(robot, "yaw")
         curve.check_wavelength(0.5 / parameters.folds, f"control.folds of {parameters.folds}", "reduce it")
-        shapes_rad = np.array([_find_angles_rad(curve, parameters, phase) for phase in PHASES])
+        shapes_rad = np.array([_compute_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD])
         curve.check_limits(shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad")
 
     def __init__(self, robot: Description, parameters: ConcertinaParameters) -> None:
         super().__init__(robot, parameters)
         self._curve = BodyCurve(robot, "yaw")
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        return _find_angles_rad(self._curve, self.parameters, phase_rad)
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        return _compute_angles_rad(self._curve, self.parameters, phase_rad)
 
 
-def _find_angles_rad(curve: BodyCurve, parameters: ConcertinaParameters, phase_rad: float) -> Floats:
-    front, rear = find_fold_fractions(phase_rad)
-    folded = np.where(curve.from_head < 0.5, front, rear)
-    waves = np.sin(math.tau * parameters.folds * 2.0 * curve.from_head)
-    return curve.find_angles_rad(parameters.winding_angle_rad * np.sqrt(folded) * waves)
+def _compute_angles_rad(curve: BodyCurve, parameters: ConcertinaParameters, phase_rad: float) -> Floats:
+    front, rear = compute_fold_fractions(phase_rad)
+    fold_fractions = np.where(curve.head_distance_fractions < 0.5, front, rear)
+    waves = np.sin(math.tau * parameters.folds * 2.0 * curve.head_distance_fractions)
+    return curve.compute_joint_angles_rad(parameters.winding_angle_rad * np.sqrt(fold_fractions) * waves)

@@ -32,7 +32,7 @@ from typing import Annotated
 
 import numpy as np
 
-from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds, find_travel_sign
+from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds, get_travel_sign
 from snakesim_gnc.control.gaits.body_curve import BodyCurve
 from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
 from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, check_serpenoid
@@ -86,52 +86,61 @@ class Oscillators:
     """Two chains of oscillators, left and right. All arrays are (2, n_joints): left and right, tail to head."""
 
     def __init__(self, phase_bias_rad: Floats, coupling: float, amplitude_rate: float) -> None:
-        """Start with the phases of the traveling wave, and with amplitudes of zero.
+        """Create the oscillators of all joints with the phases of the traveling wave, and with amplitudes of zero.
 
         Args:
             phase_bias_rad: (n_joints,) phases of the left chain on the limit cycle.
-            coupling: w, 1/(rad s).
-            amplitude_rate: a, 1/s.
+            coupling: Weight w of the coupling, 1/(rad s).
+            amplitude_rate: Rate a at which amplitudes approach their limits, 1/s.
         """
         self.theta_rad = np.stack([phase_bias_rad, phase_bias_rad + math.pi])
         self.r_rad = np.zeros_like(self.theta_rad)
-        self._r_rate_rad_s = np.zeros_like(self.theta_rad)
+        self._r_velocity_rad_s = np.zeros_like(self.theta_rad)
         self._bias_step_rad = np.diff(phase_bias_rad)  # from each joint to the one ahead of it
         self._w = coupling
         self._a = amplitude_rate
 
-    def advance(self, passed_s: float, turn_rad_s: float, limit_rad: Floats, feedback_rad_s: Floats) -> None:
-        """Integrate over a time, in Euler steps of at most MAX_STEP_S.
+    def integrate(
+        self, elapsed_s: float, intrinsic_frequency_rad_s: float, amplitude_limit_rad: Floats, feedback_rad_s: Floats
+    ) -> None:
+        """Integrate the equations of the oscillators over a time, in Euler steps of at most MAX_STEP_S.
 
         Args:
-            passed_s: the time.
-            turn_rad_s: 2 pi nu; negative: the wave travels to the head.
-            limit_rad: R, (2, n_joints).
-            feedback_rad_s: (2, n_joints).
+            elapsed_s: Time since the last call.
+            intrinsic_frequency_rad_s: Frequency 2 pi nu without coupling; negative for a wave that travels to the head.
+            amplitude_limit_rad: (2, n_joints) amplitudes R that the amplitudes r approach.
+            feedback_rad_s: (2, n_joints) terms feedback_i that are added to the phase rates.
         """
-        steps = math.ceil(passed_s / MAX_STEP_S)
-        for _ in range(steps):
-            step_s = passed_s / steps
-            r_acceleration = self._a * (0.25 * self._a * (limit_rad - self.r_rad) - self._r_rate_rad_s)
-            self.theta_rad = self.theta_rad + step_s * (turn_rad_s + self._couple() + feedback_rad_s)
-            self._r_rate_rad_s = self._r_rate_rad_s + step_s * r_acceleration
-            self.r_rad = self.r_rad + step_s * self._r_rate_rad_s
+        step_count = math.ceil(elapsed_s / MAX_STEP_S)
+        for _ in range(step_count):
+            step_s = elapsed_s / step_count
+            r_acceleration = self._a * (0.25 * self._a * (amplitude_limit_rad - self.r_rad) - self._r_velocity_rad_s)
+            self.theta_rad = self.theta_rad + step_s * (
+                intrinsic_frequency_rad_s + self._compute_coupling_rad_s() + feedback_rad_s
+            )
+            self._r_velocity_rad_s = self._r_velocity_rad_s + step_s * r_acceleration
+            self.r_rad = self.r_rad + step_s * self._r_velocity_rad_s
 
-    def find_angles_rad(self) -> Floats:
-        """Return x_left - x_right of every joint, (n_joints,)."""
+    def compute_joint_angles_rad(self) -> Floats:
+        """Return the joint angles x_left - x_right, (n_joints,) in rad."""
         left_rad, right_rad = self.r_rad * (1.0 + np.cos(self.theta_rad))
         return left_rad - right_rad
 
-    def _couple(self) -> Floats:
-        """Return sum_j r_j w_ij sin(theta_j - theta_i - phi_ij) of the neighbors and of the other side."""
+    def _compute_coupling_rad_s(self) -> Floats:
+        """Return the coupling terms sum_j r_j w_ij sin(theta_j - theta_i - phi_ij), (2, n_joints) in rad/s.
+
+        j are the neighbors of oscillator i on its side, and the oscillator on the other side of its joint.
+        """
         theta = self.theta_rad
         r = self.r_rad
-        ahead = np.sin(np.diff(theta, axis=1) - self._bias_step_rad)  # of the joint ahead, as seen from each joint
-        across = np.sin(theta[::-1] - theta - math.pi)
-        total = r[::-1] * across
-        total[:, :-1] += r[:, 1:] * ahead
-        total[:, 1:] -= r[:, :-1] * ahead
-        return self._w * total
+        ahead_terms = np.sin(
+            np.diff(theta, axis=1) - self._bias_step_rad
+        )  # of the joint ahead, as seen from each joint
+        across_terms = np.sin(theta[::-1] - theta - math.pi)
+        coupling_terms = r[::-1] * across_terms
+        coupling_terms[:, :-1] += r[:, 1:] * ahead_terms
+        coupling_terms[:, 1:] -= r[:, :-1] * ahead_terms
+        return self._w * coupling_terms
 
 
 class Cpg(Gait[CpgParameters]):
@@ -146,6 +155,12 @@ class Cpg(Gait[CpgParameters]):
         check_serpenoid(robot, parameters.winding_angle_rad, parameters.wavelength)
 
     def __init__(self, robot: Description, parameters: CpgParameters) -> None:
+        """Create the oscillators whose limit cycle is the serpenoid curve, and the heading control.
+
+        Args:
+            robot: Description of the robot, whose yaw joints get two oscillators each.
+            parameters: Parameters of the curve, the oscillators, the feedback and the steering.
+        """
         super().__init__(robot, parameters)
         self._curve = BodyCurve(robot, "yaw")
         self._heading_control = HeadingControl(
@@ -153,9 +168,9 @@ class Cpg(Gait[CpgParameters]):
             k_theta=parameters.k_theta,
             look_ahead=parameters.look_ahead,
             max_bend_rad=parameters.max_bend_rad,
-            filter_s=parameters.period_s,
+            time_constant_s=parameters.period_s,
         )
-        from_head = self._curve.from_head
+        from_head = self._curve.head_distance_fractions
         piece_distance = from_head[:-1] - from_head[1:]  # (n_yaw,) l of every joint
         joint_from_head = 0.5 * (from_head[:-1] + from_head[1:])
         wave_number = math.tau / parameters.wavelength
@@ -164,25 +179,34 @@ class Cpg(Gait[CpgParameters]):
         phase_bias_rad = 0.5 * math.pi - wave_number * joint_from_head
         self._oscillators = Oscillators(phase_bias_rad, parameters.coupling, parameters.amplitude_rate)
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        turn_rad_s = find_travel_sign(observation) * math.tau / self.parameters.period_s
-        bend_rad = self._bend_fraction * self._heading_control.find_bend_rad(observation)
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        intrinsic_frequency_rad_s = get_travel_sign(observation) * math.tau / self.parameters.period_s
+        bend_rad = self._bend_fraction * self._heading_control.compute_bend_rad(observation)
         bend_rad = np.clip(bend_rad, -self._amplitude_rad, self._amplitude_rad)  # no oscillator below zero
-        limit_rad = 0.5 * np.stack([self._amplitude_rad + bend_rad, self._amplitude_rad - bend_rad])
-        feedback_rad_s = self._find_feedback_rad_s(observation.world)
-        self._oscillators.advance(observation.period_s, turn_rad_s, limit_rad, feedback_rad_s)
-        reference_rad = self.make_straight()
-        reference_rad[self._curve.joints] = self._oscillators.find_angles_rad()
+        amplitude_limit_rad = 0.5 * np.stack([self._amplitude_rad + bend_rad, self._amplitude_rad - bend_rad])
+        feedback_rad_s = self._compute_feedback_rad_s(observation.world)
+        self._oscillators.integrate(
+            observation.period_s, intrinsic_frequency_rad_s, amplitude_limit_rad, feedback_rad_s
+        )
+        reference_rad = self.make_straight_angles_rad()
+        reference_rad[self._curve.joint_indices] = self._oscillators.compute_joint_angles_rad()
         return reference_rad
 
-    def list_custom_numbers(self) -> dict[str, float]:
+    def list_custom_telemetry(self) -> dict[str, float]:
         return {
             "heading_error_rad": self._heading_control.error_rad,
             "oscillator_amplitude_rad": float(self._oscillators.r_rad.mean()),
         }
 
-    def _find_feedback_rad_s(self, world: World | None) -> Floats:
-        """Return sigma F_i cos(theta_i - psi), (2, n_yaw), limited."""
+    def _compute_feedback_rad_s(self, world: World | None) -> Floats:
+        """Compute the feedback of contact forces, sigma F_i cos(theta_i - psi), limited so that no oscillator stops.
+
+        Args:
+            world: World model with the contacts; None if there is none, then the feedback is zero.
+
+        Returns:
+            (2, n_yaw) changes of the phase rates in rad/s.
+        """
         theta_rad = self._oscillators.theta_rad
         if world is None or self.parameters.force_gain == 0.0:
             return np.zeros_like(theta_rad)
@@ -191,7 +215,7 @@ class Cpg(Gait[CpgParameters]):
             tangent_x, tangent_y, _ = contact.tangent_w
             force_x, force_y, _ = contact.force_w
             forces_n[contact.link] += tangent_x * force_y - tangent_y * force_x
-        at_joints_n = (forces_n[:-1] + forces_n[1:])[self._curve.joints]
+        at_joints_n = (forces_n[:-1] + forces_n[1:])[self._curve.joint_indices]
         signed_n = np.stack([at_joints_n, -at_joints_n])
         feedback = self.parameters.force_gain * signed_n * np.cos(theta_rad - self.parameters.force_phase_rad)
         max_rad_s = MAX_FEEDBACK_RATIO * math.tau / self.parameters.period_s

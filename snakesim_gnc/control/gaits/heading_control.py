@@ -32,7 +32,7 @@ from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import above, from_zero
 
-MIN_SPREAD = 0.2  # resultant of the headings below which they have no mean direction
+MIN_MEAN_RESULTANT = 0.2  # resultant of the headings below which they have no mean direction
 
 SteeringGain = Annotated[float, from_zero(5, "1")]
 LookAhead = Annotated[float, above(10, "body lengths")]
@@ -43,38 +43,44 @@ class HeadingControl:
     """Computes the bend of one robot."""
 
     def __init__(
-        self, robot: Description, *, k_theta: float, look_ahead: float, max_bend_rad: float, filter_s: float
+        self, robot: Description, *, k_theta: float, look_ahead: float, max_bend_rad: float, time_constant_s: float
     ) -> None:
-        """Start without a path and without a bend.
+        """Create a heading control without a path, whose bend is zero.
 
         Args:
-            robot: description of the robot.
-            k_theta: bend of the whole body for each radian of heading error; 0 switches the control off.
-            look_ahead: look-ahead distance Delta in body lengths.
-            max_bend_rad: bound of the bend.
-            filter_s: time constant of the low-pass filter.
+            robot: Description of the robot.
+            k_theta: Gain: bend of the whole body for each radian of heading error; 0 switches the control off.
+            look_ahead: Look-ahead distance Delta in body lengths.
+            max_bend_rad: Maximum bend of the whole body to either side.
+            time_constant_s: Time constant of the low-pass filter.
         """
         self._body = PlanarBody(robot)
         self._k_theta = k_theta
         self._look_ahead_m = look_ahead * self._body.length_m
         self._max_bend_rad = max_bend_rad
-        self._filter_s = filter_s
+        self._time_constant_s = time_constant_s
         self._bend_rad = 0.0
         self._route: Route | None = None
         self._path_id: int | None = None
-        self.error_rad = 0.0  # theta_ref - theta_bar of the last tick; 0.0: unknown
+        self.error_rad = 0.0  # theta_ref - theta_bar of the last tick; 0.0 if unknown
 
-    def find_bend_rad(self, observation: Observation) -> float:
-        """Return the bend of the whole body, to the left positive. Call it in every tick."""
-        self.error_rad = self._find_error_rad(observation)
+    def compute_bend_rad(self, observation: Observation) -> float:
+        """Update the low-pass filtered bend of the whole body, and return it in rad, left positive.
+
+        Call it once in every tick.
+        """
+        self.error_rad = self._compute_error_rad(observation)
         desired_rad = self._k_theta * self.error_rad
         desired_rad = min(max(desired_rad, -self._max_bend_rad), self._max_bend_rad)
-        gain = 1.0 - math.exp(-observation.period_s / self._filter_s)
-        self._bend_rad += gain * (desired_rad - self._bend_rad)
+        alpha = 1.0 - math.exp(-observation.period_s / self._time_constant_s)
+        self._bend_rad += alpha * (desired_rad - self._bend_rad)
         return self._bend_rad
 
-    def _find_error_rad(self, observation: Observation) -> float:
-        """Return theta_ref - theta_bar; 0.0 without a world model or a path."""
+    def _compute_error_rad(self, observation: Observation) -> float:
+        """Return the heading error theta_ref - theta_bar in rad.
+
+        It is 0.0 without a world model or a path, and if the headings of the links have no mean direction.
+        """
         world = observation.world
         trajectory = observation.trajectory
         if self._k_theta == 0.0 or world is None or trajectory is None:
@@ -83,16 +89,16 @@ class HeadingControl:
             self._route = Route(trajectory.path_w)
             self._path_id = trajectory.path_id
 
-        nodes_w = self._body.nodes_w(world, observation.joints.angle_rad)  # (2, n_nodes)
-        pieces_w = np.diff(nodes_w, axis=1)
-        headings_rad = np.arctan2(pieces_w[1], pieces_w[0])
+        body_points_w = self._body.compute_body_points_w(world, observation.joints.angle_rad)  # (2, n_points)
+        link_vectors_w = np.diff(body_points_w, axis=1)
+        headings_rad = np.arctan2(link_vectors_w[1], link_vectors_w[0])
         resultant = np.exp(1j * headings_rad).mean()
-        if abs(resultant) < MIN_SPREAD:
+        if abs(resultant) < MIN_MEAN_RESULTANT:
             return 0.0
         theta_bar = float(np.angle(resultant))
 
-        center_w = nodes_w.mean(axis=1)
-        s_m = self._route.project(center_w)
-        aim_x, aim_y = self._route.point_at(s_m + self._look_ahead_m)
+        center_w = body_points_w.mean(axis=1)
+        s_m = self._route.project_point(center_w)
+        aim_x, aim_y = self._route.compute_point(s_m + self._look_ahead_m)
         theta_ref = math.atan2(aim_y - center_w[1], aim_x - center_w[0])
         return math.remainder(theta_ref - theta_bar, math.tau)

@@ -20,7 +20,7 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds
-from snakesim_gnc.control.gaits.body_curve import PHASES, BodyCurve
+from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_gnc.control.gaits.serpenoid import Wavelength
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
@@ -58,19 +58,23 @@ class Rectilinear(Gait[RectilinearParameters]):
         """Check that the joints can form the wave. Raises ConfigError."""
         curve = BodyCurve(robot, "pitch")
         curve.check_wavelength(parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it")
-        shapes_rad = np.array([_find_slope_angles_rad(curve, parameters, phase) for phase in PHASES])
+        shapes_rad = np.array([_compute_slope_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD])
         curve.check_limits(shapes_rad, f"control.slope_rad of {parameters.slope_rad:g} rad")
 
     def __init__(self, robot: Description, parameters: RectilinearParameters) -> None:
         super().__init__(robot, parameters)
         self._pitch_curve = BodyCurve(robot, "pitch")
         yaw_curve = BodyCurve(robot, "yaw")
-        self._stance_rad = yaw_curve.find_angles_rad(parameters.stance_rad * np.sin(math.tau * yaw_curve.from_head))
+        self._stance_rad = yaw_curve.compute_joint_angles_rad(
+            parameters.stance_rad * np.sin(math.tau * yaw_curve.head_distance_fractions)
+        )
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        return self._stance_rad + _find_slope_angles_rad(self._pitch_curve, self.parameters, phase_rad)
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        return self._stance_rad + _compute_slope_angles_rad(self._pitch_curve, self.parameters, phase_rad)
 
 
-def _find_slope_angles_rad(curve: BodyCurve, parameters: RectilinearParameters, phase_rad: float) -> Floats:
-    slopes_rad = parameters.slope_rad * np.cos(phase_rad + math.tau * curve.from_head / parameters.wavelength)
-    return curve.find_angles_rad(slopes_rad)
+def _compute_slope_angles_rad(curve: BodyCurve, parameters: RectilinearParameters, phase_rad: float) -> Floats:
+    slopes_rad = parameters.slope_rad * np.cos(
+        phase_rad + math.tau * curve.head_distance_fractions / parameters.wavelength
+    )
+    return curve.compute_joint_angles_rad(slopes_rad)

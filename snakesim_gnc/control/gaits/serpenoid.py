@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds
-from snakesim_gnc.control.gaits.body_curve import PHASES, BodyCurve
+from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
@@ -53,7 +53,9 @@ class SerpenoidParameters(GaitParameters, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
 
-def find_serpenoid_headings(from_head: Floats, phase_rad: float, winding_angle_rad: float, wavelength: float) -> Floats:
+def compute_serpenoid_headings(
+    from_head: Floats, phase_rad: float, winding_angle_rad: float, wavelength: float
+) -> Floats:
     """Return the headings psi of the serpenoid curve.
 
     Args:
@@ -72,18 +74,20 @@ def check_serpenoid(robot: Description, winding_angle_rad: float, wavelength: fl
     """Check that the yaw joints of a robot can form the serpenoid curve at every phase.
 
     Args:
-        robot: the robot.
+        robot: The robot.
         winding_angle_rad: alpha, the parameter `winding_angle_rad` of the controller.
         wavelength: lambda, the parameter `wavelength` of the controller.
 
     Raises:
-        ConfigError: the waves are too short for the joints, or the bends exceed their limits.
+        ConfigError: The waves are too short for the joints, or the bends exceed their limits.
     """
     curve = BodyCurve(robot, "yaw")
     curve.check_wavelength(wavelength, f"control.wavelength of {wavelength:g}", "increase it")
     shapes_rad = [
-        curve.find_angles_rad(find_serpenoid_headings(curve.from_head, phase_rad, winding_angle_rad, wavelength))
-        for phase_rad in PHASES
+        curve.compute_joint_angles_rad(
+            compute_serpenoid_headings(curve.head_distance_fractions, phase_rad, winding_angle_rad, wavelength)
+        )
+        for phase_rad in CHECKED_PHASES_RAD
     ]
     curve.check_limits(np.array(shapes_rad), f"control.winding_angle_rad of {winding_angle_rad:g} rad")
 
@@ -107,15 +111,18 @@ class Serpenoid(Gait[SerpenoidParameters]):
             k_theta=parameters.k_theta,
             look_ahead=parameters.look_ahead,
             max_bend_rad=parameters.max_bend_rad,
-            filter_s=parameters.period_s,
+            time_constant_s=parameters.period_s,
         )
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        headings_rad = find_serpenoid_headings(
-            self._curve.from_head, phase_rad, self.parameters.winding_angle_rad, self.parameters.wavelength
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        headings_rad = compute_serpenoid_headings(
+            self._curve.head_distance_fractions,
+            phase_rad,
+            self.parameters.winding_angle_rad,
+            self.parameters.wavelength,
         )
-        bend_rad = self._heading_control.find_bend_rad(observation)
-        return self._curve.find_angles_rad(headings_rad + self._curve.spread_bend(bend_rad))
+        bend_rad = self._heading_control.compute_bend_rad(observation)
+        return self._curve.compute_joint_angles_rad(headings_rad + self._curve.make_bend_headings_rad(bend_rad))
 
-    def list_custom_numbers(self) -> dict[str, float]:
+    def list_custom_telemetry(self) -> dict[str, float]:
         return {"heading_error_rad": self._heading_control.error_rad}

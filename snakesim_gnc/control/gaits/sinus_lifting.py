@@ -20,9 +20,9 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds
-from snakesim_gnc.control.gaits.body_curve import PHASES, BodyCurve
+from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
-from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, find_serpenoid_headings
+from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, compute_serpenoid_headings
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import Description
@@ -68,11 +68,11 @@ class SinusLifting(Gait[SinusLiftingParameters]):
         """Check that the joints can form the curve. Raises ConfigError."""
         curves = (BodyCurve(robot, "yaw"), BodyCurve(robot, "pitch"))
         yaw_curve, pitch_curve = curves
-        setting = f"control.wavelength of {parameters.wavelength:g}"
-        yaw_curve.check_wavelength(parameters.wavelength, setting, "increase it")
-        pitch_curve.check_wavelength(0.5 * parameters.wavelength, setting, "increase it")
-        if yaw_curve.joints and pitch_curve.joints:
-            shapes_rad = np.array([_find_angles_rad(curves, parameters, phase, 0.0) for phase in PHASES])
+        parameter_label = f"control.wavelength of {parameters.wavelength:g}"
+        yaw_curve.check_wavelength(parameters.wavelength, parameter_label, "increase it")
+        pitch_curve.check_wavelength(0.5 * parameters.wavelength, parameter_label, "increase it")
+        if yaw_curve.joint_indices and pitch_curve.joint_indices:
+            shapes_rad = np.array([_compute_angles_rad(curves, parameters, phase, 0.0) for phase in CHECKED_PHASES_RAD])
             yaw_curve.check_limits(shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad")
 
     def __init__(self, robot: Description, parameters: SinusLiftingParameters) -> None:
@@ -83,22 +83,22 @@ class SinusLifting(Gait[SinusLiftingParameters]):
             k_theta=parameters.k_theta,
             look_ahead=parameters.look_ahead,
             max_bend_rad=parameters.max_bend_rad,
-            filter_s=parameters.period_s,
+            time_constant_s=parameters.period_s,
         )
 
-    def find_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        bend_rad = self._heading_control.find_bend_rad(observation)
-        return _find_angles_rad(self._curves, self.parameters, phase_rad, bend_rad)
+    def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
+        bend_rad = self._heading_control.compute_bend_rad(observation)
+        return _compute_angles_rad(self._curves, self.parameters, phase_rad, bend_rad)
 
 
-def _find_angles_rad(
+def _compute_angles_rad(
     curves: tuple[BodyCurve, BodyCurve], parameters: SinusLiftingParameters, phase_rad: float, bend_rad: float
 ) -> Floats:
     yaw_curve, pitch_curve = curves
-    headings_rad = find_serpenoid_headings(
-        yaw_curve.from_head, phase_rad, parameters.winding_angle_rad, parameters.wavelength
+    headings_rad = compute_serpenoid_headings(
+        yaw_curve.head_distance_fractions, phase_rad, parameters.winding_angle_rad, parameters.wavelength
     )
-    u = phase_rad - math.tau * pitch_curve.from_head / parameters.wavelength
+    u = phase_rad - math.tau * pitch_curve.head_distance_fractions / parameters.wavelength
     slopes_rad = parameters.lift_slope_rad * np.sin(2.0 * u)
-    yaw_rad = yaw_curve.find_angles_rad(headings_rad + yaw_curve.spread_bend(bend_rad))
-    return yaw_rad + pitch_curve.find_angles_rad(slopes_rad)
+    yaw_rad = yaw_curve.compute_joint_angles_rad(headings_rad + yaw_curve.make_bend_headings_rad(bend_rad))
+    return yaw_rad + pitch_curve.compute_joint_angles_rad(slopes_rad)

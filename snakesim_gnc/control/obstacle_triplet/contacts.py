@@ -50,34 +50,36 @@ class PushPoint:
 def plan_contact(
     route: Route, obstacle: Obstacle, body_radius_m: float, *, near_s_m: float, window_m: float
 ) -> PlannedContact:
-    """Find the place on the route that is nearest to an obstacle, where the body will push off it.
+    """Find the point of the route that is nearest to an obstacle, where the body will push off the obstacle.
 
     Args:
-        route: the path.
-        obstacle: an obstacle of any shape.
-        body_radius_m: radius of the robot's body.
-        near_s_m: arc length on the route around which the search begins.
-        window_m: distance from there within which it searches.
+        route: The path.
+        obstacle: An obstacle of any shape.
+        body_radius_m: Radius of the robot's body.
+        near_s_m: Arc length on the route that is the middle of the searched part.
+        window_m: Length of the searched part on either side of `near_s_m`.
 
     Returns:
         The contact, with the normal from the obstacle into the body and the tangent towards the head.
     """
     if obstacle.shape == "box":
-        s, away_w, distance_m = _find_place_at_box(route, obstacle, near_s_m, window_m)
+        nearest_s_m, direction_from_obstacle_w, distance_m = _find_nearest_point_to_box(
+            route, obstacle, near_s_m, window_m
+        )
     else:
         center_w = np.array(obstacle.position_w[:2])
-        s = route.project(center_w, near_s_m, window_m)
-        x, y = route.point_at(s)
-        away_w = (x - float(center_w[0]), y - float(center_w[1]))
-        distance_m = math.hypot(*away_w) - obstacle.radius_m
-    heading_rad = route.heading_rad(s)
+        nearest_s_m = route.project_point(center_w, near_s_m, window_m)
+        x, y = route.compute_point(nearest_s_m)
+        direction_from_obstacle_w = (x - float(center_w[0]), y - float(center_w[1]))
+        distance_m = math.hypot(*direction_from_obstacle_w) - obstacle.radius_m
+    heading_rad = route.compute_heading_rad(nearest_s_m)
     tangent = (math.cos(heading_rad), math.sin(heading_rad))
-    is_pushed_left = tangent[0] * away_w[1] - tangent[1] * away_w[0] >= 0
+    is_pushed_left = tangent[0] * direction_from_obstacle_w[1] - tangent[1] * direction_from_obstacle_w[0] >= 0
     side = 1 if is_pushed_left else -1
     return PlannedContact(
         obstacle=obstacle.name,
-        path_s_m=s,
-        point_w=route.point_at(s),
+        path_s_m=nearest_s_m,
+        point_w=route.compute_point(nearest_s_m),
         normal_w=(-side * tangent[1], side * tangent[0]),
         tangent_w=tangent,
         side=side,
@@ -85,43 +87,48 @@ def plan_contact(
     )
 
 
-def _find_place_at_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
-    """Find the place on a route that is nearest to a box, by a coarse and a fine search.
+def _find_nearest_point_to_box(
+    route: Route, box: Obstacle, near_s_m: float, window_m: float
+) -> tuple[float, Planar, float]:
+    """Find the point of a route that is nearest to a box, by a coarse and a fine search.
 
     Args:
-        route: the path.
-        box: the obstacle.
-        near_s_m: arc length around which the search begins.
-        window_m: how far from there it searches.
+        route: The path.
+        box: The obstacle.
+        near_s_m: Arc length on the route that is the middle of the searched part.
+        window_m: Length of the searched part on either side of `near_s_m`.
 
     Returns:
-        The arc length of the place in m, the unit vector from the box to it, and its distance from the box in m.
+        The arc length of the nearest point in m, the unit vector from the box to this point, and its distance from the
+        box in m.
     """
     outline = Outlines.from_obstacles([box])
-    low = near_s_m - window_m
-    high = near_s_m + window_m
-    s = near_s_m
-    away_w = np.zeros(2)
+    low_s_m = near_s_m - window_m
+    high_s_m = near_s_m + window_m
+    nearest_s_m = near_s_m
+    direction_from_obstacle_w = np.zeros(2)
     distance_m = 0.0
-    for step in (COARSE_STEP_M, FINE_STEP_M):
-        places_m = np.arange(low, high, step)
-        box_indices = np.zeros(len(places_m), dtype=np.intp)
-        distances_m, normals_w = outline.distance_and_normal(route.position_w(places_m), box_indices)
-        best = int(np.argmin(distances_m))
-        s = float(places_m[best])
-        away_w = normals_w[best]
-        distance_m = float(distances_m[best])
-        low = s - step
-        high = s + step
-    return s, (float(away_w[0]), float(away_w[1])), distance_m
+    for step_m in (COARSE_STEP_M, FINE_STEP_M):
+        candidates_s_m = np.arange(low_s_m, high_s_m, step_m)
+        box_indices = np.zeros(len(candidates_s_m), dtype=np.intp)
+        distances_m, normals_w = outline.compute_distances_and_normals(
+            route.compute_positions_w(candidates_s_m), box_indices
+        )
+        best_index = int(np.argmin(distances_m))
+        nearest_s_m = float(candidates_s_m[best_index])
+        direction_from_obstacle_w = normals_w[best_index]
+        distance_m = float(distances_m[best_index])
+        low_s_m = nearest_s_m - step_m
+        high_s_m = nearest_s_m + step_m
+    return nearest_s_m, (float(direction_from_obstacle_w[0]), float(direction_from_obstacle_w[1])), distance_m
 
 
 def find_push_points(
-    planned: Sequence[PlannedContact],
-    retained: Collection[str],
+    planned_contacts: Sequence[PlannedContact],
+    retained_obstacles: Collection[str],
     body_pose: BodyPose,
-    measured_w: Floats,
-    node_body_s_m: Sequence[float],
+    measured_points_w: Floats,
+    body_points_s_m: Sequence[float],
     *,
     gap_m: float,
     give_up_gap_m: float,
@@ -129,40 +136,42 @@ def find_push_points(
 ) -> list[PushPoint]:
     """Find the planned contacts that the body can push at now.
 
-    One counts if the body covers it, and the measured body is near enough to it.
+    A planned contact is a push-point if the body covers it, and the measured body is near enough to its obstacle.
 
     Args:
-        planned: planned contacts.
-        retained: names of the obstacles in contact, and of those that the body already pushes at.
-        body_pose: the body as it lies on the path.
-        measured_w: (2, n_nodes) m, the measured body.
-        node_body_s_m: (n_nodes,) arc lengths of the nodes from the tail end along the body.
-        gap_m: maximum distance of the measured body from an obstacle.
-        give_up_gap_m: the same for the obstacles in `retained`.
-        end_m: minimum distance along the body from either tip.
+        planned_contacts: Contacts that were planned where the path passes obstacles.
+        retained_obstacles: Names of the obstacles in contact, and of those that the body already pushes at.
+        body_pose: The body as it lies on the path.
+        measured_points_w: (2, n_points) tail end, joints that bend and head end of the measured body, m.
+        body_points_s_m: (n_points,) arc lengths of these points from the tail end along the body.
+        gap_m: Maximum distance of the measured body from an obstacle.
+        give_up_gap_m: Maximum distance from an obstacle in `retained_obstacles`, instead of `gap_m`.
+        end_m: Minimum distance of a push-point along the body from either tip.
 
     Returns:
         The push-points, tail to head.
     """
     # Plain lists: this runs in every tick, and for single numbers they are faster than arrays.
-    node_s_m: list[float] = body_pose.node_s_m.tolist()
-    x_m, y_m = measured_w.tolist()
-    length_m = node_body_s_m[-1]
+    points_path_s_m: list[float] = body_pose.body_points_s_m.tolist()
+    x_m, y_m = measured_points_w.tolist()
+    length_m = body_points_s_m[-1]
     points: list[PushPoint] = []
-    for contact in planned:
+    for contact in planned_contacts:
         # The contact is on the segment from node i to node i + 1, at this fraction of it.
-        i = bisect_right(node_s_m, contact.path_s_m) - 1
-        if not 0 <= i < len(node_s_m) - 1:
+        segment = bisect_right(points_path_s_m, contact.path_s_m) - 1
+        if not 0 <= segment < len(points_path_s_m) - 1:
             continue
-        fraction = (contact.path_s_m - node_s_m[i]) / (node_s_m[i + 1] - node_s_m[i])
-        body_s_m = node_body_s_m[i] + fraction * (node_body_s_m[i + 1] - node_body_s_m[i])
+        fraction = (contact.path_s_m - points_path_s_m[segment]) / (
+            points_path_s_m[segment + 1] - points_path_s_m[segment]
+        )
+        body_s_m = body_points_s_m[segment] + fraction * (body_points_s_m[segment + 1] - body_points_s_m[segment])
         if not end_m < body_s_m < length_m - end_m:
             continue
         # Offset of the measured body from the planned contact, and its gap to the obstacle along the normal.
-        offset_x_m = x_m[i] + fraction * (x_m[i + 1] - x_m[i]) - contact.point_w[0]
-        offset_y_m = y_m[i] + fraction * (y_m[i + 1] - y_m[i]) - contact.point_w[1]
+        offset_x_m = x_m[segment] + fraction * (x_m[segment + 1] - x_m[segment]) - contact.point_w[0]
+        offset_y_m = y_m[segment] + fraction * (y_m[segment + 1] - y_m[segment]) - contact.point_w[1]
         measured_gap_m = contact.clearance_m + offset_x_m * contact.normal_w[0] + offset_y_m * contact.normal_w[1]
-        max_gap_m = give_up_gap_m if contact.obstacle in retained else gap_m
+        max_gap_m = give_up_gap_m if contact.obstacle in retained_obstacles else gap_m
         # A large negative gap does not count either: the body is on the other side of the obstacle.
         if abs(measured_gap_m) <= max_gap_m:
             points.append(PushPoint(contact, body_s_m, measured_gap_m))

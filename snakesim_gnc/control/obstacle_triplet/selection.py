@@ -16,16 +16,16 @@ import numpy as np
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint
 from snakesim_gnc.control.obstacle_triplet.statics import (
     UnitForces,
-    add_tether,
+    add_tether_force,
     compute_torque_per_newton,
-    explain_missing_authority,
+    find_authority_problem,
     solve_unit_forces,
 )
-from snakesim_gnc.geometry.planar import wrenches
+from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_hal.base.arrays import Floats
 
-Names = tuple[str, str, str]  # of the obstacles, tail to head
-Three = tuple[PlannedContact, PlannedContact, PlannedContact]  # o_1, o_2, o_3, tail to head
+ObstacleNames = tuple[str, str, str]  # of the obstacles, tail to head
+ContactTriple = tuple[PlannedContact, PlannedContact, PlannedContact]  # o_1, o_2, o_3, tail to head
 
 TORQUE_DECIMALS = 3  # triplets whose torque per newton is equal to 1 mN·m/N count as equally good
 
@@ -34,10 +34,10 @@ TORQUE_DECIMALS = 3  # triplets whose torque per newton is equal to 1 mN·m/N co
 class Triplet:
     """Three planned contacts, solved once. They do not depend on the body's position."""
 
-    names: Names
-    contacts: Three
-    unit: UnitForces
-    unit_force_3: float  # lambda_3 for 1 N of propulsion, N/N
+    names: ObstacleNames
+    contacts: ContactTriple
+    unit_forces: UnitForces
+    force_3_per_n: float  # lambda_3 for 1 N of propulsion, N/N
     torque_per_n: float  # N·m/N, absolute; the maximum of all joints between o_2 and o_3, whose lever begins at o_2
 
     @cached_property
@@ -46,12 +46,12 @@ class Triplet:
         points_w = np.array([contact.point_w for contact in self.contacts])
         normals_w = np.array([contact.normal_w for contact in self.contacts])
         tether_w = -np.array(self.contacts[0].tangent_w)
-        return wrenches(points_w, add_tether(self.unit.forces, normals_w, tether_w))
+        return compute_wrenches(points_w, add_tether_force(self.unit_forces.forces, normals_w, tether_w))
 
 
 @dataclass(frozen=True)
-class Choice:
-    """A triplet, its present place on the body, and the propulsion joint."""
+class TripletChoice:
+    """A triplet, its current place on the body, and the propulsion joint."""
 
     triplet: Triplet
     body_s_m: tuple[float, float, float]  # of o_1, o_2, o_3, from the tail end along the body
@@ -59,33 +59,39 @@ class Choice:
     torque_per_n: float  # N·m/N, on the part of the body ahead of that joint
 
 
-def solve_triplets(threes: Sequence[Three], *, condition_max: float) -> list[Triplet]:
-    """Compute the unit forces of several triplets at once.
+def solve_triplets(contact_triples: Sequence[ContactTriple], *, condition_max: float) -> list[Triplet]:
+    """Solve the contact forces for 1 N of propulsion of several triplets at once.
 
     Args:
-        threes: three contacts each, tail to head.
-        condition_max: triplets above this condition number cannot be used; see `solve_unit_forces`.
+        contact_triples: Three contacts for each triplet, tail to head.
+        condition_max: Condition number above which a triplet cannot be used; see `solve_unit_forces`.
+
+    Returns:
+        The triplets in the same order. A triplet that cannot propel has the reason in `unit_forces.reason`.
     """
-    if not threes:
+    if not contact_triples:
         return []
-    units = solve_unit_forces(
-        np.array([[contact.point_w for contact in three] for three in threes]),
-        np.array([[contact.normal_w for contact in three] for three in threes]),
-        np.array([three[0].tangent_w for three in threes]),
+    all_unit_forces = solve_unit_forces(
+        np.array([[contact.point_w for contact in contact_triple] for contact_triple in contact_triples]),
+        np.array([[contact.normal_w for contact in contact_triple] for contact_triple in contact_triples]),
+        np.array([contact_triple[0].tangent_w for contact_triple in contact_triples]),
         condition_max=condition_max,
     )
-    return [_make_triplet(three, unit) for three, unit in zip(threes, units, strict=True)]
+    return [
+        _make_triplet(contact_triple, unit_forces)
+        for contact_triple, unit_forces in zip(contact_triples, all_unit_forces, strict=True)
+    ]
 
 
-def _make_triplet(three: Three, unit: UnitForces) -> Triplet:
-    _, middle, ahead = three
-    unit_force_3 = float(unit.forces[2])
-    max_torque = compute_torque_per_newton(unit_force_3, ahead.point_w, ahead.normal_w, middle.point_w)
-    return Triplet(_get_names(three), three, unit, unit_force_3, abs(max_torque))
+def _make_triplet(contact_triple: ContactTriple, unit_forces: UnitForces) -> Triplet:
+    _, middle, front = contact_triple
+    force_3_per_n = float(unit_forces.forces[2])
+    max_torque = compute_torque_per_newton(force_3_per_n, front.point_w, front.normal_w, middle.point_w)
+    return Triplet(_get_obstacle_names(contact_triple), contact_triple, unit_forces, force_3_per_n, abs(max_torque))
 
 
-def _get_names(three: Three) -> Names:
-    return three[0].obstacle, three[1].obstacle, three[2].obstacle
+def _get_obstacle_names(contact_triple: ContactTriple) -> ObstacleNames:
+    return contact_triple[0].obstacle, contact_triple[1].obstacle, contact_triple[2].obstacle
 
 
 def find_alternating_triples(sides: Sequence[int]) -> list[tuple[int, int, int]]:
@@ -102,174 +108,189 @@ def find_alternating_triples(sides: Sequence[int]) -> list[tuple[int, int, int]]
 
 
 def find_propulsion_joint(
-    node_body_s_m: Sequence[float], behind_m: float, ahead_m: float, present: int | None, hold_on_m: float
+    body_points_s_m: Sequence[float], o_2_s_m: float, o_3_s_m: float, current_joint: int | None, hold_on_m: float
 ) -> int | None:
     """Find the joint that propels a triplet of push-points o_1, o_2, o_3 (tail to head).
 
     It is the first joint ahead of o_2 and behind o_3, because that joint has the longest lever.
 
     Args:
-        node_body_s_m: (n_nodes,) arc lengths of the body's nodes from the tail end; joint i is node i + 1.
-        behind_m: arc length of o_2 on the body.
-        ahead_m: arc length of o_3 on the body.
-        present: the present propulsion joint of this triplet. It remains until the joint behind it is `hold_on_m`
-            past o_2, so that noise does not switch back and forth.
-        hold_on_m: that distance.
+        body_points_s_m: (n_points,) arc lengths of the body's points (tail end, joints, head end) from the tail end.
+            Joint i is point i + 1.
+        o_2_s_m: Arc length of o_2 on the body, from the tail end.
+        o_3_s_m: Arc length of o_3 on the body, from the tail end.
+        current_joint: Current propulsion joint of this triplet; None if it has none. It remains the propulsion joint
+            until the joint behind it is `hold_on_m` past o_2, so that noise does not switch back and forth.
+        hold_on_m: Distance past o_2 at which the joint behind takes over.
 
     Returns:
         Index of the joint, or None if there is no joint between o_2 and o_3.
     """
-    joint = max(bisect_right(node_body_s_m, behind_m) - 1, 0)
-    last_joint = len(node_body_s_m) - 3
-    if joint > last_joint or node_body_s_m[joint + 1] >= ahead_m:
+    joint = max(bisect_right(body_points_s_m, o_2_s_m) - 1, 0)
+    last_joint = len(body_points_s_m) - 3
+    if joint > last_joint or body_points_s_m[joint + 1] >= o_3_s_m:
         return None
     next_joint = joint + 1
-    if present != next_joint or next_joint > last_joint:
+    if current_joint != next_joint or next_joint > last_joint:
         return joint
-    has_just_passed = node_body_s_m[joint + 1] - behind_m < hold_on_m
-    next_is_behind_o_3 = node_body_s_m[next_joint + 1] < ahead_m
+    has_just_passed = body_points_s_m[joint + 1] - o_2_s_m < hold_on_m
+    next_is_behind_o_3 = body_points_s_m[next_joint + 1] < o_3_s_m
     if has_just_passed and next_is_behind_o_3:
-        return present
+        return current_joint
     return joint
 
 
 def choose_triplet(
-    choices: Sequence[Choice], present: Triplet | None, *, switch_fraction: float, banned: Collection[Names] = ()
-) -> Choice | None:
+    choices: Sequence[TripletChoice],
+    current_triplet: Triplet | None,
+    *,
+    switch_fraction: float,
+    banned_triplets: Collection[ObstacleNames] = (),
+) -> TripletChoice | None:
     """Choose the triplet of push-points with which the body pushes itself forward.
 
-    The present triplet stays as long as it can be used, unless another needs less than `switch_fraction` of its torque.
+    The current triplet stays as long as it can be used, unless another needs less than `switch_fraction` of its torque.
     Candidates for its successor need little more than the minimum torque. Among them, in this order, the successor
 
-    1. shares as many push-points with the present triplet as possible,
+    1. shares as many push-points with the current triplet as possible,
     2. needs the least torque,
     3. is nearest to the tail: then the short end of the body swings with the propulsion joint, and the long end stays
        in its corridor.
 
     Args:
-        choices: triplets that can propel.
-        present: the triplet that pushes now; None if none does.
-        switch_fraction: ratio of two torques per newton, 0 to 1.
-        banned: names of triplets that must not be chosen.
+        choices: Triplets that can propel.
+        current_triplet: The triplet that pushes now; None if none does.
+        switch_fraction: Ratio of two torques per newton, 0 to 1.
+        banned_triplets: Obstacle names of the triplets that must not be chosen.
 
     Returns:
-        The choice; None if there is none.
+        The chosen triplet with its joint; None if all are banned, or if there are no choices.
     """
-    permitted_choices = [choice for choice in choices if choice.triplet.names not in banned]
-    if not permitted_choices:
+    allowed_choices = [choice for choice in choices if choice.triplet.names not in banned_triplets]
+    if not allowed_choices:
         return None
-    min_torque = min(choice.triplet.torque_per_n for choice in permitted_choices)
-    for choice in permitted_choices:
-        if choice.triplet is present and min_torque >= switch_fraction * choice.triplet.torque_per_n:
+    min_torque = min(choice.triplet.torque_per_n for choice in allowed_choices)
+    for choice in allowed_choices:
+        if choice.triplet is current_triplet and min_torque >= switch_fraction * choice.triplet.torque_per_n:
             return choice
-    present_names: frozenset[str] = frozenset()
-    if present is not None:
-        present_names = frozenset(present.names)
+    current_obstacles: frozenset[str] = frozenset()
+    if current_triplet is not None:
+        current_obstacles = frozenset(current_triplet.names)
 
-    def rank(choice: Choice) -> tuple[int, float, float]:
-        shared_count = len(present_names.intersection(choice.triplet.names))
+    def compute_rank(choice: TripletChoice) -> tuple[int, float, float]:
+        shared_count = len(current_obstacles.intersection(choice.triplet.names))
         return shared_count, -round(choice.triplet.torque_per_n, TORQUE_DECIMALS), -choice.body_s_m[1]
 
-    candidates = [choice for choice in permitted_choices if switch_fraction * choice.triplet.torque_per_n <= min_torque]
-    return max(candidates, key=rank)
+    candidates = [choice for choice in allowed_choices if switch_fraction * choice.triplet.torque_per_n <= min_torque]
+    return max(candidates, key=compute_rank)
 
 
-class Triplets:
-    """Finds all choices for the present push-points. Solves each three contacts only once."""
+class TripletFinder:
+    """Finds all choices for the current push-points. Solves each three contacts only once."""
 
     def __init__(self, *, condition_max: float, authority_min: float, hold_on_m: float) -> None:
-        """Start without solved triplets.
+        """Create a finder of triplets that has not solved any yet.
 
         Args:
-            condition_max: triplets above this condition number cannot be used.
-            authority_min: joints whose lever is so nearly along the normal at o_3 cannot be used, sine of the angle.
-            hold_on_m: the joint behind o_2 takes over when it is so far past o_2.
+            condition_max: Condition number above which a triplet cannot be used.
+            authority_min: Sine of the angle between a joint's lever and the normal at o_3 below which the joint cannot
+                be used.
+            hold_on_m: Distance past o_2 at which the joint behind takes over as propulsion joint.
         """
         self._condition_max = condition_max
         self._authority_min = authority_min
         self._hold_on_m = hold_on_m
-        self._solved: dict[Names, Triplet] = {}
+        self._solved_triplets: dict[ObstacleNames, Triplet] = {}
 
     def find_choices(
         self,
         points: Sequence[PushPoint],
-        nodes_w: Floats,
-        node_body_s_m: Sequence[float],
-        present: Choice | None,
-        barred_joint: int | None,
-    ) -> tuple[list[Choice], list[str]]:
+        body_points_w: Floats,
+        body_points_s_m: Sequence[float],
+        current_choice: TripletChoice | None,
+        excluded_joint: int | None,
+    ) -> tuple[list[TripletChoice], list[str]]:
         """Find every triplet that can propel with some joint.
 
         Args:
-            points: push-points, tail to head.
-            nodes_w: (2, n_nodes) m, the body.
-            node_body_s_m: (n_nodes,) arc lengths of the nodes from the tail end.
-            present: the choice that pushes now.
-            barred_joint: a joint that must not propel.
+            points: Push-points, tail to head.
+            body_points_w: (2, n_points) tail end, joints that bend and head end of the body in the world, m.
+            body_points_s_m: (n_points,) arc lengths of these points from the tail end.
+            current_choice: The choice that pushes now; None if none does.
+            excluded_joint: Index of a joint that must not propel; None if every joint may.
 
         Returns:
-            The choices, and why the other triplets cannot propel.
+            The choices, and for each other triplet a text with its obstacles and why it cannot propel.
         """
-        choices: list[Choice] = []
-        refused: list[str] = []
+        choices: list[TripletChoice] = []
+        refusal_reasons: list[str] = []
         triples = find_alternating_triples([point.contact.side for point in points])
-        triplets = self._solve([(points[i].contact, points[j].contact, points[k].contact) for i, j, k in triples])
+        triplets = self._solve_new_triplets(
+            [(points[i].contact, points[j].contact, points[k].contact) for i, j, k in triples]
+        )
         for (i, j, k), triplet in zip(triples, triplets, strict=True):
-            places_m = (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m)
-            present_joint = None
-            if present is not None and present.triplet is triplet:
-                present_joint = present.joint
-            choice = self._choose_joint(triplet, places_m, nodes_w, node_body_s_m, present_joint, barred_joint)
-            if isinstance(choice, Choice):
+            contacts_s_m = (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m)
+            current_joint = None
+            if current_choice is not None and current_choice.triplet is triplet:
+                current_joint = current_choice.joint
+            choice = self._choose_propulsion_joint(
+                triplet, contacts_s_m, body_points_w, body_points_s_m, current_joint, excluded_joint
+            )
+            if isinstance(choice, TripletChoice):
                 choices.append(choice)
             else:
-                refused.append(f"{'/'.join(triplet.names)}: {choice}")
-        return choices, refused
+                refusal_reasons.append(f"{'/'.join(triplet.names)}: {choice}")
+        return choices, refusal_reasons
 
-    def _choose_joint(
+    def _choose_propulsion_joint(
         self,
         triplet: Triplet,
-        places_m: tuple[float, float, float],
-        nodes_w: Floats,
-        node_body_s_m: Sequence[float],
-        present_joint: int | None,
-        barred_joint: int | None,
-    ) -> Choice | str:
+        contacts_s_m: tuple[float, float, float],
+        body_points_w: Floats,
+        body_points_s_m: Sequence[float],
+        current_joint: int | None,
+        excluded_joint: int | None,
+    ) -> TripletChoice | str:
         """Return a triplet with its propulsion joint and the torque for 1 N, or the reason why it cannot propel.
 
         Args:
-            triplet: three contacts, with the forces for 1 N of propulsion.
-            places_m: arc lengths of the contacts on the body.
-            nodes_w: (2, n_nodes) m, the body; joint i is node i + 1.
-            node_body_s_m: (n_nodes,) arc lengths of the nodes from the tail end.
-            present_joint: the present propulsion joint of this triplet, if any.
-            barred_joint: a joint that must not propel.
+            triplet: Three contacts, with the forces for 1 N of propulsion.
+            contacts_s_m: Arc lengths of the three contacts on the body, from the tail end.
+            body_points_w: (2, n_points) points of the body in the world, m. Joint i is point i + 1, because point 0 is
+                the tail end.
+            body_points_s_m: (n_points,) arc lengths of these points from the tail end.
+            current_joint: Current propulsion joint of this triplet; None if it has none.
+            excluded_joint: Index of a joint that must not propel; None if every joint may.
         """
-        if triplet.unit.reason:
-            return triplet.unit.reason
-        _, behind_m, ahead_m = places_m
-        joint = find_propulsion_joint(node_body_s_m, behind_m, ahead_m, present_joint, self._hold_on_m)
+        if triplet.unit_forces.reason:
+            return triplet.unit_forces.reason
+        _, o_2_s_m, o_3_s_m = contacts_s_m
+        joint = find_propulsion_joint(body_points_s_m, o_2_s_m, o_3_s_m, current_joint, self._hold_on_m)
         if joint is None:
             return "no joint between o_2 and o_3"
-        if joint == barred_joint:
+        if joint == excluded_joint:
             return "its propulsion joint has left its reference too far"
-        joint_w = (float(nodes_w[0, joint + 1]), float(nodes_w[1, joint + 1]))
-        ahead = triplet.contacts[2]
-        why_not = explain_missing_authority(ahead.point_w, ahead.normal_w, joint_w, self._authority_min)
-        if why_not:
-            return why_not
-        torque_per_n = compute_torque_per_newton(triplet.unit_force_3, ahead.point_w, ahead.normal_w, joint_w)
-        return Choice(triplet, places_m, joint, torque_per_n)
+        joint_w = (float(body_points_w[0, joint + 1]), float(body_points_w[1, joint + 1]))
+        o_3 = triplet.contacts[2]
+        authority_problem = find_authority_problem(o_3.point_w, o_3.normal_w, joint_w, self._authority_min)
+        if authority_problem:
+            return authority_problem
+        torque_per_n = compute_torque_per_newton(triplet.force_3_per_n, o_3.point_w, o_3.normal_w, joint_w)
+        return TripletChoice(triplet, contacts_s_m, joint, torque_per_n)
 
-    def _solve(self, threes: Sequence[Three]) -> list[Triplet]:
-        """Return the triplets of these contacts. Solves those that are new, and discards those that are gone."""
-        solved: dict[Names, Triplet] = {}
-        for three in threes:
-            known = self._solved.get(_get_names(three))
-            if known is not None and known.contacts == three:
-                solved[known.names] = known
-        new = [three for three in threes if _get_names(three) not in solved]
-        for triplet in solve_triplets(new, condition_max=self._condition_max):
-            solved[triplet.names] = triplet
-        self._solved = solved
-        return [solved[_get_names(three)] for three in threes]
+    def _solve_new_triplets(self, contact_triples: Sequence[ContactTriple]) -> list[Triplet]:
+        """Return the triplets of these contacts in order. Solve only those that are new, and forget all others."""
+        solved_triplets: dict[ObstacleNames, Triplet] = {}
+        for contact_triple in contact_triples:
+            known_triplet = self._solved_triplets.get(_get_obstacle_names(contact_triple))
+            if known_triplet is not None and known_triplet.contacts == contact_triple:
+                solved_triplets[known_triplet.names] = known_triplet
+        new_triples = [
+            contact_triple
+            for contact_triple in contact_triples
+            if _get_obstacle_names(contact_triple) not in solved_triplets
+        ]
+        for triplet in solve_triplets(new_triples, condition_max=self._condition_max):
+            solved_triplets[triplet.names] = triplet
+        self._solved_triplets = solved_triplets
+        return [solved_triplets[_get_obstacle_names(contact_triple)] for contact_triple in contact_triples]

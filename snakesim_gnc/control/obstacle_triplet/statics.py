@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from snakesim_gnc.geometry.planar import cross, wrenches
+from snakesim_gnc.geometry.planar import compute_wrenches, cross_2d
 from snakesim_hal.base.arrays import Floats
 
 Planar = tuple[float, float] | Floats
@@ -44,7 +44,7 @@ class TripletSolution:
     forces_n: Floats  # (3,) tail to head, along the normals; NaN where the balance has no unique solution
     torque_nm: float  # internal torque on the part of the body ahead of the joint, left turn positive; NaN like forces
     condition: float
-    feasible: bool
+    is_feasible: bool
     reason: str  # empty when feasible
 
 
@@ -64,17 +64,17 @@ def solve_triplet(
         points_w: (3, 2) m, o_1, o_2, o_3 from tail to head.
         normals_w: (3, 2) unit vectors, from the obstacle into the body.
         tangent_1_w: (2,) unit vector along the body at o_1 towards the head; the tether pulls along its negative.
-        propulsion_n: size of the tether's force.
+        propulsion_n: Size of the tether's force.
         joint_w: (2,) m, where the torque acts.
-        condition_max: maximum condition number of the balance, with lengths in units of |o_3 - o_1|.
-        authority_min: minimum of |r x n_3| / |r|, where r reaches from the joint to o_3.
+        condition_max: Maximum condition number of the balance, with lengths in units of |o_3 - o_1|.
+        authority_min: Minimum of |r x n_3| / |r|, where r reaches from the joint to o_3.
 
     Returns:
         The solution. It is not feasible, with the reason, if the balance is ill-conditioned, if a contact would have to
         pull (lambda_i <= 0), or if the joint has no authority, because r is parallel to n_3.
 
     Raises:
-        ValueError: wrong shapes, NaN, directions that are not unit vectors, or a propulsion force that is not positive.
+        ValueError: Wrong shapes, NaN, directions that are not unit vectors, or a propulsion force that is not positive.
     """
     points = _check_array("points_w", points_w, (3, 2))
     normals = _check_array("normals_w", normals_w, (3, 2))
@@ -87,12 +87,12 @@ def solve_triplet(
     (unit,) = solve_unit_forces(points[None], normals[None], tangent[None], condition_max=condition_max)
     forces_n = propulsion_n * unit.forces
     torque_nm = propulsion_n * compute_torque_per_newton(unit.forces[2], points[2], normals[2], joint)
-    reason = unit.reason or explain_missing_authority(points[2], normals[2], joint, authority_min)
+    reason = unit.reason or find_authority_problem(points[2], normals[2], joint, authority_min)
     return TripletSolution(
         forces_n=forces_n,
         torque_nm=torque_nm,
         condition=unit.condition,
-        feasible=not reason,
+        is_feasible=not reason,
         reason=reason,
     )
 
@@ -124,30 +124,37 @@ def solve_unit_forces(
     unit_m = np.where(has_span, span_m, 1.0)
     arms = (points_w - points_w.mean(axis=1, keepdims=True)) / unit_m[:, None, None]
 
-    moments = cross(arms, normals_w)
+    moments = cross_2d(arms, normals_w)
     a = np.concatenate([normals_w.swapaxes(1, 2), moments[:, None]], axis=1)  # (m, 3, 3)
-    tether_moments = cross(arms[:, 0], tangents_1_w)
+    tether_moments = cross_2d(arms[:, 0], tangents_1_w)
     b = np.concatenate([tangents_1_w, tether_moments[:, None]], axis=1)  # (m, 3)
 
     conditions = np.where(has_span, np.linalg.cond(a), np.inf)
-    is_solvable = conditions <= condition_max
+    is_well_conditioned = conditions <= condition_max
     forces = np.full((len(span_m), 3), np.nan)  # lambda
-    forces[is_solvable] = np.linalg.solve(a[is_solvable], b[is_solvable, :, None])[..., 0]
+    forces[is_well_conditioned] = np.linalg.solve(a[is_well_conditioned], b[is_well_conditioned, :, None])[..., 0]
 
     results: list[UnitForces] = []
-    for unit, condition, length_m in zip(forces, conditions.tolist(), span_m.tolist(), strict=True):
-        reason = _explain_unit_forces(length_m, condition, condition_max, unit.tolist())
-        results.append(UnitForces(unit, condition, reason))
+    for forces_of_triplet, condition, length_m in zip(forces, conditions.tolist(), span_m.tolist(), strict=True):
+        reason = _find_propulsion_problem(length_m, condition, condition_max, forces_of_triplet.tolist())
+        results.append(UnitForces(forces_of_triplet, condition, reason))
     return results
 
 
-def _explain_unit_forces(span_m: float, condition: float, condition_max: float, forces: list[float]) -> str:
-    """Return why three contacts cannot propel; empty when they can."""
+def _find_propulsion_problem(span_m: float, condition: float, condition_max: float, forces: list[float]) -> str:
+    """Return why three contacts cannot propel the body; an empty text if they can.
+
+    Args:
+        span_m: Distance between o_1 and o_3.
+        condition: Condition number of the balance of forces and moments.
+        condition_max: Maximum condition number.
+        forces: Contact forces lambda_1 to lambda_3 for 1 N of propulsion.
+    """
     if span_m <= 0.0:
         return "o_1 and o_3 are the same point"
     if not condition <= condition_max:  # also true for NaN
-        why = f"the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
-        return f"ill-conditioned: {why}"
+        condition_text = f"the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
+        return f"ill-conditioned: {condition_text}"
     pulling = [f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces) if force <= 0.0]
     if pulling:
         return f"a contact would have to pull: {', '.join(pulling)}"
@@ -173,10 +180,16 @@ def compute_torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w
     return float(-unit_force_3 * r_cross_n)
 
 
-def explain_missing_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, authority_min: float) -> str:
-    """Return why a torque of the joint does not press on the contact at o_3; empty when it does.
+def find_authority_problem(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, authority_min: float) -> str:
+    """Return why a torque of the joint does not press on the contact at o_3; an empty text if it does.
 
     With r from the joint to o_3, the joint has authority if |r x n_3| >= authority_min |r|.
+
+    Args:
+        point_3_w: (2,) o_3 in the world, m.
+        normal_3_w: (2,) unit vector n_3.
+        joint_w: (2,) position of the joint, m.
+        authority_min: Minimum sine of the angle between r and n_3.
     """
     x, y = point_3_w
     nx, ny = normal_3_w
@@ -197,45 +210,48 @@ def compute_bending_torque_nm(
     joint of all forces ahead of it. If all forces are in balance, that is the sum of the moments of all forces behind.
 
     Args:
-        joints_w: (n, 2) m, the joints.
-        joints_s_m: (n,) m, the joints from the tail end along the body.
-        points_w: (k, 2) m, the points at which forces act on the body.
-        points_s_m: (k,) m, these points from the tail end along the body.
-        forces_w: (k, 2) N, the forces at these points, the tether's force included.
+        joints_w: (n, 2) positions of the joints, m.
+        joints_s_m: (n,) arc lengths of the joints from the tail end along the body.
+        points_w: (k, 2) positions of the points at which forces act on the body, m.
+        points_s_m: (k,) arc lengths of these points from the tail end along the body.
+        forces_w: (k, 2) forces at these points in N, the tether's force included.
 
     Returns:
-        (n,) N·m.
+        (n,) torques in N·m.
     """
-    pushes = wrenches(np.asarray(points_w), np.asarray(forces_w))
-    return compute_joint_torques(np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), pushes)
+    wrenches = compute_wrenches(np.asarray(points_w), np.asarray(forces_w))
+    return compute_joint_torques(np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), wrenches)
 
 
 def compute_joint_torques(joints_w: Floats, joints_s_m: Floats, points_s_m: Floats, wrenches: Floats) -> Floats:
-    """Compute `bending_torque_nm` from the wrenches of the pushes.
+    """Compute the internal torque at every joint that balances the wrenches ahead of the joint.
 
     With the sums F and M over all wrenches ahead of a joint at p, M about the origin: torque = p x F - M.
 
     Args:
-        joints_w: (n, 2) m, the joints.
-        joints_s_m: (n,) m, the joints from the tail end along the body.
-        points_s_m: (k,) m, where the body is pushed, from the tail end along the body.
+        joints_w: (n, 2) positions of the joints, m.
+        joints_s_m: (n,) arc lengths of the joints from the tail end along the body.
+        points_s_m: (k,) arc lengths of the points at which forces act, from the tail end along the body.
         wrenches: (k, 3) force x and y in N, and moment about the origin in N·m.
+
+    Returns:
+        (n,) torques in N·m on the part of the body ahead of each joint, left turn positive.
     """
     is_ahead = (points_s_m > joints_s_m[:, None]).astype(np.float64)
     x_force, y_force, moment = (is_ahead @ wrenches).T
     return joints_w[:, 0] * y_force - joints_w[:, 1] * x_force - moment
 
 
-def add_tether(forces_n: ArrayLike, normals_w: ArrayLike, tether_w: ArrayLike) -> Floats:
-    """Return the forces at the three contacts, with the tether's force added at o_1.
+def add_tether_force(forces_n: ArrayLike, normals_w: ArrayLike, tether_w: ArrayLike) -> Floats:
+    """Return the forces at the three contacts as vectors, with the tether's force added at o_1.
 
     Args:
-        forces_n: (3,) N, along the normals.
-        normals_w: (3, 2) unit vectors.
-        tether_w: (2,) N.
+        forces_n: (3,) contact forces along the normals in N, tail to head.
+        normals_w: (3, 2) unit vectors from the obstacles into the body.
+        tether_w: (2,) force of the tether in N.
 
     Returns:
-        (3, 2) N.
+        (3, 2) forces in N.
     """
     forces_w = np.asarray(forces_n)[:, None] * np.asarray(normals_w)
     forces_w[0] += tether_w

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_gnc.control.obstacle_triplet.selection import Choice
+from snakesim_gnc.control.obstacle_triplet.selection import TripletChoice
 from snakesim_gnc.control.obstacle_triplet.statics import compute_joint_torques
 from snakesim_gnc.geometry.body_on_path import BodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
@@ -12,32 +12,35 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import World, WorldContact
 
 
-def compute_bending_nm(body: PlanarBody, body_pose: BodyPose, choice: Choice, force_n: float) -> Floats:
-    """Return the torque of every joint for the planned contact forces, (n_joints,) in N·m.
+def compute_bending_torques_nm(body: PlanarBody, body_pose: BodyPose, choice: TripletChoice, force_n: float) -> Floats:
+    """Compute the torque of every joint for the planned contact forces.
 
     Args:
-        body: the robot's body.
-        body_pose: the body as it lies on the path.
-        choice: the triplet that pushes.
-        force_n: propulsion force; the tether's force, which balances it, stands for all resistance.
+        body: Lengths and indices of the robot's body.
+        body_pose: The body as it lies on the path.
+        choice: The triplet that pushes.
+        force_n: Propulsion force. The tether's force, which balances it, stands for all resistance.
+
+    Returns:
+        (n_joints,) torques in N·m, left turn positive.
     """
-    places_m = np.array(choice.body_s_m)
-    unit_nm = compute_joint_torques(
-        body.joints_w(body_pose), body.joint_s_m, places_m, choice.triplet.unit_wrenches
+    contacts_s_m = np.array(choice.body_s_m)
+    unit_torques_nm = compute_joint_torques(
+        body.compute_joint_positions_w(body_pose), body.joint_s_m, contacts_s_m, choice.triplet.unit_wrenches
     )  # for 1 N of propulsion
-    return force_n * unit_nm
+    return force_n * unit_torques_nm
 
 
 def make_contact_messages(
-    body: PlanarBody, world: World, choice: Choice, forces_n: Sequence[float]
+    body: PlanarBody, world: World, choice: TripletChoice, forces_n: Sequence[float]
 ) -> list[WorldContact]:
     """Return the three contacts of a triplet with their desired forces, as messages.
 
     Args:
-        body: the robot's body.
-        world: the world model, for the height of the body.
-        choice: the triplet, and where its contacts are on the body.
-        forces_n: desired force of each contact along its normal.
+        body: The robot's body.
+        world: The world model, for the height of the body.
+        choice: The triplet, and where its contacts are on the body.
+        forces_n: Desired force of each contact along its normal.
 
     Returns:
         The contacts, tail to head.
@@ -46,17 +49,17 @@ def make_contact_messages(
     messages: list[WorldContact] = []
     for contact, body_s_m, force_n in zip(choice.triplet.contacts, choice.body_s_m, forces_n, strict=True):
         x, y = contact.point_w
-        nx, ny = contact.normal_w
-        tx, ty = contact.tangent_w
+        normal_x, normal_y = contact.normal_w
+        tangent_x, tangent_y = contact.tangent_w
         messages.append(
             WorldContact(
-                link=body.link_at(body_s_m),
+                link=body.find_link_at(body_s_m),
                 obstacle=contact.obstacle,
                 body_s_m=body_s_m,
                 position_w=(x, y, height_m),
-                normal_w=(nx, ny, 0.0),
-                tangent_w=(tx, ty, 0.0),
-                force_w=(force_n * nx, force_n * ny, 0.0),
+                normal_w=(normal_x, normal_y, 0.0),
+                tangent_w=(tangent_x, tangent_y, 0.0),
+                force_w=(force_n * normal_x, force_n * normal_y, 0.0),
             )
         )
     return messages

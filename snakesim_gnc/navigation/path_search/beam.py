@@ -28,16 +28,16 @@ from collections.abc import Generator
 
 import numpy as np
 
-from snakesim_gnc.geometry.planar import sample_back_from_end, wrenches
+from snakesim_gnc.geometry.planar import compute_wrenches, sample_back_from_end
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_touched
-from snakesim_gnc.navigation.path_search.native_growth import NativeGrowth
+from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_obstacle_contacts
+from snakesim_gnc.navigation.path_search.native_growth import NativeExpander
 from snakesim_gnc.navigation.path_search.native_library import is_native_available
-from snakesim_gnc.navigation.path_search.path_growth import PathGrowth
+from snakesim_gnc.navigation.path_search.path_growth import PathExpander
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
-from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_body_arcs
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_arcs_per_body
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
-from snakesim_gnc.navigation.path_search.specified_growth import SpecifiedGrowth
+from snakesim_gnc.navigation.path_search.specified_growth import NumpyExpander
 from snakesim_hal.base.arrays import Floats
 
 # Where the search of a whole body begins: around the tail, and around its heading.
@@ -54,45 +54,45 @@ class BeamSearch:
         self,
         obstacles: ObstacleGrid,
         parameters: SearchParameters,
-        growth: type[PathGrowth] | None = None,
+        expander_class: type[PathExpander] | None = None,
     ) -> None:
         """Prepare to search paths on a map, from the head of a body or for the whole body.
 
         Args:
-            obstacles: the map.
-            parameters: the robot, and the cost weights.
-            growth: implementation that expands the layers of the search; None: the C library if it is installed,
-                otherwise NumPy. The paths are the same.
+            obstacles: The map.
+            parameters: Size of the robot's body, and the cost weights.
+            expander_class: Implementation that expands the layers of the search. None selects the C library if it is
+                installed, and NumPy otherwise. The paths are the same.
         """
         self._obstacles = obstacles
         self._parameters = parameters
-        self._body_arcs = count_body_arcs(parameters)
-        if growth is None:
-            growth = NativeGrowth if is_native_available() else SpecifiedGrowth
-        self._growth = growth
+        self._arcs_per_body = count_arcs_per_body(parameters)
+        if expander_class is None:
+            expander_class = NativeExpander if is_native_available() else NumpyExpander
+        self._expander_class = expander_class
 
     def search_ahead(self, body_w: Floats, goal_rad: float, steps: int) -> PathSearch:
         """Search the best path ahead of the head.
 
         Args:
             body_w: (n, 2) the body's curve, tail to head.
-            goal_rad: direction of travel.
-            steps: number of arcs.
+            goal_rad: Direction of travel.
+            steps: Number of arcs.
 
         Returns:
             A path of that many arcs, or of as many as there is room for; None if there is no room for one.
         """
-        initial_body_w = sample_back_from_end(body_w, STEP_M, self._body_arcs)
+        initial_body_w = sample_back_from_end(body_w, STEP_M, self._arcs_per_body)
         origin_w = body_w[-1]
-        middles_w, tangents = _middles_and_tangents(initial_body_w)
+        middles_w, tangents = _compute_chord_middles_and_tangents(initial_body_w)
         task = SearchTask(
             origin_w=origin_w,
             goal_rad=goal_rad,
             goal_w=np.array([np.cos(goal_rad), np.sin(goal_rad)]),
-            initial_drag_m=STEP_M * wrenches(middles_w - origin_w, tangents),
+            initial_drag_m=STEP_M * compute_wrenches(middles_w - origin_w, tangents),
         )
-        start = self._start_at_head(body_w, middles_w, tangents, task)
-        return (yield from self._grow(start, steps, task))
+        start = self._make_start_node_at_head(body_w, middles_w, tangents, task)
+        return (yield from self._expand_layers(start, steps, task))
 
     def search_whole_body(
         self, body_w: Floats, goal_rad: float, steps: int, max_sideways_m: float, failed_w: Floats | None = None
@@ -101,64 +101,91 @@ class BeamSearch:
 
         Args:
             body_w: (n, 2) the body's curve, tail to head, m.
-            goal_rad: direction of travel.
-            steps: number of arcs beyond the head.
-            max_sideways_m: maximum distance of the path from the present body.
+            goal_rad: Direction of travel.
+            steps: Number of arcs beyond the head.
+            max_sideways_m: Maximum distance of the path from the current body.
             failed_w: (k, 2) points of paths on which the body got stuck here, m; the search prefers other ways round.
 
         Returns:
             A path, which may have fewer arcs; None if there is none.
         """
-        initial_body_w = sample_back_from_end(body_w, STEP_M, self._body_arcs)
+        initial_body_w = sample_back_from_end(body_w, STEP_M, self._arcs_per_body)
         task = SearchTask(
             origin_w=body_w[-1],
             goal_rad=goal_rad,
             goal_w=np.array([np.cos(goal_rad), np.sin(goal_rad)]),
-            initial_drag_m=np.zeros((self._body_arcs, 3)),
+            initial_drag_m=np.zeros((self._arcs_per_body, 3)),
             initial_body_w=initial_body_w,
             max_sideways_m=max_sideways_m,
             failed_w=failed_w,
         )
-        return (yield from self._grow(_start_at_tail(initial_body_w), self._body_arcs + steps, task))
+        return (
+            yield from self._expand_layers(_make_start_nodes_at_tail(initial_body_w), self._arcs_per_body + steps, task)
+        )
 
-    def _grow(self, start: NodeLayer, steps: int, task: SearchTask) -> PathSearch:
-        """Expand layer after layer, and return the cheapest path."""
-        paths = self._growth(self._obstacles, self._parameters, task, start, steps)
+    def _expand_layers(self, start: NodeLayer, steps: int, task: SearchTask) -> PathSearch:
+        """Expand a number of layers of the search, and return the cheapest path.
+
+        Args:
+            start: Nodes of the first layer.
+            steps: Maximum number of arcs of the path.
+            task: Goal of the search, and the body from which it starts.
+
+        Yields:
+            The number of nodes that the next step expands, before doing it.
+
+        Returns:
+            The cheapest path, or None if no arc is free.
+        """
+        expander = self._expander_class(self._obstacles, self._parameters, task, start, steps)
         for _ in range(steps):
-            yield paths.node_count
-            if not paths.grow():
+            yield expander.node_count
+            if not expander.expand_layer():
                 break
-        return paths.trace_cheapest()
+        return expander.trace_cheapest()
 
-    def _start_at_head(self, body_w: Floats, middles_w: Floats, tangents: Floats, task: SearchTask) -> NodeLayer:
-        """Return the node of the body as it lies, with its contacts. middles_w, tangents: (a, 2) of its arcs."""
+    def _make_start_node_at_head(
+        self, body_w: Floats, middles_w: Floats, tangents: Floats, task: SearchTask
+    ) -> NodeLayer:
+        """Make the start node of a search ahead of the head: the body as it lies, with its contacts and drag.
+
+        Args:
+            body_w: (n, 2) the body's curve, tail to head, m.
+            middles_w: (a, 2) middles of the a arcs of the body, m.
+            tangents: (a, 2) unit vectors along these arcs.
+            task: Goal of the search, and drag of the body.
+        """
         ahead = body_w[-1:] - body_w[-2:-1]
         node = make_start_nodes(body_w[-1:], np.arctan2(ahead[:, 1], ahead[:, 0]))
         node.drag_m = task.initial_drag_m.sum(axis=0)[None]
-        touched = find_touched(self._obstacles, middles_w, tangents, self._parameters, task)
-        for arc in np.flatnonzero(touched.is_usable):
-            s_m = -STEP_M * (self._body_arcs - int(arc) - 0.5)
+        contacts = find_obstacle_contacts(self._obstacles, middles_w, tangents, self._parameters, task)
+        for arc in np.flatnonzero(contacts.is_usable):
+            s_m = -STEP_M * (self._arcs_per_body - int(arc) - 0.5)
             row = slice(arc, arc + 1)
             node.add_contacts(
-                touched.is_usable[row], touched.obstacle[row], touched.gap_m[row], touched.wrench[row], s_m
+                contacts.is_usable[row], contacts.obstacle[row], contacts.gap_m[row], contacts.wrench[row], s_m
             )
-        node.margin_n = compute_node_margins_n(node, self._parameters)
+        node.propulsion_margin_n = compute_node_margins_n(node, self._parameters)
         return node
 
 
-def _middles_and_tangents(points_w: Floats) -> tuple[Floats, Floats]:
-    """Return the middles and unit directions, (k, 2) each, of the chords between points (k + 1, 2)."""
+def _compute_chord_middles_and_tangents(points_w: Floats) -> tuple[Floats, Floats]:
+    """Return the middles (k, 2) and the unit vectors (k, 2) of the k chords between successive points (k + 1, 2)."""
     chords = np.diff(points_w, axis=0)
     lengths_m = np.maximum(np.hypot(chords[:, 0], chords[:, 1]), 1e-9)
     return 0.5 * (points_w[1:] + points_w[:-1]), chords / lengths_m[:, None]
 
 
-def _start_at_tail(initial_body_w: Floats) -> NodeLayer:
-    """Return nodes around the tail end of a lying body, as starts of the path of the whole body."""
+def _make_start_nodes_at_tail(initial_body_w: Floats) -> NodeLayer:
+    """Make the start nodes of a search for the whole body: positions and headings around its tail end.
+
+    Args:
+        initial_body_w: (a + 1, 2) points of the body as it lies, tail to head, m.
+    """
     tail_w = initial_body_w[0]
     ahead = initial_body_w[1] - tail_w
     heading_rad = float(np.arctan2(ahead[1], ahead[0]))
     left = np.array([-np.sin(heading_rad), np.cos(heading_rad)])
-    turns = len(TAIL_TURNS_RAD)
-    points_w = np.concatenate([np.tile(tail_w + offset_m * left, (turns, 1)) for offset_m in TAIL_OFFSETS_M])
+    turn_count = len(TAIL_TURNS_RAD)
+    points_w = np.concatenate([np.tile(tail_w + offset_m * left, (turn_count, 1)) for offset_m in TAIL_OFFSETS_M])
     return make_start_nodes(points_w, np.tile(heading_rad + TAIL_TURNS_RAD, len(TAIL_OFFSETS_M)))

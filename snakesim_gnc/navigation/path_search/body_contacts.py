@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.geometry.planar import wrenches
+from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
 from snakesim_gnc.navigation.path_search.margin import compute_margins_n
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer
@@ -22,7 +22,7 @@ Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class TouchedObstacles:
+class ObstacleContacts:
     """The nearest obstacle at each of n points on the axes of bodies, and whether it is a contact there."""
 
     propulsion: Floats  # (n,) normal . goal, -1 to 1: positive propels, negative brakes; 0 without a contact
@@ -32,20 +32,20 @@ class TouchedObstacles:
     wrench: Floats  # (n, 3) of a normal force of 1 N with its friction: fx, fy, moment about the task's origin
 
 
-def find_touched(
+def find_obstacle_contacts(
     obstacles: ObstacleGrid, points_w: Floats, tangents: Floats, parameters: SearchParameters, task: SearchTask
-) -> TouchedObstacles:
+) -> ObstacleContacts:
     """Find the obstacles that bodies touch at points on their axes, and the force that these contacts give.
 
     A contact is a small gap at the side of the body. Obstacles ahead of the body, which a head would bump into, are not
     contacts. Friction acts against the motion along the tangent.
 
     Args:
-        obstacles: the map.
+        obstacles: The map.
         points_w: (n, 2) the points, m.
         tangents: (n, 2) unit vectors along the axes.
-        parameters: the robot, and the assumed friction of obstacles.
-        task: direction of the goal, and the origin of moments.
+        parameters: Size of the robot's body, and the assumed friction of obstacles.
+        task: Direction of the goal, and the origin of moments.
 
     Returns:
         For each point, the nearest obstacle, the gap, whether it is a usable contact, and the wrench of 1 N there.
@@ -53,19 +53,19 @@ def find_touched(
     nearest = obstacles.find_nearest(points_w[:, 0], points_w[:, 1])
     normals = nearest.normal_w
     gap_m = nearest.distance_m - parameters.radius_m
-    has_obstacle = nearest.obstacle != NO_OBSTACLE
+    has_obstacle = nearest.obstacle_index != NO_OBSTACLE
     is_close = gap_m < parameters.contact_distance_m
     is_at_side = np.abs(_dot(normals, tangents)) < MAX_FRONTAL
     is_contact = has_obstacle & is_close & is_at_side
     propulsion = _dot(normals, task.goal_w)
-    contact_point_m = points_w - normals * parameters.radius_m - task.origin_w  # on the skin, from the origin
+    contact_points_m = points_w - normals * parameters.radius_m - task.origin_w  # on the skin, from the origin
     unit_force = normals - parameters.assumed_obstacle_friction * tangents
-    return TouchedObstacles(
+    return ObstacleContacts(
         propulsion=np.where(is_contact, propulsion, 0.0),
         is_usable=is_contact & (propulsion > MIN_PUSH),
-        obstacle=nearest.obstacle,
+        obstacle=nearest.obstacle_index,
         gap_m=gap_m,
-        wrench=wrenches(contact_point_m, unit_force),
+        wrench=compute_wrenches(contact_points_m, unit_force),
     )
 
 
@@ -74,12 +74,12 @@ def compute_node_margins_n(nodes: NodeLayer, parameters: SearchParameters) -> Fl
 
     Contacts near the tail end and near the head are left out, because the body cannot push there.
     """
-    first_s_m = nodes.s_m - parameters.body_length_m + parameters.unused_tail_m
-    last_s_m = nodes.s_m - parameters.unused_head_m
+    first_s_m = nodes.path_length_m - parameters.body_length_m + parameters.unused_tail_m
+    last_s_m = nodes.path_length_m - parameters.unused_head_m
     is_usable = (nodes.contact_s_m >= first_s_m) & (nodes.contact_s_m <= last_s_m)
     usable_wrenches = np.where(is_usable[..., None], nodes.contact_wrench, 0.0)
-    drag_of_1_n = nodes.drag_m / parameters.body_length_m  # wrench of a drag of 1 N, spread over the whole body
-    return compute_margins_n(usable_wrenches, drag_of_1_n)
+    drag_per_newton = nodes.drag_m / parameters.body_length_m  # wrench of a drag of 1 N, spread over the whole body
+    return compute_margins_n(usable_wrenches, drag_per_newton)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

@@ -25,11 +25,15 @@ MIN_FORCE_PER_N = 1e-9  # avoids a division by zero
 
 
 def compute_margins_n(contacts: Floats, drag: Floats) -> Floats:
-    """Return the propulsion margin F* of n bodies, (n,); zero where no three contacts can push.
+    """Compute the propulsion margin F* of n bodies.
 
     Args:
         contacts: (n, k, 3) wrenches [d_c ; o_c x d_c] of unit pushes, zero where a body has fewer than k contacts.
-        drag: (n, 3) right-hand side for F = 1 N. All moments are about one point near the bodies.
+        drag: (n, 3) wrench of the drag for F = 1 N, which is the right-hand side of the balance. All moments are about
+            one point near the bodies.
+
+    Returns:
+        (n,) margins in N; 0 where no three contacts can push.
     """
     margins_n = np.zeros(len(contacts))
     is_contact: NDArray[np.bool_] = np.any(contacts != 0.0, axis=2)
@@ -38,12 +42,12 @@ def compute_margins_n(contacts: Floats, drag: Floats) -> Floats:
     for count in range(3, contacts.shape[1] + 1):
         rows = np.flatnonzero(contact_count == count)
         if len(rows):
-            packed = contacts[rows][is_contact[rows]].reshape(-1, count, 3)
-            margins_n[rows] = _margins_with_all_contacts_n(packed, drag[rows])
+            packed_contacts = contacts[rows][is_contact[rows]].reshape(-1, count, 3)
+            margins_n[rows] = _compute_margins_with_all_contacts_n(packed_contacts, drag[rows])
     return margins_n
 
 
-def _margins_with_all_contacts_n(contacts: Floats, drag: Floats) -> Floats:
+def _compute_margins_with_all_contacts_n(contacts: Floats, drag: Floats) -> Floats:
     """Return the propulsion margins of n bodies that all have k contacts.
 
     The margin is the largest force along the body that any three contacts can balance within the limit of contact
@@ -60,7 +64,7 @@ def _margins_with_all_contacts_n(contacts: Floats, drag: Floats) -> Floats:
     """
     scaled = contacts * WRENCH_SCALE
     scaled_drag = drag * WRENCH_SCALE
-    first, second, third = _sets_of_three(contacts.shape[1])
+    first, second, third = _list_contact_triples(contacts.shape[1])
     a = scaled[:, first].transpose(2, 0, 1)  # (3, n, sets)
     b = scaled[:, second].transpose(2, 0, 1)
     c = scaled[:, third].transpose(2, 0, 1)
@@ -69,16 +73,18 @@ def _margins_with_all_contacts_n(contacts: Floats, drag: Floats) -> Floats:
     d_cross_a = _cross(d, a)
     volume = _dot(a, b_cross_c)
     is_regular = np.abs(volume) > MIN_DETERMINANT
-    inverse = 1.0 / np.where(is_regular, volume, 1.0)
-    forces = np.stack([_dot(d, b_cross_c) * inverse, -_dot(c, d_cross_a) * inverse, _dot(b, d_cross_a) * inverse])
+    inverse_volume = 1.0 / np.where(is_regular, volume, 1.0)
+    forces = np.stack(
+        [_dot(d, b_cross_c) * inverse_volume, -_dot(c, d_cross_a) * inverse_volume, _dot(b, d_cross_a) * inverse_volume]
+    )
     can_push = is_regular & (forces.min(axis=0) >= 0.0)
     max_force = np.maximum(forces.max(axis=0), MIN_FORCE_PER_N)
     return MAX_CONTACT_FORCE_N / np.where(can_push, max_force, np.inf).min(axis=1)
 
 
 @cache
-def _sets_of_three(count: int) -> tuple[NDArray[np.intp], ...]:
-    """Return the indices of the first, second and third contact of all sets of three."""
+def _list_contact_triples(count: int) -> tuple[NDArray[np.intp], ...]:
+    """Return the indices of the first, second and third contact of all sets of three out of `count` contacts."""
     indices = np.array(list(combinations(range(count), 3)), dtype=np.intp).reshape(-1, 3)
     return indices[:, 0], indices[:, 1], indices[:, 2]
 

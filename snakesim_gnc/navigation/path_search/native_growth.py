@@ -13,31 +13,31 @@ from numpy.typing import NDArray
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.path_search import margin, search_parameters
 from snakesim_gnc.navigation.path_search.native_library import (
-    INTEGER,
-    NO_LAYER_ROOM,
-    NODE,
-    NUMBER,
-    NativeGrowthError,
+    FLOAT_DTYPE,
+    INTEGER_DTYPE,
+    LAYER_LIMIT_REACHED,
+    NODE_DTYPE,
     NativeLayout,
     NativeMemory,
     NativeSearch,
-    explain_absence,
+    PlannerLibraryError,
+    explain_missing_library,
     load_library,
 )
-from snakesim_gnc.navigation.path_search.path_growth import PathGrowth
+from snakesim_gnc.navigation.path_search.path_growth import PathExpander
 from snakesim_gnc.navigation.path_search.search_arcs import ArcTable
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer
-from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_body_arcs
+from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_arcs_per_body
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 
 Array = NDArray[Any]
 
 
-class NativeGrowth(PathGrowth):
+class NativeExpander(PathExpander):
     """Grows paths with the C library.
 
     Raises:
-        NativeGrowthError: by the constructor, if the C library is not installed or an array has a wrong size; by
+        PlannerLibraryError: By the constructor, if the C library is not installed or an array has a wrong size; by
             `grow`, if there are as many layers as were requested.
     """
 
@@ -47,46 +47,47 @@ class NativeGrowth(PathGrowth):
         """Copy a search into the structures of the C library, which then expands it layer by layer.
 
         Args:
-            obstacles: the map.
-            parameters: the robot, and the cost weights.
-            task: goal of the search, and the body from which it starts.
-            start: nodes of the first layer.
-            steps: maximum number of layers after the first.
+            obstacles: The map.
+            parameters: Size of the robot's body, and the cost weights.
+            task: Goal of the search, and the body from which it starts.
+            start: Nodes of the first layer.
+            steps: Maximum number of layers after the first.
 
         Raises:
-            NativeGrowthError: the C library is not installed.
+            PlannerLibraryError: The C library is not installed.
         """
         library = load_library()
         if library is None:
-            raise NativeGrowthError(f"there is no C library of the planner: {explain_absence()}")
-        self._expand = library.expand
-        self._node_room = max(parameters.kept_nodes, len(start.x_m))
-        self._layer_room = steps + 1
+            raise PlannerLibraryError(f"there is no C library of the planner: {explain_missing_library()}")
+        self._expand_in_c = library.expand
+        self._max_nodes_per_layer = max(parameters.kept_nodes, len(start.x_m))
+        self._max_layers = steps + 1
         self._memory = NativeMemory()
 
-        self._search = NativeSearch()
-        self._search.grid = obstacles.make_native_grid(self._memory)
+        self._native_search = NativeSearch()
+        self._native_search.grid = obstacles.make_native_grid(self._memory)
         self._fill_arc_table(ArcTable(parameters))
         self._fill_parameters(parameters)
         self._fill_task(task, parameters)
         self._fill_layers(start)
-        self._fill_scratch(library.layout, len(parameters.curvatures_per_m))
+        self._allocate_scratch_memory(library.layout, len(parameters.curvatures_per_m))
 
     @property
     def node_count(self) -> int:
-        return self._search.layers.node_count
+        return self._native_search.layers.node_count
 
-    def grow(self) -> bool:
-        added = self._expand(ctypes.byref(self._search))
-        if added == NO_LAYER_ROOM:
-            raise NativeGrowthError(f"the paths have {self._layer_room - 1} arcs already, as many as were asked for")
-        return added > 0
+    def expand_layer(self) -> bool:
+        added_count = self._expand_in_c(ctypes.byref(self._native_search))
+        if added_count == LAYER_LIMIT_REACHED:
+            raise PlannerLibraryError(f"the paths have {self._max_layers - 1} arcs already, as many as were asked for")
+        return added_count > 0
 
     def trace_cheapest(self) -> SearchedPath | None:
-        layers = self._search.layers
+        """Follow the parents of the cheapest node of the newest layer back to the start, and return that path."""
+        layers = self._native_search.layers
         if layers.layer_count == 1:
             return None
-        newest = self._node_pair[(layers.layer_count - 1) % 2]["cost_m"][: layers.node_count]
+        newest = self._alternating_nodes[(layers.layer_count - 1) % 2]["cost_m"][: layers.node_count]
         row = int(np.argmin(newest))
         cost_m = float(newest[row])
         points: list[tuple[float, float]] = []
@@ -98,19 +99,20 @@ class NativeGrowth(PathGrowth):
         return SearchedPath(np.array(points[::-1]), np.array(margins[::-1]), cost_m)
 
     def _fill_arc_table(self, arcs: ArcTable) -> None:
-        table = self._search.arc_table
+        """Copy the table of arcs, which all nodes share, into the structure that C reads."""
+        table = self._native_search.arc_table
         curvatures_per_m = arcs.curvatures_per_m
         shape = (len(curvatures_per_m),)
         table.count = len(curvatures_per_m)
-        table.curvature_per_m = self._memory.pass_array("the curvatures", curvatures_per_m, shape)
-        table.turn_rad = self._memory.pass_array("the turns", curvatures_per_m * STEP_M, shape)
-        table.half_turn_rad = self._memory.pass_array("the half turns", 0.5 * curvatures_per_m * STEP_M, shape)
-        table.end_ahead_m = self._memory.pass_array("the ends of the arcs", arcs.end_m[0], shape)
-        table.end_left_m = self._memory.pass_array("the ends of the arcs", arcs.end_m[1], shape)
-        table.middle_ahead_m = self._memory.pass_array("the middles of the arcs", arcs.middle_m[0], shape)
-        table.middle_left_m = self._memory.pass_array("the middles of the arcs", arcs.middle_m[1], shape)
-        table.needed_inside_m = self._memory.pass_array("the needed distances", arcs.needed_inside_m, shape)
-        table.surely_clear_m = self._memory.pass_array("the clear distances", arcs.surely_clear_m, shape)
+        table.curvature_per_m = self._memory.get_array_address("the curvatures", curvatures_per_m, shape)
+        table.turn_rad = self._memory.get_array_address("the turns", curvatures_per_m * STEP_M, shape)
+        table.half_turn_rad = self._memory.get_array_address("the half turns", 0.5 * curvatures_per_m * STEP_M, shape)
+        table.end_ahead_m = self._memory.get_array_address("the ends of the arcs", arcs.end_m[0], shape)
+        table.end_left_m = self._memory.get_array_address("the ends of the arcs", arcs.end_m[1], shape)
+        table.middle_ahead_m = self._memory.get_array_address("the middles of the arcs", arcs.middle_m[0], shape)
+        table.middle_left_m = self._memory.get_array_address("the middles of the arcs", arcs.middle_m[1], shape)
+        table.needed_inside_m = self._memory.get_array_address("the needed distances", arcs.needed_inside_m, shape)
+        table.surely_clear_m = self._memory.get_array_address("the clear distances", arcs.surely_clear_m, shape)
         table.needed_m = arcs.needed_m
         table.surely_blocked_m = arcs.surely_blocked_m
 
@@ -118,13 +120,13 @@ class NativeGrowth(PathGrowth):
         """Copy the robot, the cost weights and the constants of the search into the structure that C reads.
 
         Args:
-            parameters: parameters of the search.
+            parameters: Parameters of the search.
         """
-        native = self._search.parameters
+        native = self._native_search.parameters
         # The robot.
         native.step_m = STEP_M
         native.body_length_m = parameters.body_length_m
-        native.body_arcs = count_body_arcs(parameters)
+        native.body_arcs = count_arcs_per_body(parameters)
         native.radius_m = parameters.radius_m
         native.contact_distance_m = parameters.contact_distance_m
         native.max_frontal = search_parameters.MAX_FRONTAL
@@ -164,82 +166,96 @@ class NativeGrowth(PathGrowth):
         """Copy the goal of the search and the body from which it starts into the structure that C reads.
 
         Args:
-            task: the task of the search.
-            parameters: the robot, whose length gives the number of arcs of the body.
+            task: The task of the search.
+            parameters: The robot, whose length gives the number of arcs of the body.
         """
-        native = self._search.task
+        native = self._native_search.task
         native.origin_x_m, native.origin_y_m = task.origin_w
         native.goal_rad = task.goal_rad
         native.goal_x, native.goal_y = task.goal_w
-        body_arcs = count_body_arcs(parameters)
-        native.lying_drag_m = self._memory.pass_array("the drag of the lying body", task.initial_drag_m, (body_arcs, 3))
+        body_arcs = count_arcs_per_body(parameters)
+        native.lying_drag_m = self._memory.get_array_address(
+            "the drag of the lying body", task.initial_drag_m, (body_arcs, 3)
+        )
         native.is_relaid = task.initial_body_w is not None
         if task.initial_body_w is not None:
             native.lying_count = len(task.initial_body_w)
-            native.lying_m = self._memory.pass_array("the lying body", task.initial_body_w, (body_arcs + 1, 2))
+            native.lying_m = self._memory.get_array_address("the lying body", task.initial_body_w, (body_arcs + 1, 2))
         native.max_sideways_m = task.max_sideways_m
         if task.failed_w is not None:
             native.failed_count = len(task.failed_w)
-            native.failed_m = self._memory.pass_array("the failed paths", task.failed_w, (len(task.failed_w), 2))
+            native.failed_m = self._memory.get_array_address("the failed paths", task.failed_w, (len(task.failed_w), 2))
 
     def _fill_layers(self, start: NodeLayer) -> None:
         """Allocate the layers of the search for C, and copy the nodes of the first layer into them.
 
-        Of all layers, parents, positions, margins and drag are kept, so that a path can be traced back. Complete nodes
-        are kept for two layers, which C reads and writes by turns.
+        Parents, positions, margins and drag of all layers are kept, so that a path can be traced back. Complete nodes
+        are kept for two layers only, which C reads and writes alternately.
 
         Args:
-            start: nodes of the first layer.
+            start: Nodes of the first layer.
         """
-        count = len(start.x_m)
-        history = (self._layer_room, self._node_room)
-        self._parent = np.empty(history, dtype=INTEGER)
-        self._x_m = np.empty(history)
-        self._y_m = np.empty(history)
-        self._margin_n = np.empty(history)
-        arc_drag_m = np.empty((*history, 3))
-        self._parent[0, :count] = start.parent
-        self._x_m[0, :count] = start.x_m
-        self._y_m[0, :count] = start.y_m
-        self._margin_n[0, :count] = start.margin_n
-        arc_drag_m[0, :count] = start.arc_drag_m
+        start_node_count = len(start.x_m)
+        history_shape = (self._max_layers, self._max_nodes_per_layer)
+        self._parent = np.empty(history_shape, dtype=INTEGER_DTYPE)
+        self._x_m = np.empty(history_shape)
+        self._y_m = np.empty(history_shape)
+        self._margin_n = np.empty(history_shape)
+        arc_drag_m = np.empty((*history_shape, 3))
+        self._parent[0, :start_node_count] = start.parent
+        self._x_m[0, :start_node_count] = start.x_m
+        self._y_m[0, :start_node_count] = start.y_m
+        self._margin_n[0, :start_node_count] = start.propulsion_margin_n
+        arc_drag_m[0, :start_node_count] = start.arc_drag_m
 
         # Layers with even numbers are in the first array, the others in the second.
-        self._node_pair = (_make_nodes(start, self._node_room), np.empty(self._node_room, dtype=NODE))
+        self._alternating_nodes = (
+            _make_node_array(start, self._max_nodes_per_layer),
+            np.empty(self._max_nodes_per_layer, dtype=NODE_DTYPE),
+        )
 
-        layers = self._search.layers
+        layers = self._native_search.layers
         layers.layer_count = 1
-        layers.layer_room = self._layer_room
-        layers.node_room = self._node_room
-        layers.node_count = count
-        layers.s_m = start.s_m
-        layers.parents = self._memory.pass_array("the parents", self._node_pair[0], (self._node_room,), NODE)
-        layers.children = self._memory.pass_array("the children", self._node_pair[1], (self._node_room,), NODE)
-        layers.parent = self._memory.pass_array("the rows of the parents", self._parent, history, INTEGER)
-        layers.x_m = self._memory.pass_array("the history of x", self._x_m, history)
-        layers.y_m = self._memory.pass_array("the history of y", self._y_m, history)
-        layers.margin_n = self._memory.pass_array("the history of margins", self._margin_n, history)
-        layers.arc_drag_m = self._memory.pass_array("the history of drag", arc_drag_m, (*history, 3))
+        layers.layer_room = self._max_layers
+        layers.node_room = self._max_nodes_per_layer
+        layers.node_count = start_node_count
+        layers.s_m = start.path_length_m
+        layers.parents = self._memory.get_array_address(
+            "the parents", self._alternating_nodes[0], (self._max_nodes_per_layer,), NODE_DTYPE
+        )
+        layers.children = self._memory.get_array_address(
+            "the children", self._alternating_nodes[1], (self._max_nodes_per_layer,), NODE_DTYPE
+        )
+        layers.parent = self._memory.get_array_address(
+            "the rows of the parents", self._parent, history_shape, INTEGER_DTYPE
+        )
+        layers.x_m = self._memory.get_array_address("the history of x", self._x_m, history_shape)
+        layers.y_m = self._memory.get_array_address("the history of y", self._y_m, history_shape)
+        layers.margin_n = self._memory.get_array_address("the history of margins", self._margin_n, history_shape)
+        layers.arc_drag_m = self._memory.get_array_address("the history of drag", arc_drag_m, (*history_shape, 3))
 
-    def _fill_scratch(self, layout: NativeLayout, curvature_count: int) -> None:
-        scratch = self._search.scratch
-        arc_room = self._node_room * curvature_count
-        entry_room = 1 << (arc_room * 5 // 4).bit_length()  # a power of two; the table is at most 80 % full
+    def _allocate_scratch_memory(self, layout: NativeLayout, curvature_count: int) -> None:
+        """Allocate the memory that C needs while it expands a layer: arcs, sort keys and a hash table of cells."""
+        scratch = self._native_search.scratch
+        max_arcs = self._max_nodes_per_layer * curvature_count
+        entry_room = 1 << (max_arcs * 5 // 4).bit_length()  # a power of two; the table is at most 80 % full
         scratch.entry_room = entry_room
         scratch.stamp = 0
-        scratch.arcs = self._memory.provide(arc_room * layout.arc)
-        scratch.keys = self._memory.provide(arc_room * layout.sort_key)
-        scratch.spare_keys = self._memory.provide(arc_room * layout.sort_key)
-        scratch.candidates = self._memory.provide(arc_room * layout.candidate)
-        scratch.entries = self._memory.provide(entry_room * layout.cell_entry)
-        scratch.tail_nodes = self._memory.provide(self._node_room * INTEGER.itemsize)
-        scratch.near_failed_m = self._memory.provide(max(self._search.task.failed_count, 1) * 2 * NUMBER.itemsize)
+        scratch.arcs = self._memory.allocate(max_arcs * layout.arc)
+        scratch.keys = self._memory.allocate(max_arcs * layout.sort_key)
+        scratch.spare_keys = self._memory.allocate(max_arcs * layout.sort_key)
+        scratch.candidates = self._memory.allocate(max_arcs * layout.candidate)
+        scratch.entries = self._memory.allocate(entry_room * layout.cell_entry)
+        scratch.tail_nodes = self._memory.allocate(self._max_nodes_per_layer * INTEGER_DTYPE.itemsize)
+        scratch.near_failed_m = self._memory.allocate(
+            max(self._native_search.task.failed_count, 1) * 2 * FLOAT_DTYPE.itemsize
+        )
 
 
-def _make_nodes(layer: NodeLayer, room: int) -> Array:
+def _make_node_array(layer: NodeLayer, capacity: int) -> Array:
     """Return the nodes of a layer, in an array with room for more."""
     count = len(layer.x_m)
-    nodes = np.zeros(room, dtype=NODE)
+    nodes = np.zeros(capacity, dtype=NODE_DTYPE)
     used = nodes[:count]
     used["x_m"] = layer.x_m
     used["y_m"] = layer.y_m

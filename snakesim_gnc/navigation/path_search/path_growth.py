@@ -8,21 +8,21 @@ from snakesim_gnc.navigation.path_search.search_parameters import SearchParamete
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 
 
-class PathGrowth(ABC):
+class PathExpander(ABC):
     """The paths of one search, which grow by one arc at a time."""
 
     @abstractmethod
     def __init__(
         self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
     ) -> None:
-        """Begin with the start nodes as the first layer.
+        """Start with the start nodes as the first layer.
 
         Args:
-            obstacles: the map.
-            parameters: the robot, and the costs.
-            task: the search.
-            start: the nodes from which the paths grow.
-            steps: the largest number of arcs.
+            obstacles: The map.
+            parameters: Size of the robot's body, and the cost weights.
+            task: Goal of the search, and the body from which it starts.
+            start: The nodes from which the paths grow.
+            steps: Maximum number of arcs of a path.
         """
 
     @property
@@ -31,9 +31,13 @@ class PathGrowth(ABC):
         """Return the number of nodes in the newest layer."""
 
     @abstractmethod
-    def grow(self) -> bool:
-        """Add the best children of the newest layer as a layer. Return False, and change nothing, if no arc is free."""
+    def expand_layer(self) -> bool:
+        """Add the best children of the newest layer as another layer.
+
+        Returns:
+            Whether a layer was added; False, without any change, if no arc is free.
+        """
 
     @abstractmethod
     def trace_cheapest(self) -> SearchedPath | None:
-        """Follow the parents of the cheapest node of the newest layer back to the start; None if nothing has grown."""
+        """Return the path to the cheapest node of the newest layer; None if no layer was added to the first one."""

@@ -37,7 +37,7 @@ class ArcTable:
         """Precompute what all arcs of a search have in common: their ends, their middles, and the distances they need.
 
         Args:
-            parameters: the robot's size and clearance, and the c curvatures among which each step of a path chooses.
+            parameters: The robot's size and clearance, and the c curvatures among which each step of a path chooses.
         """
         self.curvatures_per_m = np.array(parameters.curvatures_per_m)  # (c,)
 
@@ -59,8 +59,8 @@ class ArcTable:
             [middle_chord_m * np.cos(0.5 * half_turn_rad), middle_chord_m * np.sin(0.5 * half_turn_rad)]
         )
 
-    def steer(self, parents: NodeLayer) -> SearchArcs:
-        """Return the arcs with every curvature from every parent."""
+    def make_arcs(self, parents: NodeLayer) -> SearchArcs:
+        """Make the arcs with every curvature from every parent node."""
         cosine = np.cos(parents.heading_rad)[:, None]
         sine = np.sin(parents.heading_rad)[:, None]
         x_m = parents.x_m[:, None]
@@ -75,19 +75,29 @@ class ArcTable:
             heading_rad=heading_rad,
         )
 
-    def clears_obstacles(self, obstacles: ObstacleGrid, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Bools:
-        """Return whether the body clears all obstacles at poses on the arcs, (n, c). x_m, y_m, heading_rad: (n, c).
+    def find_clear_poses(self, obstacles: ObstacleGrid, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Bools:
+        """Find the poses on the arcs at which the body clears all obstacles.
 
-        Most poses are decided by the approximate distance; the exact one, with its normal, is computed for the others.
+        Most poses are decided by the approximate distance. The exact distance and its normal are computed only for the
+        others.
+
+        Args:
+            obstacles: The map.
+            x_m: (n, c) positions on the arcs in the world.
+            y_m: (n, c) positions on the arcs in the world.
+            heading_rad: (n, c) headings of the arcs at these positions.
+
+        Returns:
+            (n, c) whether the body clears all obstacles there.
         """
-        approximate_m = obstacles.approximate_distance_m(x_m, y_m)
+        approximate_m = obstacles.compute_approximate_distance_m(x_m, y_m)
         is_clear = approximate_m >= self.surely_clear_m
-        unsure = np.nonzero(~is_clear & (approximate_m >= self.surely_blocked_m))
-        nearest = obstacles.find_nearest(x_m[unsure], y_m[unsure])
-        heading = heading_rad[unsure]
-        curvature_index = unsure[1]
+        undecided = np.nonzero(~is_clear & (approximate_m >= self.surely_blocked_m))
+        nearest = obstacles.find_nearest(x_m[undecided], y_m[undecided])
+        heading = heading_rad[undecided]
+        curvature_index = undecided[1]
         normal_to_left = np.cos(heading) * nearest.normal_w[:, 1] - np.sin(heading) * nearest.normal_w[:, 0]
         is_inner_side = normal_to_left * np.sign(self.curvatures_per_m[curvature_index]) < 0
         needed_m = np.where(is_inner_side, self.needed_inside_m[curvature_index], self.needed_m)
-        is_clear[unsure] = nearest.distance_m >= needed_m
+        is_clear[undecided] = nearest.distance_m >= needed_m
         return is_clear

@@ -36,38 +36,40 @@ class NodeLayer:
     # What resists the body.
     drag_m: Floats  # (n, 3) integral of the tangent's wrench over the whole body: m, m, m²
     arc_drag_m: Floats  # (n, 3) the part of that integral over the arc that led here
-    margin_n: Floats  # (n,) propulsion margin F*
+    propulsion_margin_n: Floats  # (n,) propulsion margin F*
     # The same for all nodes of a layer.
-    s_m: float  # arc length from the start of the path
+    path_length_m: float  # arc length from the start of the path
 
     def select_rows(self, rows: Ints) -> "NodeLayer":
         """Return a layer with copies of some of the nodes."""
-        arrays = {field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "s_m"}
-        return NodeLayer(**arrays, s_m=self.s_m)
+        arrays = {
+            field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "path_length_m"
+        }
+        return NodeLayer(**arrays, path_length_m=self.path_length_m)
 
-    def add_contacts(self, touches: Bools, obstacle: Ints, gap_m: Floats, wrench: Floats, s_m: float) -> None:
+    def add_contacts(self, is_touching: Bools, obstacle: Ints, gap_m: Floats, wrench: Floats, s_m: float) -> None:
         """Store the contact of each node that touches an obstacle at an arc length.
 
         A body slides along an obstacle over several arcs. That is one contact, stored where the gap is smallest; its
         arc length is that of the newest arc. A contact with another obstacle takes a new slot and drops the oldest.
 
         Args:
-            touches: (n,) which nodes touch an obstacle there; the other rows are ignored.
+            is_touching: (n,) which nodes touch an obstacle there; the other rows are ignored.
             obstacle: (n,) index of the obstacle.
             gap_m: (n,) gap between skin and obstacle.
             wrench: (n, 3) wrench of a unit push.
-            s_m: arc length of the contact.
+            s_m: Arc length of the contact.
         """
-        is_same = touches & (self.obstacle[:, -1] == obstacle)
+        is_same = is_touching & (self.obstacle[:, -1] == obstacle)
         is_nearer = is_same & (gap_m < self.contact_gap_m[:, -1])
-        is_new = touches & ~is_same
+        is_new = is_touching & ~is_same
         for slots in (self.obstacle, self.contact_gap_m, self.contact_wrench, self.contact_s_m):
             slots[is_new, :-1] = slots[is_new, 1:]
         is_stored = is_new | is_nearer
         self.obstacle[is_stored, -1] = obstacle[is_stored]
         self.contact_gap_m[is_stored, -1] = gap_m[is_stored]
         self.contact_wrench[is_stored, -1] = wrench[is_stored]
-        self.contact_s_m[touches, -1] = s_m
+        self.contact_s_m[is_touching, -1] = s_m
 
 
 def make_start_nodes(points_w: Floats, headings_rad: Floats) -> NodeLayer:
@@ -91,24 +93,37 @@ def make_start_nodes(points_w: Floats, headings_rad: Floats) -> NodeLayer:
         contact_wrench=np.zeros((count, MAX_CONTACTS, 3)),
         drag_m=np.zeros((count, 3)),
         arc_drag_m=np.zeros((count, 3)),
-        margin_n=np.zeros(count),
-        s_m=0.0,
+        propulsion_margin_n=np.zeros(count),
+        path_length_m=0.0,
     )
 
 
-def number_cells(x_m: Floats, y_m: Floats, heading_rad: Floats, size_m: float, size_rad: float) -> NDArray[np.int64]:
-    """Return for each node, (n,), a number that nodes in the same cell of place and heading share."""
-    column = np.floor(x_m / size_m).astype(np.int64)
-    row = np.floor(y_m / size_m).astype(np.int64)
-    sector = np.floor(heading_rad / size_rad).astype(np.int64)
+def compute_cell_numbers(
+    x_m: Floats, y_m: Floats, heading_rad: Floats, cell_size_m: float, cell_size_rad: float
+) -> NDArray[np.int64]:
+    """Compute for each node the number of its cell of position and heading; nodes in the same cell share the number.
+
+    Args:
+        x_m: (n,) positions of the nodes in the world.
+        y_m: (n,) positions of the nodes in the world.
+        heading_rad: (n,) headings of the nodes.
+        cell_size_m: Size of a cell in x and y.
+        cell_size_rad: Size of a cell in heading.
+
+    Returns:
+        (n,) cell numbers. Distant cells may have the same number.
+    """
+    column = np.floor(x_m / cell_size_m).astype(np.int64)
+    row = np.floor(y_m / cell_size_m).astype(np.int64)
+    sector = np.floor(heading_rad / cell_size_rad).astype(np.int64)
     return (column * 100_003 + row) * 1009 + sector
 
 
 def count_earlier_in_cell(cells: NDArray[np.int64]) -> Ints:
-    """Return for each node, (n,), how many nodes before it are in the same cell."""
+    """Return for each node, (n,), how many nodes before it have the same cell number."""
     order = np.argsort(cells, kind="stable")
     is_first = np.concatenate(([True], np.diff(cells[order]) != 0))
-    starts = np.flatnonzero(is_first)
-    earlier = np.empty(len(order), dtype=np.intp)
-    earlier[order] = np.arange(len(order)) - starts[np.cumsum(is_first) - 1]
-    return earlier
+    cell_starts = np.flatnonzero(is_first)
+    earlier_counts = np.empty(len(order), dtype=np.intp)
+    earlier_counts[order] = np.arange(len(order)) - cell_starts[np.cumsum(is_first) - 1]
+    return earlier_counts

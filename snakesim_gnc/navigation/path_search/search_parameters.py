@@ -53,6 +53,6 @@ class SearchParameters:
     sideways_cost: float = 0.5
 
 
-def count_body_arcs(parameters: SearchParameters) -> int:
+def count_arcs_per_body(parameters: SearchParameters) -> int:
     """Return the length of the body as a number of arcs."""
     return round(parameters.body_length_m / STEP_M)

@@ -10,12 +10,12 @@ In shapes, n is the number of nodes and c the number of curvatures. Points and h
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.geometry.planar import wrenches
+from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_touched
-from snakesim_gnc.navigation.path_search.path_growth import PathGrowth
+from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_obstacle_contacts
+from snakesim_gnc.navigation.path_search.path_growth import PathExpander
 from snakesim_gnc.navigation.path_search.search_arcs import ArcTable, SearchArcs
-from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, count_earlier_in_cell, number_cells
+from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, compute_cell_numbers, count_earlier_in_cell
 from snakesim_gnc.navigation.path_search.search_parameters import (
     CANDIDATES_PER_KEPT_NODE,
     CELL_M,
@@ -26,7 +26,7 @@ from snakesim_gnc.navigation.path_search.search_parameters import (
     WIDE_CELL_M,
     WIDE_CELL_RAD,
     SearchParameters,
-    count_body_arcs,
+    count_arcs_per_body,
 )
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 from snakesim_hal.base.arrays import Floats
@@ -35,7 +35,7 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
 
-class SpecifiedGrowth(PathGrowth):
+class NumpyExpander(PathExpander):
     """Grows paths with NumPy, in the words of the cost's equation in `beam`."""
 
     def __init__(
@@ -46,28 +46,30 @@ class SpecifiedGrowth(PathGrowth):
         self._parameters = parameters
         self._task = task
         self._arc_table = ArcTable(parameters)
-        self._body_arcs = count_body_arcs(parameters)
+        self._arcs_per_body = count_arcs_per_body(parameters)
         self._layers = [start]
 
     @property
     def node_count(self) -> int:
         return len(self._layers[-1].x_m)
 
-    def grow(self) -> bool:
+    def expand_layer(self) -> bool:
+        """Add a layer with the best children of the newest one; return False if no arc is allowed."""
         parents = self._layers[-1]
-        arcs = self._arc_table.steer(parents)
-        sideways_m = self._distance_from_initial_body(arcs, parents.s_m)
-        is_allowed = self._find_allowed(arcs, sideways_m)
+        arcs = self._arc_table.make_arcs(parents)
+        sideways_m = self._compute_distance_from_initial_body_m(arcs, parents.path_length_m)
+        is_allowed = self._find_allowed_arcs(arcs, sideways_m)
         if not is_allowed.any():
             return False
-        cost_m = self._path_cost_m(parents, arcs, sideways_m)
-        candidates = self._pick_candidates(arcs, is_allowed, cost_m)
-        nodes = self._make_nodes(parents, arcs, cost_m, candidates)
-        self._add_contact_terms(nodes, arcs, candidates)
-        self._layers.append(self._thin_out(nodes))
+        cost_m = self._compute_path_costs_m(parents, arcs, sideways_m)
+        arc_indices = self._select_candidates(arcs, is_allowed, cost_m)
+        nodes = self._make_nodes(parents, arcs, cost_m, arc_indices)
+        self._add_contact_terms(nodes, arcs, arc_indices)
+        self._layers.append(self._keep_best_nodes(nodes))
         return True
 
     def trace_cheapest(self) -> SearchedPath | None:
+        """Follow the parents of the cheapest node of the newest layer back to the start, and return that path."""
         if len(self._layers) == 1:
             return None
         newest = self._layers[-1]
@@ -77,29 +79,43 @@ class SpecifiedGrowth(PathGrowth):
         margins: list[float] = []
         for layer in reversed(self._layers):
             points.append((layer.x_m[row], layer.y_m[row]))
-            margins.append(layer.margin_n[row])
+            margins.append(layer.propulsion_margin_n[row])
             row = int(layer.parent[row])
         return SearchedPath(np.array(points[::-1]), np.array(margins[::-1]), cost_m)
 
-    def _distance_from_initial_body(self, arcs: SearchArcs, parent_s_m: float) -> Floats | None:
-        """Return how far the ends of the arcs are from where the body lies at the same arc length, (n, c).
+    def _compute_distance_from_initial_body_m(self, arcs: SearchArcs, parent_s_m: float) -> Floats | None:
+        """Compute the distances of the ends of the arcs from where the body lies at the same arc length.
 
-        None if the search does not start at the tail, or if the arcs are ahead of the measured head.
+        Args:
+            arcs: (n, c) arcs, one for each node and curvature.
+            parent_s_m: Arc length at which the arcs begin.
+
+        Returns:
+            (n, c) distances in m, or None if the search does not start at the tail, or if the arcs are ahead of the
+            measured head.
         """
         initial_body_w = self._task.initial_body_w
         if initial_body_w is None:
             return None
-        end = round(parent_s_m / STEP_M) + 1
-        if end >= len(initial_body_w):
+        arc_end_index = round(parent_s_m / STEP_M) + 1
+        if arc_end_index >= len(initial_body_w):
             return None
-        return np.hypot(arcs.x_m - initial_body_w[end, 0], arcs.y_m - initial_body_w[end, 1])
+        return np.hypot(arcs.x_m - initial_body_w[arc_end_index, 0], arcs.y_m - initial_body_w[arc_end_index, 1])
 
-    def _find_allowed(self, arcs: SearchArcs, sideways_m: Floats | None) -> Bools:
-        """Return which arcs clear all obstacles and lead about the right way, (n, c)."""
-        is_allowed = self._arc_table.clears_obstacles(
+    def _find_allowed_arcs(self, arcs: SearchArcs, sideways_m: Floats | None) -> Bools:
+        """Find the arcs on which the body clears all obstacles and heads roughly towards the goal.
+
+        Args:
+            arcs: (n, c) arcs, one for each node and curvature.
+            sideways_m: (n, c) distance of the ends from the current body; None if this does not count.
+
+        Returns:
+            (n, c) whether each arc is allowed.
+        """
+        is_allowed = self._arc_table.find_clear_poses(
             self._obstacles, arcs.middle_x_m, arcs.middle_y_m, arcs.middle_heading_rad
         )
-        is_allowed &= self._arc_table.clears_obstacles(self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad)
+        is_allowed &= self._arc_table.find_clear_poses(self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad)
         from_goal_rad = arcs.heading_rad - self._task.goal_rad
         heading_error_rad = np.abs(np.remainder(from_goal_rad + np.pi, 2 * np.pi) - np.pi)
         is_allowed &= heading_error_rad < MAX_HEADING_ERROR_RAD
@@ -107,16 +123,16 @@ class SpecifiedGrowth(PathGrowth):
             is_allowed &= sideways_m < self._task.max_sideways_m
         return is_allowed
 
-    def _path_cost_m(self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None) -> Floats:
+    def _compute_path_costs_m(self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None) -> Floats:
         """Return the cost of the paths to the ends of the arcs, without the terms of the last contacts.
 
         It is the cost of the parent, plus length and change of curvature, minus progress towards the goal. A search of
-        the whole body also adds the distance from the present body and the closeness to paths that have failed.
+        the whole body also adds the distance from the current body and the closeness to paths that have failed.
 
         Args:
             parents: (n) nodes at which the arcs begin.
             arcs: (n, c) arcs, one for each node and curvature.
-            sideways_m: (n, c) distance of the ends from the present body; None if this does not count.
+            sideways_m: (n, c) distance of the ends from the current body; None if this does not count.
 
         Returns:
             (n, c) costs in m.
@@ -138,16 +154,25 @@ class SpecifiedGrowth(PathGrowth):
         if task.failed_w is not None:
             to_failed_x = arcs.x_m[..., None] - task.failed_w[:, 0]
             to_failed_y = arcs.y_m[..., None] - task.failed_w[:, 1]
-            to_failed_m = np.hypot(to_failed_x, to_failed_y).min(axis=-1)
-            closeness = np.maximum(1.0 - to_failed_m / FAILED_PATH_M, 0.0)
+            failed_path_distance_m = np.hypot(to_failed_x, to_failed_y).min(axis=-1)
+            closeness = np.maximum(1.0 - failed_path_distance_m / FAILED_PATH_M, 0.0)
             cost_m = cost_m + STEP_M * parameters.failed_path_cost * closeness
         return cost_m + STEP_M * parameters.sideways_cost * (sideways_m / task.max_sideways_m) ** 2
 
-    def _pick_candidates(self, arcs: SearchArcs, is_allowed: Bools, cost_m: Floats) -> Ints:
-        """Return the indices into the raveled arcs of the cheapest allowed one in each cell, the cheapest first."""
-        allowed = np.flatnonzero(is_allowed.ravel())
-        cheapest_first = allowed[np.argsort(cost_m.ravel()[allowed], kind="stable")]
-        cells = number_cells(
+    def _select_candidates(self, arcs: SearchArcs, is_allowed: Bools, cost_m: Floats) -> Ints:
+        """Select the cheapest allowed arc in each cell of position and heading, up to a maximum number.
+
+        Args:
+            arcs: (n, c) arcs, one for each node and curvature.
+            is_allowed: (n, c) whether each arc is allowed.
+            cost_m: (n, c) cost of the path to the end of each arc, m.
+
+        Returns:
+            Indices into the flattened arcs, the cheapest first.
+        """
+        allowed_indices = np.flatnonzero(is_allowed.ravel())
+        cheapest_first = allowed_indices[np.argsort(cost_m.ravel()[allowed_indices], kind="stable")]
+        cells = compute_cell_numbers(
             arcs.x_m.ravel()[cheapest_first],
             arcs.y_m.ravel()[cheapest_first],
             arcs.heading_rad.ravel()[cheapest_first],
@@ -158,41 +183,49 @@ class SpecifiedGrowth(PathGrowth):
         first_of_cell = np.sort(first_of_cell)
         return cheapest_first[first_of_cell[: CANDIDATES_PER_KEPT_NODE * self._parameters.kept_nodes]]
 
-    def _make_nodes(self, parents: NodeLayer, arcs: SearchArcs, cost_m: Floats, candidates: Ints) -> NodeLayer:
-        """Return nodes at the ends of some arcs, with the contacts and the drag of their parents."""
-        curvature_count = len(self._arc_table.curvatures_per_m)
-        parent_rows = candidates // curvature_count
-        nodes = parents.select_rows(parent_rows)
-        nodes.parent = parent_rows
-        nodes.x_m = arcs.x_m.ravel()[candidates]
-        nodes.y_m = arcs.y_m.ravel()[candidates]
-        nodes.heading_rad = arcs.heading_rad.ravel()[candidates]
-        nodes.curvature_per_m = self._arc_table.curvatures_per_m[candidates % curvature_count]
-        nodes.cost_m = cost_m.ravel()[candidates]
-        nodes.s_m = parents.s_m + STEP_M
-        return nodes
-
-    def _add_contact_terms(self, nodes: NodeLayer, arcs: SearchArcs, candidates: Ints) -> None:
-        """Add to new nodes what the body meets on their newest arcs: contacts, drag, and the costs of both.
-
-        A search of the whole body begins at the tail, and first follows the body where it already lies. Until the path
-        is one body length long, it is no complete body, and has no propulsion margin.
+    def _make_nodes(self, parents: NodeLayer, arcs: SearchArcs, cost_m: Floats, arc_indices: Ints) -> NodeLayer:
+        """Make nodes at the ends of the selected arcs, with the contacts and the drag of their parents.
 
         Args:
-            nodes: the n new nodes; their contacts, drag, margins and costs are changed.
-            arcs: all arcs from the parents of these nodes.
-            candidates: (n,) index of each node's arc among the flattened arcs.
+            parents: (n) nodes at which the arcs begin.
+            arcs: (n, c) arcs, one for each node and curvature.
+            cost_m: (n, c) cost of the path to the end of each arc, m.
+            arc_indices: Indices of the selected arcs among the flattened arcs.
         """
-        middles_w = np.stack([arcs.middle_x_m.ravel()[candidates], arcs.middle_y_m.ravel()[candidates]], axis=-1)
-        headings_rad = arcs.middle_heading_rad.ravel()[candidates]
+        curvature_count = len(self._arc_table.curvatures_per_m)
+        parent_rows = arc_indices // curvature_count
+        nodes = parents.select_rows(parent_rows)
+        nodes.parent = parent_rows
+        nodes.x_m = arcs.x_m.ravel()[arc_indices]
+        nodes.y_m = arcs.y_m.ravel()[arc_indices]
+        nodes.heading_rad = arcs.heading_rad.ravel()[arc_indices]
+        nodes.curvature_per_m = self._arc_table.curvatures_per_m[arc_indices % curvature_count]
+        nodes.cost_m = cost_m.ravel()[arc_indices]
+        nodes.path_length_m = parents.path_length_m + STEP_M
+        return nodes
+
+    def _add_contact_terms(self, nodes: NodeLayer, arcs: SearchArcs, arc_indices: Ints) -> None:
+        """Add the contacts and the drag along the arc that leads to each new node, and the costs of both.
+
+        A search of the whole body begins at the tail, and first follows the body where it already lies. Until the path
+        is one body length long, the body is incomplete, and its propulsion margin does not count.
+
+        Args:
+            nodes: The n new nodes; their contacts, drag, margins and costs are changed.
+            arcs: All arcs from the parents of these nodes.
+            arc_indices: (n,) index of each node's arc among the flattened arcs.
+        """
+        middles_w = np.stack([arcs.middle_x_m.ravel()[arc_indices], arcs.middle_y_m.ravel()[arc_indices]], axis=-1)
+        headings_rad = arcs.middle_heading_rad.ravel()[arc_indices]
         tangents = np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=-1)
 
-        starts_at_tail = self._task.initial_body_w is not None
-        is_incomplete = starts_at_tail and nodes.s_m < self._parameters.body_length_m - 0.5 * STEP_M
+        starts_at_tail = self._task.initial_body_w is not None  # only a search of the whole body has an initial body
+        # All nodes of a layer have the same arc length; half an arc allows for rounding of its sum.
+        is_incomplete = starts_at_tail and nodes.path_length_m < self._parameters.body_length_m - 0.5 * STEP_M
         self._add_contacts(nodes, middles_w, tangents, is_incomplete=is_incomplete)
         self._add_drag(nodes, middles_w, tangents)
         # The margin depends on the contacts and the drag, which are complete now.
-        nodes.margin_n = compute_node_margins_n(nodes, self._parameters)
+        nodes.propulsion_margin_n = compute_node_margins_n(nodes, self._parameters)
         if not is_incomplete:
             self._add_margin_cost(nodes)
 
@@ -200,17 +233,17 @@ class SpecifiedGrowth(PathGrowth):
         """Store the contacts of the newest arcs, and add their cost: negative if they propel, positive if they brake.
 
         Args:
-            nodes: the n new nodes, whose contacts and costs are changed.
+            nodes: The n new nodes, whose contacts and costs are changed.
             middles_w: (n, 2) middles of their newest arcs, m.
             tangents: (n, 2) unit vectors along these arcs.
-            is_incomplete: whether the path is still shorter than the body.
+            is_incomplete: Whether the path is still shorter than the body.
         """
         parameters = self._parameters
-        touched = find_touched(self._obstacles, middles_w, tangents, parameters, self._task)
-        middle_s_m = nodes.s_m - 0.5 * STEP_M
-        nodes.add_contacts(touched.is_usable, touched.obstacle, touched.gap_m, touched.wrench, middle_s_m)
+        contacts = find_obstacle_contacts(self._obstacles, middles_w, tangents, parameters, self._task)
+        middle_s_m = nodes.path_length_m - 0.5 * STEP_M
+        nodes.add_contacts(contacts.is_usable, contacts.obstacle, contacts.gap_m, contacts.wrench, middle_s_m)
         push_reward = parameters.push_reward_of_body if is_incomplete else parameters.push_reward
-        propulsion = touched.propulsion
+        propulsion = contacts.propulsion
         reward_cost = -push_reward * propulsion
         brake_cost = -parameters.brake_cost * propulsion
         nodes.cost_m += STEP_M * np.where(propulsion > 0, reward_cost, brake_cost)
@@ -219,24 +252,24 @@ class SpecifiedGrowth(PathGrowth):
         """Move the body's drag one arc forward: add the arc that the head enters, and subtract the one the tail leaves.
 
         Args:
-            nodes: the n new nodes, whose drag is changed.
+            nodes: The n new nodes, whose drag is changed.
             middles_w: (n, 2) middles of their newest arcs, m.
             tangents: (n, 2) unit vectors along these arcs.
         """
-        nodes.arc_drag_m = STEP_M * wrenches(middles_w - self._task.origin_w, tangents)
-        nodes.drag_m += nodes.arc_drag_m - self._drag_at_tail_m(nodes.parent)
+        nodes.arc_drag_m = STEP_M * compute_wrenches(middles_w - self._task.origin_w, tangents)
+        nodes.drag_m += nodes.arc_drag_m - self._get_drag_at_tail_m(nodes.parent)
 
     def _add_margin_cost(self, nodes: NodeLayer) -> None:
         """Add the cost of propulsion margins below the wanted one; it is higher just ahead of the measured head."""
         parameters = self._parameters
         starts_at_tail = self._task.initial_body_w is not None
-        is_just_ahead = starts_at_tail and nodes.s_m < parameters.body_length_m + parameters.near_m
+        is_just_ahead = starts_at_tail and nodes.path_length_m < parameters.body_length_m + parameters.near_m
         weak_margin_cost = parameters.weak_margin_cost_near if is_just_ahead else parameters.weak_margin_cost
         # 0 with the wanted margin, 1 without any.
-        missing_fraction = np.clip(1.0 - nodes.margin_n / parameters.wanted_margin_n, 0.0, 1.0)
+        missing_fraction = np.clip(1.0 - nodes.propulsion_margin_n / parameters.wanted_margin_n, 0.0, 1.0)
         nodes.cost_m += STEP_M * weak_margin_cost * missing_fraction
 
-    def _drag_at_tail_m(self, parent_rows: Ints) -> Floats:
+    def _get_drag_at_tail_m(self, parent_rows: Ints) -> Floats:
         """Return the drag integral of the arc that the tail leaves when the head enters the next arc.
 
         That arc is one body length behind the head: on the initial body as long as the path is shorter than a body, and
@@ -249,16 +282,18 @@ class SpecifiedGrowth(PathGrowth):
             (n, 3) drag in m, m, m² for each node; or (3,), equal for all, while the tail is on the initial body.
         """
         layers = self._layers
-        if len(layers) <= self._body_arcs:
+        if len(layers) <= self._arcs_per_body:
             return self._task.initial_drag_m[len(layers) - 1]
         rows = parent_rows
-        for layer in reversed(layers[len(layers) - self._body_arcs + 1 :]):
+        for layer in reversed(layers[len(layers) - self._arcs_per_body + 1 :]):
             rows = layer.parent[rows]
-        return layers[-self._body_arcs].arc_drag_m[rows]
+        return layers[-self._arcs_per_body].arc_drag_m[rows]
 
-    def _thin_out(self, nodes: NodeLayer) -> NodeLayer:
-        """Return the cheapest nodes, with a limited number in each wide cell."""
+    def _keep_best_nodes(self, nodes: NodeLayer) -> NodeLayer:
+        """Return the cheapest nodes: at most `kept_nodes`, and at most `kept_per_wide_cell` in each wide cell."""
         order = np.argsort(nodes.cost_m, kind="stable")
-        cells = number_cells(nodes.x_m[order], nodes.y_m[order], nodes.heading_rad[order], WIDE_CELL_M, WIDE_CELL_RAD)
+        cells = compute_cell_numbers(
+            nodes.x_m[order], nodes.y_m[order], nodes.heading_rad[order], WIDE_CELL_M, WIDE_CELL_RAD
+        )
         is_kept = count_earlier_in_cell(cells) < self._parameters.kept_per_wide_cell
         return nodes.select_rows(order[is_kept][: self._parameters.kept_nodes])

@@ -6,7 +6,14 @@ A scenario names a robot, a scene, a controller, a clock mode and the services. 
 `loading`      reads the three files, and applies flags      `start_pose`   robot and obstacles at tick 0
 """
 
-from snakesim_hal.model.scenario.loading import CHOSEN, Loaded, Override, compose_table, load, parse_set
+from snakesim_hal.model.scenario.loading import (
+    CHOSEN_PREFIXES,
+    LoadedScenario,
+    Override,
+    compose_config_table,
+    load_scenario,
+    parse_set_option,
+)
 from snakesim_hal.model.scenario.mission import HeadingGoal, Mission, Start, WaypointGoal
 from snakesim_hal.model.scenario.run_config import (
     POLICY,
@@ -15,7 +22,7 @@ from snakesim_hal.model.scenario.run_config import (
     MaxAge,
     RunConfig,
     ServiceSchedule,
-    config_hash,
+    compute_config_hash,
     describe_run_robot,
     encode_config,
     read_config,
@@ -23,20 +30,20 @@ from snakesim_hal.model.scenario.run_config import (
 )
 from snakesim_hal.model.scenario.start_pose import (
     StartPose,
-    capsules_at_start,
-    check,
-    find_start_pose,
+    compute_start_pose,
+    get_noisy_obstacle_map,
+    make_start_capsules,
     place_obstacles,
-    survey_obstacles,
+    validate_start_pose,
 )
 
 __all__ = [
-    "CHOSEN",
+    "CHOSEN_PREFIXES",
     "POLICY",
     "POLICY_CONTROLLER",
     "SENSOR",
     "HeadingGoal",
-    "Loaded",
+    "LoadedScenario",
     "MaxAge",
     "Mission",
     "Override",
@@ -45,17 +52,17 @@ __all__ = [
     "Start",
     "StartPose",
     "WaypointGoal",
-    "capsules_at_start",
-    "check",
-    "compose_table",
-    "config_hash",
+    "compose_config_table",
+    "compute_config_hash",
+    "compute_start_pose",
     "describe_run_robot",
     "encode_config",
-    "find_start_pose",
-    "load",
-    "parse_set",
+    "get_noisy_obstacle_map",
+    "load_scenario",
+    "make_start_capsules",
+    "parse_set_option",
     "place_obstacles",
     "read_config",
-    "survey_obstacles",
+    "validate_start_pose",
     "write_config",
 ]

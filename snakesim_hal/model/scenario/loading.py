@@ -11,27 +11,34 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.files import Table, decode, find_file, leaves, read_part, read_table
-from snakesim_hal.model.fitting import fit_scene
-from snakesim_hal.model.scenario.run_config import POLICY, POLICY_CONTROLLER, RunConfig, section_name
-from snakesim_hal.model.scenario.start_pose import check
+from snakesim_hal.model.files import (
+    ConfigTable,
+    decode_table,
+    iterate_leaves,
+    read_table,
+    read_table_with_base,
+    resolve_file_path,
+)
+from snakesim_hal.model.fitting import compute_scaled_scene_values
+from snakesim_hal.model.scenario.run_config import POLICY, POLICY_CONTROLLER, RunConfig, get_section_name
+from snakesim_hal.model.scenario.start_pose import validate_start_pose
 from snakesim_hal.model.textfiles import parse_toml
 
 # Prefixes of --set keys: `control.x` is a parameter of the chosen controller, `backend.x` one of the chosen backend.
-CHOSEN = ("control.", "backend.")
+CHOSEN_PREFIXES = ("control.", "backend.")
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedScenario:
     """A checked configuration, with the origin of each value."""
 
     config: RunConfig
-    table: Table
+    table: ConfigTable
 
-    def explain(self) -> list[tuple[str, Any, str]]:
+    def list_effective_values(self) -> list[tuple[str, Any, str]]:
         """Return every effective value as (dotted key, value, file or flag or `default`)."""
         effective = msgspec.to_builtins(self.config)
-        return [(key, value, self.table.origin_of(key)) for key, value in leaves(effective)]
+        return [(key, value, self.table.find_origin(key)) for key, value in iterate_leaves(effective)]
 
 
 @dataclass(frozen=True)
@@ -43,10 +50,13 @@ class Override:
     flag: str  # as written on the command line, for error messages
 
 
-def parse_set(text: str) -> Override:
-    """Parse the `section.key=value` of a --set option.
+def parse_set_option(text: str) -> Override:
+    """Parse the text `section.key=value` of a --set option.
 
     The value is read as TOML. If it is not valid TOML, it is taken as plain text.
+
+    Args:
+        text: Text behind --set.
 
     Raises:
         ConfigError: The key or the equals sign is missing.
@@ -65,32 +75,39 @@ def parse_set(text: str) -> Override:
     return Override(key, parsed, f"--set {shorten(text)}")
 
 
-def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
+def load_scenario(scenario: str, overrides: Sequence[Override] = ()) -> LoadedScenario:
     """Read a scenario with its robot and scene, apply the flags, and check the result.
 
     Args:
-        scenario: the name of a shipped scenario, or the path of a file.
-        overrides: values from the command line.
+        scenario: Name of a shipped scenario, or path of a scenario file.
+        overrides: Values from the command line.
 
     Raises:
         ConfigError: A file cannot be read, or a value is not allowed.
     """
-    table = compose_table(scenario, overrides)
-    config = decode(table, RunConfig)
-    check(config)
-    return Loaded(config, table)
+    table = compose_config_table(scenario, overrides)
+    config = decode_table(table, RunConfig)
+    validate_start_pose(config)
+    return LoadedScenario(config, table)
 
 
-def compose_table(scenario: str, overrides: Sequence[Override] = ()) -> Table:
-    """Return all values of a scenario, its robot and its scene, with the flags applied, but not checked yet.
+def compose_config_table(scenario: str, overrides: Sequence[Override] = ()) -> ConfigTable:
+    """Compose the values of a scenario, its robot and its scene, and apply the flags. The values are not checked yet.
+
+    Args:
+        scenario: Name of a shipped scenario, or path of a scenario file.
+        overrides: Values from the command line.
+
+    Returns:
+        All values, each with the file or flag that it comes from. The scene is scaled to the robot.
 
     Raises:
         ConfigError: A file cannot be read.
     """
-    path = find_file(scenario, "scenarios")
+    path = resolve_file_path(scenario, "scenarios")
     table = read_table(path)
     table.values.setdefault("name", path.stem)
-    _split_policy(table, table.values.get("controller"), table.source)
+    _split_policy_controller(table, table.values.get("controller"), table.source)
 
     # Another robot or scene is chosen before its single values are changed.
     file_choices = [override for override in overrides if override.key in ("robot", "scene")]
@@ -98,42 +115,43 @@ def compose_table(scenario: str, overrides: Sequence[Override] = ()) -> Table:
         table.set_value(choice.key, choice.value, choice.flag)
     chosen_by_flag = {choice.key for choice in file_choices}
     for part, kind in (("robot", "robots"), ("scene", "scenes")):
-        relative_to = None if part in chosen_by_flag else path.parent
-        _include_file(table, part, kind, relative_to)
+        # A path on the command line is relative to the working directory, a path in the scenario to its folder.
+        base_dir = None if part in chosen_by_flag else path.parent
+        _replace_name_by_file(table, part, kind, base_dir)
 
     # A controller or backend is chosen before the keys that refer to the chosen one.
     value_overrides = [override for override in overrides if override not in file_choices]
-    for override in sorted(value_overrides, key=lambda override: override.key.startswith(CHOSEN)):
+    for override in sorted(value_overrides, key=lambda override: override.key.startswith(CHOSEN_PREFIXES)):
         _apply_override(table, override)
 
     scene = table.values.get("scene")
     if isinstance(scene, dict) and "reference_robot" in scene:
-        _fit_scene(table, flags={override.flag for override in value_overrides})
+        _scale_scene_to_robot(table, flags={override.flag for override in value_overrides})
     return table
 
 
-def _include_file(table: Table, part: str, kind: str, relative_to: Path | None) -> None:
-    """Replace the name of a robot or scene by the contents of its file; do nothing if the contents are there."""
+def _replace_name_by_file(table: ConfigTable, part: str, kind: str, base_dir: Path | None) -> None:
+    """Replace the name of a robot or scene in the table by the content of its file, unless it is there already."""
     name = table.values.get(part)
     if not isinstance(name, str):
         return
-    included = read_part(name, kind, relative_to)
+    included = read_table_with_base(name, kind, base_dir)
     table.set_value(part, included.values, included.source)
     # With `extends`, the values of one part come from two files.
-    table.origin |= {f"{part}.{key}": origin for key, origin in included.origin.items()}
+    table.origin_by_key |= {f"{part}.{key}": origin for key, origin in included.origin_by_key.items()}
 
 
-def _apply_override(table: Table, override: Override) -> None:
+def _apply_override(table: ConfigTable, override: Override) -> None:
     """Put a value from the command line into the table."""
-    key = _expand_chosen(table, override.key)
+    key = _expand_chosen_key(table, override.key)
     table.set_value(key, override.value, override.flag)
     if key == "controller":
-        _split_policy(table, override.value, override.flag)
+        _split_policy_controller(table, override.value, override.flag)
 
 
-def _expand_chosen(table: Table, key: str) -> str:
+def _expand_chosen_key(table: ConfigTable, key: str) -> str:
     """Return the key in the section of the chosen controller or backend, for `control.KEY` or `backend.KEY`."""
-    control_prefix, backend_prefix = CHOSEN
+    control_prefix, backend_prefix = CHOSEN_PREFIXES
     if key.startswith(control_prefix):
         prefix = control_prefix
         chosen = table.values.get("controller", "sim")
@@ -144,22 +162,22 @@ def _expand_chosen(table: Table, key: str) -> str:
         section = "backends"
     else:
         return key
-    return f"{section}.{section_name(str(chosen))}.{key.removeprefix(prefix)}"
+    return f"{section}.{get_section_name(str(chosen))}.{key.removeprefix(prefix)}"
 
 
-def _fit_scene(table: Table, flags: set[str]) -> None:
-    """Change a scene that was laid out for another robot, except for the values that a flag gives; see fitting.py."""
-    config = decode(table, RunConfig)
+def _scale_scene_to_robot(table: ConfigTable, flags: set[str]) -> None:
+    """Scale a scene that was laid out for another robot, except for values that a flag sets. See fitting.py."""
+    config = decode_table(table, RunConfig)
 
     def is_set_by_flag(key: str) -> bool:
-        return table.origin_of(f"scene.{key}") in flags
+        return table.find_origin(f"scene.{key}") in flags
 
-    changed = fit_scene(config.scene, config.robot, is_set_by_flag)
+    changed = compute_scaled_scene_values(config.scene, config.robot, is_set_by_flag)
     for key, value in changed.items():
         table.set_value(f"scene.{key}", value, f"fitted to robot {config.robot.name!r}")
 
 
-def _split_policy(table: Table, controller: Any, origin: str) -> None:
+def _split_policy_controller(table: ConfigTable, controller: Any, origin: str) -> None:
     """Replace the controller `policy:MODEL` by the controller `policy` and its parameter `model`."""
     if isinstance(controller, str) and controller.startswith(POLICY):
         table.set_value("controller", POLICY_CONTROLLER, origin)

@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.model.files import FileStruct, decode, read_table
+from snakesim_hal.model.files import FileStruct, decode_table, read_table
 from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.model.scenario.mission import Mission, Start
 from snakesim_hal.model.scene import SceneFile
@@ -161,42 +161,42 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     @property
     def control_section(self) -> str:
         """Return the section with the parameters of the chosen controller: `controllers.Wave` for `./file.py:Wave`."""
-        return f"controllers.{section_name(self.controller)}"
+        return f"controllers.{get_section_name(self.controller)}"
 
     @property
     def controller_parameters(self) -> dict[str, Any]:
         """Return the parameters of the chosen controller."""
-        return self.controllers.get(section_name(self.controller), {})
+        return self.controllers.get(get_section_name(self.controller), {})
 
     @property
     def backend_section(self) -> str:
         """Return the section with the settings of the chosen backend: `backends.Bench` for `./file.py:Bench`."""
-        return f"backends.{section_name(self.backend)}"
+        return f"backends.{get_section_name(self.backend)}"
 
     @property
     def backend_settings(self) -> dict[str, Any]:
         """Return the settings of the chosen backend."""
-        return self.backends.get(section_name(self.backend), {})
+        return self.backends.get(get_section_name(self.backend), {})
 
     @property
-    def own_services(self) -> dict[str, ServiceSchedule]:
+    def internal_services(self) -> dict[str, ServiceSchedule]:
         """Return the services that the run starts itself."""
         return {name: service for name, service in self.services.items() if not service.external}
 
     @property
     def in_host_services(self) -> list[str]:
         """Return the names of the services that run in the process of the HAL host."""
-        return [name for name, service in self.own_services.items() if service.process == "host"]
+        return [name for name, service in self.internal_services.items() if service.process == "host"]
 
     @property
-    def has_own_control(self) -> bool:
+    def has_internal_control(self) -> bool:
         """Return whether the run starts a controller; otherwise an external controller also arms the robot."""
-        return CONTROL in self.own_services
+        return CONTROL in self.internal_services
 
     @property
-    def commander(self) -> str:
+    def commander_name(self) -> str:
         """Return the name of the controller, with the model of a policy; `external` if the run starts no controller."""
-        if not self.has_own_control:
+        if not self.has_internal_control:
             return "external"
         if self.controller == POLICY_CONTROLLER:
             model = self.controller_parameters.get("model")
@@ -222,17 +222,17 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def lease_ns(self) -> int:
-        """Return the term of a lease: five periods or 50 ms, whichever is longer, but at most 100 ms."""
-        term_ns = max(LEASE_PERIODS * self.period_ns, MIN_LEASE_NS)
-        return min(term_ns, MAX_LEASE_NS)
+        """Return the duration of a lease: five periods or 50 ms, whichever is longer, but at most 100 ms."""
+        duration_ns = max(LEASE_PERIODS * self.period_ns, MIN_LEASE_NS)
+        return min(duration_ns, MAX_LEASE_NS)
 
 
-def section_name(plugin_name: str) -> str:
+def get_section_name(plugin_name: str) -> str:
     """Return the name of a plugin's section: the class, for a plugin in a file such as `./file.py:Wave`."""
     return plugin_name.rpartition(":")[2]
 
 
-def config_hash(config: RunConfig) -> str:
+def compute_config_hash(config: RunConfig) -> str:
     """Return a hash of everything that the outcome of a run depends on."""
     plain = json.dumps(msgspec.to_builtins(config), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
@@ -249,23 +249,23 @@ def write_config(config: RunConfig, path: Path) -> None:
 
 
 def read_config(path: Path) -> RunConfig:
-    """Read a file that `write` saved, whatever its name."""
-    return decode(read_table(path), RunConfig)
+    """Read a configuration file that `write_config` has written, whatever its name."""
+    return decode_table(read_table(path), RunConfig)
 
 
 def describe_run_robot(config: RunConfig, backend: str = "", *, emulated: bool = False) -> Description:
     """Return the description that the HAL publishes of the configured robot.
 
     Args:
-        config: of the run.
-        backend: the name that the backend has for itself; empty: the name in the scenario.
-        emulated: whether no real motor moves.
+        config: Configuration of the run.
+        backend: Name that the backend gives itself. Empty for the name in the scenario.
+        emulated: Whether no real motor moves.
     """
     return describe_robot(
         config.robot,
         backend=backend or config.backend,
         period_ns=config.period_ns,
         lease_ns=config.lease_ns,
-        config_hash=config_hash(config),
+        config_hash=compute_config_hash(config),
         emulated=emulated,
     )

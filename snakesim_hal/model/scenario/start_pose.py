@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule
-from snakesim_hal.model.placement import Placed, check_clear, place_scene
-from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
+from snakesim_hal.model.placement import PlacedObstacle, place_scene_obstacles, validate_start_clearance
+from snakesim_hal.model.route import compute_yaw_segments_m, expand_yaw_angles, place_chain_on_route
 from snakesim_hal.model.scenario.run_config import RunConfig
 from snakesim_hal.model.scene import make_route
 from snakesim_hal.wire.messages import Obstacle
 
-# Second part of the seed of the survey errors, so that they differ from other random numbers of the run's seed.
-SURVEY_SEED = 0x5EED
+# Second part of the seed of the map errors, so that they differ from other random numbers of the run's seed.
+MAP_ERROR_SEED = 0x5EED
 
 
-def check(config: RunConfig) -> None:
-    """Check what more than one field decides: the start pose, and that no obstacle overlaps it.
+def validate_start_pose(config: RunConfig) -> None:
+    """Raise ConfigError unless the robot can lie at its start pose, and no obstacle overlaps it there.
 
     Raises:
         ConfigError: The robot cannot lie at the start pose, or an obstacle is in its place.
@@ -32,7 +32,7 @@ def check(config: RunConfig) -> None:
             f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene",
             code="scene/no-route",
         )
-    angles_rad = find_start_pose(config).angles_rad.tolist()
+    angles_rad = compute_start_pose(config).angles_rad.tolist()
     for joint, angle_rad in zip(config.robot.joint_table, angles_rad, strict=True):
         if not joint.limits.lower_rad <= angle_rad <= joint.limits.upper_rad:
             raise _start_angle_error(config, joint, angle_rad)
@@ -40,7 +40,7 @@ def check(config: RunConfig) -> None:
 
 
 def _start_angle_error(config: RunConfig, joint: Joint, angle_rad: float) -> ConfigError:
-    """Return the error for a start angle outside of a joint's limits."""
+    """Return the error for a joint whose start angle is outside of its limits."""
     limits = joint.limits
     if not config.start.on_route:
         return ConfigError(
@@ -66,27 +66,27 @@ class StartPose:
     angles_rad: NDArray[np.float64]  # (n_joints,), tail to head
 
 
-def find_start_pose(config: RunConfig) -> StartPose:
-    """Return the pose of the snake at tick 0: on the scene's route, or straight."""
+def compute_start_pose(config: RunConfig) -> StartPose:
+    """Compute the pose of the snake at tick 0: on the scene's route, or straight at the configured pose."""
     robot = config.robot
     start = config.start
     route = make_route(config.scene)
     if not start.on_route or route is None:
         straight_rad = np.zeros(robot.chain.modules)
         return StartPose(start.position_m, start.yaw_rad, straight_rad)
-    segments_m = yaw_segments_m(robot.axes, robot.link_lengths_m)
-    chain = lay_chain(route, start.tail_s_m, segments_m)
-    return StartPose(chain.tail_w, chain.heading_rad, chain_angles(robot.axes, chain.angles_rad))
+    segments_m = compute_yaw_segments_m(robot.axes, robot.link_lengths_m)
+    chain = place_chain_on_route(route, start.tail_s_m, segments_m)
+    return StartPose(chain.tail_w, chain.heading_rad, expand_yaw_angles(robot.axes, chain.angles_rad))
 
 
-def capsules_at_start(config: RunConfig) -> list[Capsule]:
+def make_start_capsules(config: RunConfig) -> list[Capsule]:
     """Return the outlines of the links at tick 0 as seen from above, tail to head."""
     robot = config.robot
-    pose = find_start_pose(config)
+    pose = compute_start_pose(config)
     radius_m = robot.module.radius_m
     base_w = (*pose.position_w, radius_m)
     base_rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
-    origins, rotations = link_frames(base_w, base_rotation, pose.angles_rad, robot.axes, robot.link_lengths_m)
+    origins, rotations = compute_link_frames(base_w, base_rotation, pose.angles_rad, robot.axes, robot.link_lengths_m)
     capsules: list[Capsule] = []
     for i, length_m in enumerate(robot.link_lengths_m):
         front_w = origins[i] + length_m * rotations[i][:, 0]
@@ -98,31 +98,35 @@ def capsules_at_start(config: RunConfig) -> list[Capsule]:
     return capsules
 
 
-def place_obstacles(config: RunConfig) -> list[Placed]:
-    """Return all obstacles of the scene, placed.
+def place_obstacles(config: RunConfig) -> list[PlacedObstacle]:
+    """Place all obstacles of the scene, and check that none overlaps the snake at its start pose.
 
     Raises:
         ConfigError: An obstacle cannot be placed, or overlaps the snake's start pose.
     """
-    snake = capsules_at_start(config)
-    placed = place_scene(config.scene, snake)
-    check_clear(config.scene, placed, snake)
+    snake_capsules = make_start_capsules(config)
+    placed = place_scene_obstacles(config.scene, snake_capsules)
+    validate_start_clearance(config.scene, placed, snake_capsules)
     return placed
 
 
-def survey_obstacles(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
-    """Return the obstacles at the positions that the survey gives, which differ from the true ones by its error.
+def get_noisy_obstacle_map(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
+    """Return the obstacles of the scene as the known map has them: at their true positions plus a random error.
+
+    The standard deviation of the error is `mission.map_error_m`.
 
     Args:
-        config: of the run; its seed decides the errors.
-        walkable: true: the platforms that the snake may lie on; false: the obstacles that it pushes against.
+        config: Run configuration. Its seed determines the errors.
+        walkable: If True, return the platforms that the snake may lie on. If False, return the obstacles that it pushes
+            against.
     """
-    obstacles = [placed.obstacle for placed in place_obstacles(config) if placed.walkable == walkable]
-    error_m = config.mission.map_error_m
-    if error_m == 0.0:
+    obstacles = [item.obstacle for item in place_obstacles(config) if item.walkable == walkable]
+    error_sigma_m = config.mission.map_error_m
+    if error_sigma_m == 0.0:
         return obstacles
-    random = np.random.default_rng((config.seed, SURVEY_SEED + walkable))
-    errors_m = random.normal(0.0, error_m, (len(obstacles), 2))
+    # Platforms and other obstacles have random streams of their own: the boolean counts as 0 or 1.
+    rng = np.random.default_rng((config.seed, MAP_ERROR_SEED + walkable))
+    errors_m = rng.normal(0.0, error_sigma_m, (len(obstacles), 2))
     displaced: list[Obstacle] = []
     for obstacle, (error_x, error_y) in zip(obstacles, errors_m.tolist(), strict=True):
         x, y, z = obstacle.position_w

@@ -13,7 +13,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.commissioning.measured import PITCH, YAW
-from snakesim_operator.features.commissioning.suspended_load import AXES, rotations_about
+from snakesim_operator.features.commissioning.suspended_load import UNIT_VECTOR_BY_AXIS, make_rotations_about
 
 MIN_SAMPLES = 20  # of a gyro
 MAX_DISAGREEMENT = 0.06  # of the link's rate, rms; intact joints show 0.02 of it, 10 mrad of backlash 0.12
@@ -22,10 +22,10 @@ MAX_RATIO_ERROR = 0.12  # of an intact joint, whose ratio is 1
 
 
 @dataclass(frozen=True)
-class Unfollowed:
+class LinkMismatch:
     """The first joint from the tail whose link does not turn as its encoder measures."""
 
-    joint: int
+    joint_index: int
     cause: Literal["backlash", "ratio"]
     ratio: float  # of the link's rate to that of the encoder
 
@@ -36,14 +36,14 @@ class Unfollowed:
         if self.cause == "ratio":
             return f"its link turns {self.ratio:+.2f} times as far as its encoder measures: {again}"
         clamp = ""
-        if self.joint == 0:
+        if self.joint_index == 0:
             clamp = ", or a clamp that lets the tail link move"
         return f"its link does not follow its encoder: backlash, a gear that slips{clamp}; {again}"
 
 
-def find_unfollowed(
+def find_link_mismatch(
     robot: RobotFile, period_s: float, angle_rad: Floats, velocity_rad_s: Floats, link_rate_rad_s: Floats
-) -> Unfollowed | None:
+) -> LinkMismatch | None:
     """Return the first joint from the tail whose link does not turn as its encoder measures.
 
     The angular rate of each link is computed from the encoders, starting at the clamped tail link, which does not
@@ -52,35 +52,41 @@ def find_unfollowed(
     Args:
         robot: The robot, whose tail link is clamped.
         period_s: Period of a tick.
-        angle_rad: (n, joints), by the encoders.
-        velocity_rad_s: (n, joints), by the encoders.
-        link_rate_rad_s: (n, links, 3), by gyros, each in the frame of its link; NaN where no gyro reported.
+        angle_rad: (n, joints) joint angles by the encoders.
+        velocity_rad_s: (n, joints) joint velocities by the encoders.
+        link_rate_rad_s: (n, links, 3) angular rates by the gyros, each in the frame of its link; NaN where no gyro
+            reported.
 
     Returns:
-        The joint and how it disagrees; None if all agree, or if no link has a gyro.
+        The joint and how it disagrees; None if all joints agree, or if no link has a gyro.
     """
     omega_rad_s = np.zeros((len(angle_rad), 3))  # angular velocity of a link, in its own frame
     for joint, axis_name in enumerate(robot.axes):
-        axis = np.array(AXES[axis_name])
+        axis = np.array(UNIT_VECTOR_BY_AXIS[axis_name])
         component = YAW if axis_name == "yaw" else PITCH
-        rotation = rotations_about(axis, angle_rad[:, joint])  # from the link ahead to the link behind the joint
+        rotation = make_rotations_about(axis, angle_rad[:, joint])  # from the link ahead to the link behind the joint
         link_behind_rad_s = np.einsum("nji,nj->ni", rotation, omega_rad_s)  # in the frame of the link ahead
         omega_rad_s = link_behind_rad_s + velocity_rad_s[:, joint, None] * axis
-        unfollowed = _compare_gyro(
+        mismatch = _find_gyro_mismatch(
             joint,
-            joint_rad_s=velocity_rad_s[:, joint],
-            behind_rad_s=link_behind_rad_s[:, component],
+            joint_velocity_rad_s=velocity_rad_s[:, joint],
+            link_behind_rad_s=link_behind_rad_s[:, component],
             acceleration_rad_s2=np.gradient(omega_rad_s[:, component], period_s),
             gyro_rad_s=link_rate_rad_s[:, joint + 1, component],
         )
-        if unfollowed is not None:
-            return unfollowed
+        if mismatch is not None:
+            return mismatch
     return None
 
 
-def _compare_gyro(
-    joint: int, *, joint_rad_s: Floats, behind_rad_s: Floats, acceleration_rad_s2: Floats, gyro_rad_s: Floats
-) -> Unfollowed | None:
+def _find_gyro_mismatch(
+    joint_index: int,
+    *,
+    joint_velocity_rad_s: Floats,
+    link_behind_rad_s: Floats,
+    acceleration_rad_s2: Floats,
+    gyro_rad_s: Floats,
+) -> LinkMismatch | None:
     """Compare the gyro on the link ahead of a joint with the encoders.
 
     Ratio of the joint, delay and bias of the gyro are fitted by least squares; what remains is the disagreement:
@@ -88,9 +94,9 @@ def _compare_gyro(
         gyro = behind + ratio * joint - delay * acceleration + bias
 
     Args:
-        joint: Index of the joint.
-        joint_rad_s: (n,) velocity of the joint by its encoder.
-        behind_rad_s: (n,) angular rate of the link behind the joint by the encoders, about the joint's axis.
+        joint_index: Index of the joint.
+        joint_velocity_rad_s: (n,) velocity of the joint by its encoder.
+        link_behind_rad_s: (n,) angular rate of the link behind the joint by the encoders, about the joint's axis.
         acceleration_rad_s2: (n,) angular acceleration of the link ahead by the encoders, about the joint's axis.
         gyro_rad_s: (n,) angular rate of the link ahead by its gyro, about the joint's axis; NaN where unknown.
 
@@ -100,16 +106,16 @@ def _compare_gyro(
     is_known = ~np.isnan(gyro_rad_s)
     if is_known.sum() < MIN_SAMPLES:
         return None
-    bias_column = np.ones(len(joint_rad_s))
-    regressors = np.column_stack((joint_rad_s, acceleration_rad_s2, bias_column))[is_known]
-    joint_by_gyro_rad_s = (gyro_rad_s - behind_rad_s)[is_known]
-    coefficients = np.linalg.lstsq(regressors, joint_by_gyro_rad_s, rcond=None)[0]
+    bias_column = np.ones(len(joint_velocity_rad_s))
+    regressors = np.column_stack((joint_velocity_rad_s, acceleration_rad_s2, bias_column))[is_known]
+    joint_velocity_by_gyro_rad_s = (gyro_rad_s - link_behind_rad_s)[is_known]
+    coefficients = np.linalg.lstsq(regressors, joint_velocity_by_gyro_rad_s, rcond=None)[0]
     ratio = float(coefficients[0])
-    residuals_rad_s = joint_by_gyro_rad_s - regressors @ coefficients
+    residuals_rad_s = joint_velocity_by_gyro_rad_s - regressors @ coefficients
     disagreement_rad_s = float(np.std(residuals_rad_s))
-    rate_rad_s = float(np.std(joint_rad_s + behind_rad_s))
+    rate_rad_s = float(np.std(joint_velocity_rad_s + link_behind_rad_s))
     if disagreement_rad_s > max(MAX_DISAGREEMENT * rate_rad_s, MIN_DISAGREEMENT_RAD_S):
-        return Unfollowed(joint, "backlash", ratio)
+        return LinkMismatch(joint_index, "backlash", ratio)
     if abs(ratio - 1) > MAX_RATIO_ERROR:
-        return Unfollowed(joint, "ratio", ratio)
+        return LinkMismatch(joint_index, "ratio", ratio)
     return None

@@ -11,11 +11,11 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_operator.features.commissioning.followed_links import find_unfollowed
+from snakesim_operator.features.commissioning.followed_links import find_link_mismatch
 from snakesim_operator.features.commissioning.least_squares import Estimate
-from snakesim_operator.features.commissioning.servo_response import ServoResponse, bandwidth_hz, fit_servo
+from snakesim_operator.features.commissioning.servo_response import ServoResponse, estimate_bandwidth_hz, fit_servo
 from snakesim_operator.features.commissioning.smoothing import smooth, smooth_derivative, smooth_second_derivative
-from snakesim_operator.features.commissioning.suspended_load import load_nm
+from snakesim_operator.features.commissioning.suspended_load import compute_link_loads_nm
 from snakesim_operator.features.commissioning.torque_balance import JointRecord, TorqueBalance, fit_torque_balance
 
 MAX_RELATIVE_WIDTH = 0.3  # half of an interval, of its value; a torque constant that is less certain is unknown
@@ -51,11 +51,11 @@ class JointIdentification:
 
     @property
     def fails(self) -> bool:
-        """Whether it does not move as the model of a suspended robot, so that its neighbors are not certain either."""
+        """Whether the joint does not move as a suspended robot does, so that its neighbors are uncertain, too."""
         return self.explained is None or self.explained < MIN_EXPLAINED
 
-    def withheld(self, reason: str) -> "JointIdentification":
-        """Return the same joint without its values, which would not be right."""
+    def without_values(self, reason: str) -> "JointIdentification":
+        """Return this result without its values, which would be wrong, and with the reason."""
         return replace(self, fields={}, unknown=[f"everything: {reason}"], complete=False)
 
 
@@ -68,102 +68,116 @@ def identify_joints(
 
     Args:
         config: Configuration of the run.
-        columns: `angle_rad`, `velocity_rad_s`, `torque_nm` and `target`, each (ticks, joints).
+        columns: Recorded signals by name: `angle_rad`, `velocity_rad_s`, `torque_nm` and `target`, each (ticks,
+            joints).
         link_rate_rad_s: Angular rates by the gyros of the links, (ticks, links, 3), in the links' frames; NaN where
-            no gyro reported; None: the links have no gyros.
+            no gyro reported. None if the links have no gyros.
 
     Returns:
         One result for each joint, tail to head.
     """
     period_s = config.period_ns * 1e-9
     joints = config.robot.joint_table
-    loads, loads_by_angle = _link_loads(config.robot, period_s, columns)
+    loads, loads_by_angle = _compute_link_loads(config.robot, period_s, columns)
     results: list[JointIdentification] = []
     failing_joints: dict[int, str] = {}  # index -> name
-    for i, joint in enumerate(joints):
+    for joint_index, joint in enumerate(joints):
         record = JointRecord(
             period_s=period_s,
-            angle_rad=columns["angle_rad"][:, i],
-            velocity_rad_s=columns["velocity_rad_s"][:, i],
-            torque_nm=columns["torque_nm"][:, i],
-            target_rad=columns["target"][:, i],
+            angle_rad=columns["angle_rad"][:, joint_index],
+            velocity_rad_s=columns["velocity_rad_s"][:, joint_index],
+            torque_nm=columns["torque_nm"][:, joint_index],
+            target_rad=columns["target"][:, joint_index],
             torque_limit_nm=joint.limits.torque_nm,
         )
-        result = _identify_or_explain(joint, record, loads[:, i], loads_by_angle[:, i])
+        result = _try_identify_joint(joint, record, loads[:, joint_index], loads_by_angle[:, joint_index])
         results.append(result)
-        if _is_judged_and_fails(result, joint.drive):
-            failing_joints[i] = result.joint
+        if _has_model_misfit(result, joint.drive):
+            failing_joints[joint_index] = result.joint
     if link_rate_rad_s is not None:
-        unfollowed = find_unfollowed(
+        mismatch = find_link_mismatch(
             config.robot, period_s, columns["angle_rad"], columns["velocity_rad_s"], link_rate_rad_s
         )
-        if unfollowed is not None:
-            result = results[unfollowed.joint]
-            failing_joints[unfollowed.joint] = result.joint
-            results[unfollowed.joint] = result.withheld(unfollowed.reason)
-    return [_withhold_beside_failing(result, i, failing_joints) for i, result in enumerate(results)]
+        if mismatch is not None:
+            result = results[mismatch.joint_index]
+            failing_joints[mismatch.joint_index] = result.joint
+            results[mismatch.joint_index] = result.without_values(mismatch.reason)
+    return [
+        _withhold_if_neighbor_fails(result, joint_index, failing_joints) for joint_index, result in enumerate(results)
+    ]
 
 
-def _link_loads(robot: RobotFile, period_s: float, columns: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+def _compute_link_loads(robot: RobotFile, period_s: float, columns: Mapping[str, Floats]) -> tuple[Floats, Floats]:
     """Return the torque that the links need: with the measured velocities, and with those derived from the angles.
 
-    Both are (ticks - 2 HALF_WINDOW, joints).
+    Both are (ticks - 2 HALF_WINDOW_TICKS, joints).
     """
-    angle = columns["angle_rad"]
-    velocity = columns["velocity_rad_s"]
-    smooth_angle = smooth(angle)
-    by_velocity = load_nm(robot, smooth_angle, smooth(velocity), smooth_derivative(velocity, period_s))
-    by_angle = load_nm(
-        robot, smooth_angle, smooth_derivative(angle, period_s), smooth_second_derivative(angle, period_s)
+    angle_rad = columns["angle_rad"]
+    velocity_rad_s = columns["velocity_rad_s"]
+    smooth_angle_rad = smooth(angle_rad)
+    by_velocity = compute_link_loads_nm(
+        robot, smooth_angle_rad, smooth(velocity_rad_s), smooth_derivative(velocity_rad_s, period_s)
+    )
+    by_angle = compute_link_loads_nm(
+        robot, smooth_angle_rad, smooth_derivative(angle_rad, period_s), smooth_second_derivative(angle_rad, period_s)
     )
     return by_velocity, by_angle
 
 
-def _identify_or_explain(joint: Joint, record: JointRecord, load: Floats, load_by_angle: Floats) -> JointIdentification:
-    """Identify one joint, or return why nothing of it is known."""
+def _try_identify_joint(
+    joint: Joint, record: JointRecord, load_nm: Floats, load_by_angle_nm: Floats
+) -> JointIdentification:
+    """Identify one joint; if that is not possible, return a result without values that holds the reason."""
     if "torque" not in joint.drive.measures:
         return JointIdentification(joint.name, {}, ["everything: it does not measure torque"], complete=False)
     try:
-        return _identify(joint.name, record, load, load_by_angle, joint.motor.torque_constant_nm_per_a)
+        return _identify_joint(joint.name, record, load_nm, load_by_angle_nm, joint.motor.torque_constant_nm_per_a)
     except ValueError as error:
         return JointIdentification(joint.name, {}, [f"everything: {error}"], complete=False)
 
 
-def _is_judged_and_fails(row: JointIdentification, drive: Drive) -> bool:
-    return "torque" in drive.measures and row.fails
+def _has_model_misfit(result: JointIdentification, drive: Drive) -> bool:
+    return "torque" in drive.measures and result.fails
 
 
-def _withhold_beside_failing(row: JointIdentification, joint: int, failing: Mapping[int, str]) -> JointIdentification:
-    """Withhold the values of a joint next to one that fails: they depend on the motion of that joint's links."""
-    if joint in failing:
-        return row
-    neighbors = [failing[neighbor] for neighbor in (joint - 1, joint + 1) if neighbor in failing]
-    if not neighbors:
-        return row
-    return row.withheld(f"{' and '.join(neighbors)} beside it fails; correct that first, and identify again")
-
-
-def _identify(
-    name: str, record: JointRecord, load: Floats, load_by_angle: Floats, torque_constant: float | None
+def _withhold_if_neighbor_fails(
+    result: JointIdentification, joint_index: int, failing_joints: Mapping[int, str]
 ) -> JointIdentification:
-    """Identify one joint.
+    """Withhold the values of a joint next to one that fails: they depend on the motion of that joint's links."""
+    if joint_index in failing_joints:
+        return result
+    neighbors = [
+        failing_joints[neighbor] for neighbor in (joint_index - 1, joint_index + 1) if neighbor in failing_joints
+    ]
+    if not neighbors:
+        return result
+    return result.without_values(f"{' and '.join(neighbors)} beside it fails; correct that first, and identify again")
+
+
+def _identify_joint(
+    name: str, record: JointRecord, load_nm: Floats, load_by_angle_nm: Floats, torque_constant_nm_per_a: float | None
+) -> JointIdentification:
+    """Fit the servo response and the torque balance of one joint, and drop the values that are too uncertain.
 
     Args:
-        name: of the joint.
-        record: its motion.
-        load: torque that the links need, from smoothed signals, (ticks - 2 HALF_WINDOW,).
-        load_by_angle: the same with velocities derived from the angles.
-        torque_constant: that of the robot file, N·m/A; None: the file has none, and torque is taken as measured.
+        name: Name of the joint.
+        record: Motion and torque of the joint.
+        load_nm: Torque that the links need,  from smoothed signals, (ticks - 2 HALF_WINDOW_TICKS,).
+        load_by_angle_nm: The same torque, with velocities derived from the angles.
+        torque_constant_nm_per_a: Torque constant in the robot file; None if the file has none. Then the torque is taken
+            as it is measured.
 
     Raises:
-        ValueError: the joint moved too little.
+        ValueError: The joint moved too little.
     """
     unknown: list[str] = []
     unknown_by_misfit: list[str] = []  # values that are unknown because the torque does not fit the motion
     complete = True
     servo = fit_servo(record)
-    balance = fit_torque_balance(record, servo.between_nm, load, load_by_angle, fit_scale=torque_constant is not None)
-    if torque_constant is None:
+    balance = fit_torque_balance(
+        record, servo.between_nm, load_nm, load_by_angle_nm, fit_scale=torque_constant_nm_per_a is not None
+    )
+    if torque_constant_nm_per_a is None:
         unknown.append("torque constant: the file has none, so its torque is taken as it is measured")
     elif not balance.torque_scale.half_width < MAX_RELATIVE_WIDTH * balance.torque_scale.value:
         if balance.misfit > 0:
@@ -171,9 +185,9 @@ def _identify(
         else:
             unknown.append(f"torque constant: {TOO_LIGHT}; its torque is taken as it is measured")
         complete = False
-        torque_constant = None
-        balance = fit_torque_balance(record, servo.between_nm, load, load_by_angle, fit_scale=False)
-    fields = _robot_file_fields(balance, servo, torque_constant)
+        torque_constant_nm_per_a = None
+        balance = fit_torque_balance(record, servo.between_nm, load_nm, load_by_angle_nm, fit_scale=False)
+    fields = _collect_robot_file_fields(balance, servo, torque_constant_nm_per_a)
     for field, label in BALANCE_LABELS.items():
         value = fields[field]
         # Without a misfit the interval is that of noise, and a friction near 0 may be as uncertain as it is small.
@@ -188,15 +202,15 @@ def _identify(
         fields=fields,
         unknown=unknown,
         latency_s=servo.latency_s,
-        bandwidth_hz=bandwidth_hz(record),
+        bandwidth_hz=estimate_bandwidth_hz(record),
         balance=balance,
         servo=servo,
         complete=complete,
     )
 
 
-def _robot_file_fields(
-    balance: TorqueBalance, servo: ServoResponse, torque_constant: float | None
+def _collect_robot_file_fields(
+    balance: TorqueBalance, servo: ServoResponse, torque_constant_nm_per_a: float | None
 ) -> dict[str, Estimate]:
     """Return the fields of the robot file, in real torque: the measured torque times the fitted scale."""
     scale = balance.torque_scale
@@ -204,10 +218,10 @@ def _robot_file_fields(
         "friction_nm": balance.dry_nm,
         "viscous_nm_s_per_rad": balance.viscous_nm_s_per_rad,
         "armature_kg_m2": balance.armature_kg_m2,
-        "stiffness_nm_per_rad": servo.stiffness_nm_per_rad.times(scale),
-        "damping_nm_s_per_rad": servo.damping_nm_s_per_rad.times(scale),
+        "stiffness_nm_per_rad": servo.stiffness_nm_per_rad.multiply_by(scale),
+        "damping_nm_s_per_rad": servo.damping_nm_s_per_rad.multiply_by(scale),
         "response_time_s": servo.response_time_s,
     }
-    if torque_constant is not None:
-        fields["torque_constant_nm_per_a"] = scale.scaled(torque_constant)
+    if torque_constant_nm_per_a is not None:
+        fields["torque_constant_nm_per_a"] = scale.scale_by(torque_constant_nm_per_a)
     return fields

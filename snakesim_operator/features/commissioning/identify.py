@@ -8,7 +8,7 @@ import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.model.files import find_file
+from snakesim_hal.model.files import resolve_file_path
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.features.commissioning.identification import (
@@ -16,15 +16,15 @@ from snakesim_operator.features.commissioning.identification import (
     JointIdentification,
     identify_joints,
 )
-from snakesim_operator.features.commissioning.identified_page import render_page
+from snakesim_operator.features.commissioning.identified_page import render_identification_page
 from snakesim_operator.features.commissioning.least_squares import Estimate
-from snakesim_operator.features.commissioning.measured import arrange_by_tick, read_imus, tick_numbers
+from snakesim_operator.features.commissioning.measured import arrange_imus_by_tick, compute_tick_numbers, read_imus
 from snakesim_operator.results.run_log import RunRecord
 
-PAGE = "identified.html"
+PAGE_FILENAME = "identified.html"
 CONTROLLER = "identify"
-COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target")
-LABELS = {  # fields of the robot file -> name and unit
+SIGNAL_NAMES = ("angle_rad", "velocity_rad_s", "torque_nm", "target")
+LABEL_AND_UNIT_BY_FIELD = {  # fields of the robot file -> name and unit
     "friction_nm": ("dry friction", "N·m"),
     "viscous_nm_s_per_rad": ("viscous friction", "N·m·s/rad"),
     "armature_kg_m2": ("rotor inertia", "kg·m²"),
@@ -35,99 +35,102 @@ LABELS = {  # fields of the robot file -> name and unit
 }
 
 
-def identify(run: Path, robot_file: Path | None, out: Path | None, *, as_json: bool = False) -> int:
-    """Identify the joints of a run, print them, and write a page.
+def identify_and_report(run: Path, robot_file: Path | None, output_path: Path | None, *, as_json: bool = False) -> int:
+    """Identify the joints from a run, print the values, and write them to an HTML page and into the robot file.
 
     Args:
-        run: folder of the run, or its recording.
-        robot_file: the user's robot file to write the values into; None: no robot file is written.
-        out: the page; None: a file in the folder of the run.
-        as_json: whether to print one JSON object instead of text.
+        run: Path of the run folder, or of its recording.
+        robot_file: The user's robot file to write the values into; None if no robot file is to be written.
+        output_path: Path of the page; None for a file in the folder of the run.
+        as_json: Whether to print one JSON object instead of text.
 
     Returns:
-        0 if every value of every joint was identified, otherwise 1.
+        The exit code: 0 if every value of every joint was identified, otherwise 1.
 
     Raises:
-        ConfigError: the run is of another controller, or a file cannot be read or written.
+        ConfigError: The run is of another controller, or a file cannot be read or written.
     """
-    if robot_file is not None and find_file(str(robot_file), "robots") != robot_file:
+    if robot_file is not None and resolve_file_path(str(robot_file), "robots") != robot_file:
         raise ConfigError(
             f"{robot_file}: give the path of your own robot file, such as ./{robot_file}.toml; shipped ones stay",
             code="commissioning/not-possible",
         )
     record = RunRecord.load(run)
-    judged_ticks = _find_judged_ticks(record)
-    columns: dict[str, Any] = {name: getattr(record, name)[judged_ticks] for name in COLUMNS}
-    link_rates, _ = arrange_by_tick(read_imus(record), tick_numbers(record), len(record.description.links))
-    rows = identify_joints(record.config, columns, link_rates[judged_ticks])
+    usable_ticks = _find_usable_ticks(record)
+    columns: dict[str, Any] = {name: getattr(record, name)[usable_ticks] for name in SIGNAL_NAMES}
+    link_rates, _ = arrange_imus_by_tick(read_imus(record), compute_tick_numbers(record), len(record.description.links))
+    results = identify_joints(record.config, columns, link_rates[usable_ticks])
     run_folder = run if run.is_dir() else run.parent
-    page_path = out or run_folder / PAGE
-    write_text(page_path, render_page(record, rows))
+    page_path = output_path or run_folder / PAGE_FILENAME
+    write_text(page_path, render_identification_page(record, results))
     if as_json:
-        print_json({"joints": rows, "page": str(page_path)})
+        print_json({"joints": results, "page": str(page_path)})
     else:
-        _print_joints(rows, judges_links=not np.isnan(link_rates).all())
+        _print_joints(results, judges_links=not np.isnan(link_rates).all())
         print_line(f"page: {page_path}")
     if robot_file is not None:
-        _write_robot_file(robot_file, record, rows)
-    everything_identified = all(row.complete and not row.fails for row in rows)
+        _write_robot_file(robot_file, record, results)
+    everything_identified = all(result.complete and not result.fails for result in results)
     return 0 if everything_identified else 1
 
 
-def _find_judged_ticks(record: RunRecord) -> slice:
-    """Return the rows of the longest part of a run in which the joints can be identified.
+def _find_usable_ticks(record: RunRecord) -> slice:
+    """Find the longest part of a run in which the joints can be identified.
 
     In that part every value is known, all joints are in position mode, and no tick is missing.
+
+    Returns:
+        The slice of the run log's rows, one row for each tick.
 
     Raises:
         ConfigError: The run is of another controller, or has no such part.
     """
     if record.config.controller != CONTROLLER:
         raise ConfigError(
-            f"{record.folder}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
+            f"{record.path}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
             f"run with `snakesim run identify`",
             code="commissioning/not-possible",
         )
-    columns = [getattr(record, name) for name in COLUMNS]
-    usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
-    usable &= (record.mode == Mode.POSITION).all(axis=1)
+    columns = [getattr(record, name) for name in SIGNAL_NAMES]
+    is_usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
+    is_usable &= (record.mode == Mode.POSITION).all(axis=1)
     ticks_since_last_row = np.diff(record.time_s) * record.config.rate_hz
-    usable[1:] &= np.abs(ticks_since_last_row - 1) < 0.5
-    padded = np.concatenate(([False], usable, [False])).astype(int)
-    edges = np.flatnonzero(np.diff(padded))
-    parts = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-    if not parts:
+    is_usable[1:] &= np.abs(ticks_since_last_row - 1) < 0.5
+    padded_is_usable = np.concatenate(([False], is_usable, [False])).astype(int)
+    edges = np.flatnonzero(np.diff(padded_is_usable))
+    usable_parts = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    if not usable_parts:
         raise ConfigError(
-            f"{record.folder}: the joints were never moved by position targets; run it again",
+            f"{record.path}: the joints were never moved by position targets; run it again",
             code="commissioning/not-possible",
         )
-    start, end = max(parts, key=lambda part: part[1] - part[0])
+    start, end = max(usable_parts, key=lambda usable_part: usable_part[1] - usable_part[0])
     return slice(start, end)
 
 
-def _print_joints(rows: Sequence[JointIdentification], *, judges_links: bool) -> None:
-    """Print what is known of each joint. judges_links: whether links have IMUs, which show backlash."""
-    for row in rows:
-        _print_joint(row)
+def _print_joints(results: Sequence[JointIdentification], *, judges_links: bool) -> None:
+    """Print what was identified of each joint. `judges_links` is whether links have IMUs, which show backlash."""
+    for result in results:
+        _print_joint(result)
     if not judges_links:
         print_line("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
 
 
-def _print_joint(row: JointIdentification) -> None:
-    if row.explained is None:
-        print_line(row.joint)
+def _print_joint(result: JointIdentification) -> None:
+    if result.explained is None:
+        print_line(result.joint)
     else:
-        print_line(f"{row.joint}   {100 * row.explained:.1f} % of its torque explained")
-    for field, estimate in row.fields.items():
-        name, unit = LABELS[field]
+        print_line(f"{result.joint}   {100 * result.explained:.1f} % of its torque explained")
+    for field, estimate in result.fields.items():
+        name, unit = LABEL_AND_UNIT_BY_FIELD[field]
         print_line(f"  {name:<17} {_format_interval(estimate)} {unit}")
-    if row.latency_s is not None:
-        print_line(f"  {'latency':<17} {_format_interval(row.latency_s)} s")
-    if row.bandwidth_hz is not None:
-        print_line(f"  {'servo bandwidth':<17} {row.bandwidth_hz:.3g} Hz, of this joint with what it carries")
-    for reason in row.unknown:
+    if result.latency_s is not None:
+        print_line(f"  {'latency':<17} {_format_interval(result.latency_s)} s")
+    if result.bandwidth_hz is not None:
+        print_line(f"  {'servo bandwidth':<17} {result.bandwidth_hz:.3g} Hz, of this joint with what it carries")
+    for reason in result.unknown:
         print_line(f"  unknown: {reason}")
-    if row.explained is not None and row.explained < MIN_EXPLAINED:
+    if result.explained is not None and result.explained < MIN_EXPLAINED:
         print_line("  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash")
 
 
@@ -137,20 +140,20 @@ def _format_interval(estimate: Estimate) -> str:
     return f"{estimate.value:.4g}, {low:.4g} to {high:.4g}"
 
 
-def _write_robot_file(path: Path, record: RunRecord, rows: Sequence[JointIdentification]) -> None:
+def _write_robot_file(path: Path, record: RunRecord, results: Sequence[JointIdentification]) -> None:
     """Write the values of the joints that do not fail into a robot file, and print what was written."""
-    from snakesim_operator.features.commissioning.robot_edit import change_joints
+    from snakesim_operator.features.commissioning.robot_edit import write_joint_fields
 
     values: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        if row.fields and not row.fails:
+    for result in results:
+        if result.fields and not result.fails:
             # An estimate of a small friction may be below zero, which no robot file may hold.
-            values[row.joint] = {field: max(estimate.value, 0.0) for field, estimate in row.fields.items()}
-    unchanged = [row.joint for row in rows if row.joint not in values]
+            values[result.joint] = {field: max(estimate.value, 0.0) for field, estimate in result.fields.items()}
+    unchanged = [result.joint for result in results if result.joint not in values]
     if not values:
         print_line(f"{path}: nothing was written: the values of no joint are sure")
         return
-    change_joints(path, values, f"identified from {record.folder.name}")
+    write_joint_fields(path, values, f"identified from {record.path.name}")
     print_line(f"{path}: {len(values)} joints changed; restart the host with it")
     if unchanged:
         print_line(f"{path}: left as they were: {', '.join(unchanged)}")

@@ -34,26 +34,26 @@ class Estimate:
     value: float
     half_width: float  # the interval is value - half_width to value + half_width
 
-    def covers(self, truth: float) -> bool:
+    def contains(self, truth: float) -> bool:
         """Return whether the interval contains a value."""
         return abs(truth - self.value) <= self.half_width
 
-    def scaled(self, factor: float) -> "Estimate":
-        """Return this estimate times a known factor."""
+    def scale_by(self, factor: float) -> "Estimate":
+        """Return this estimate multiplied by a known factor."""
         return Estimate(self.value * factor, self.half_width * abs(factor))
 
-    def times(self, other: "Estimate") -> "Estimate":
+    def multiply_by(self, other: "Estimate") -> "Estimate":
         """Return the product with an independent estimate; its interval is right to first order."""
         half_width = ((self.half_width * other.value) ** 2 + (self.value * other.half_width) ** 2) ** 0.5
         return Estimate(self.value * other.value, half_width)
 
-    def widened(self, uncertainty: float) -> "Estimate":
+    def widen_by(self, uncertainty: float) -> "Estimate":
         """Return this estimate with an independent uncertainty added to its interval."""
         return Estimate(self.value, float(np.hypot(self.half_width, uncertainty)))
 
 
 @dataclass(frozen=True)
-class Fit:
+class LeastSquaresFit:
     """The solution of a least-squares problem with k values."""
 
     values: Floats  # (k,)
@@ -65,7 +65,9 @@ class Fit:
     @property
     def half_widths(self) -> Floats:
         """The half widths of the 95 % intervals, (k,)."""
-        by_scatter: Floats = INTERVAL_FACTOR * student_95(self.degrees_of_freedom) * np.sqrt(np.diag(self.covariance))
+        by_scatter: Floats = (
+            INTERVAL_FACTOR * compute_student_t_95(self.degrees_of_freedom) * np.sqrt(np.diag(self.covariance))
+        )
         if self.bias is None:
             return by_scatter
         return by_scatter + self.bias
@@ -76,12 +78,12 @@ class Fit:
         pairs = zip(self.values, self.half_widths, strict=True)
         return [Estimate(float(value), float(half_width)) for value, half_width in pairs]
 
-    def with_bias(self, bias: Floats) -> "Fit":
+    def with_bias(self, bias: Floats) -> "LeastSquaresFit":
         """Return the same fit with intervals that are wider by a bias, (k,), to either side."""
         return replace(self, bias=bias)
 
-    def divided_by(self, index: int) -> "Fit":
-        """Return the fit of all values divided by one of them, with the covariance to first order.
+    def divide_by_value(self, index: int) -> "LeastSquaresFit":
+        """Return the fit of all values divided by the value at an index, with the covariance to first order.
 
         The Jacobian of v_i / d with respect to v is (I - v e_d' / d) / d, where d is the value at `index`.
         """
@@ -93,19 +95,24 @@ class Fit:
         if self.bias is not None:
             bias = np.abs(jacobian) @ self.bias
         covariance = jacobian @ self.covariance @ jacobian.T
-        return Fit(values, covariance, self.degrees_of_freedom, self.residuals, bias)
+        return LeastSquaresFit(values, covariance, self.degrees_of_freedom, self.residuals, bias)
 
 
-def solve(regressors: Floats, target: Floats, instruments: Floats, blocks: NDArray[np.int64]) -> Fit:
+def solve_with_instruments(
+    regressors: Floats, target: Floats, instruments: Floats, blocks: NDArray[np.int64]
+) -> LeastSquaresFit:
     """Solve a least-squares problem with instruments: find b so that Z' (y - X b) = 0.
 
     The covariance of b is estimated by the jackknife: the problem is solved again without each block of the record.
 
     Args:
         regressors: X, (rows, k).
-        target: y, (rows,).
+        target: Y, (rows,).
         instruments: Z, (rows, k); the regressors themselves for ordinary least squares.
-        blocks: (rows,), for each row, the number of the block of the record that it belongs to.
+        blocks: (rows,) number of the block of the record to which each row belongs.
+
+    Returns:
+        The values b with their covariance, and the residuals y - X b.
 
     Raises:
         ValueError: The rows are too few or do not determine the values.
@@ -116,31 +123,31 @@ def solve(regressors: Floats, target: Floats, instruments: Floats, blocks: NDArr
     if block_count < MIN_BLOCKS_PER_VALUE * value_count:
         raise ValueError("too little motion is left to judge; let it run longer, with larger motion")
     normal_matrix = instruments.T @ regressors
-    if _condition(normal_matrix, instruments, regressors) > MAX_CONDITION:
+    if _compute_condition_number(normal_matrix, instruments, regressors) > MAX_CONDITION:
         raise ValueError("its motion does not tell the values apart; was it moved at all?")
     right_side = instruments.T @ target
     values: Floats = np.linalg.solve(normal_matrix, right_side).astype(np.float64)
     jackknife_changes: list[Floats] = []  # of the values, when one block is left out
     for block in block_ids:
-        left_out = blocks == block
-        reduced_matrix = normal_matrix - instruments[left_out].T @ regressors[left_out]
-        reduced_right_side = right_side - instruments[left_out].T @ target[left_out]
+        is_left_out = blocks == block
+        reduced_matrix = normal_matrix - instruments[is_left_out].T @ regressors[is_left_out]
+        reduced_right_side = right_side - instruments[is_left_out].T @ target[is_left_out]
         reduced_values = np.linalg.solve(reduced_matrix, reduced_right_side)
         jackknife_changes.append(reduced_values - values)
     scatter = np.array(jackknife_changes).T @ np.array(jackknife_changes)
     covariance: Floats = (scatter * ((block_count - 1) / block_count)).astype(np.float64)
     residuals = target - regressors @ values
-    return Fit(values, covariance, block_count - value_count, residuals)
+    return LeastSquaresFit(values, covariance, block_count - value_count, residuals)
 
 
-def _condition(normal: Floats, instruments: Floats, regressors: Floats) -> float:
+def _compute_condition_number(normal_matrix: Floats, instruments: Floats, regressors: Floats) -> float:
     """Return the condition number of the normal equations with all columns scaled to length 1."""
     instrument_lengths = np.linalg.norm(instruments, axis=0) + 1e-300
     regressor_lengths = np.linalg.norm(regressors, axis=0) + 1e-300
-    return float(np.linalg.cond(normal / np.outer(instrument_lengths, regressor_lengths)))
+    return float(np.linalg.cond(normal_matrix / np.outer(instrument_lengths, regressor_lengths)))
 
 
-def student_95(degrees_of_freedom: int) -> float:
+def compute_student_t_95(degrees_of_freedom: int) -> float:
     """Return the two-sided 95 % quantile of Student's t.
 
         t = z + (z^3 + z) / (4 n) + (5 z^5 + 16 z^3 + 3 z) / (96 n^2)
@@ -152,12 +159,12 @@ def student_95(degrees_of_freedom: int) -> float:
     return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
 
 
-def independent_parts(regressors: Floats) -> Floats:
-    """Return how large a part of each column, rms, no combination of the other columns makes up, (k,)."""
-    parts: list[float] = []
+def compute_independent_rms(regressors: Floats) -> Floats:
+    """Return the rms of the part of each column that is linearly independent of the other columns, (k,)."""
+    independent_rms: list[float] = []
     for column in range(regressors.shape[1]):
         others = np.delete(regressors, column, axis=1)
         coefficients = np.linalg.lstsq(others, regressors[:, column], rcond=None)[0]
         remainder = regressors[:, column] - others @ coefficients
-        parts.append(float(np.sqrt(np.mean(remainder**2))))
-    return np.maximum(np.array(parts), 1e-12)
+        independent_rms.append(float(np.sqrt(np.mean(remainder**2))))
+    return np.maximum(np.array(independent_rms), 1e-12)

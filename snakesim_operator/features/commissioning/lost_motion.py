@@ -17,14 +17,14 @@ from snakesim_operator.features.commissioning.link_shares import MIN_SAMPLES
 from snakesim_operator.features.commissioning.measured import CheckMeasurements
 
 SLOPE_HALF_WINDOW_S = 0.04  # rates are slopes over that time to either side, so that noisy angles give no noisy rates
-MARGIN_S = 0.1  # before and after a joint's motion
+MOTION_MARGIN_S = 0.1  # before and after a joint's motion
 FAST_FRACTION = 0.3  # of the highest rate; slower samples tell no ratio
-AGREEMENT = 0.06  # of the highest rate; a sample that is nearer to a ratio agrees with it
+MAX_DISAGREEMENT_FRACTION = 0.06  # of the highest rate; a sample that is nearer to a ratio agrees with it
 MIN_ASSUMED_RATIO = 0.5  # a link behind a slower gear has slower rates, so the agreement scales with the ratio
 MAX_RATIO = 4.0
 MIN_RATIO = 0.12  # of a link that turns at all
 RATIO_STEP = 0.01
-MIN_AGREEING = 0.2  # fraction of the fast samples
+MIN_AGREEING_FRACTION = 0.2  # fraction of the fast samples
 MAX_DELAY_S = 0.03  # between IMU and encoder
 NOISE_FACTOR = 4.0  # standard deviations; less lost motion may be noise
 MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, of its median absolute deviation
@@ -39,38 +39,38 @@ class LostMotion:
     ratio: float  # of the link's rate to the drive's, while the teeth touch
 
 
-def find_lost_motion(run: CheckMeasurements, joint: int) -> LostMotion | None:
+def measure_lost_motion(measurements: CheckMeasurements, joint: int) -> LostMotion | None:
     """Measure the backlash of a joint that moved back and forth.
 
     Fits the ratio of the link's rate to the drive's rate and the delay between their sensors. The backlash is the range
     of the drive angle minus the link angle divided by that ratio.
 
     Args:
-        run: Measurements of the check.
+        measurements: Measurements of the check.
         joint: Index of the joint.
 
     Returns:
         The backlash and its noise; None if the joint moved too little, or no gyro measured its link.
     """
-    moved_rows = np.flatnonzero(run.moved_by_target(joint))
-    link_angle = _integrate_link_angle(run, joint)
+    moved_rows = np.flatnonzero(measurements.is_moved_by_target(joint))
+    link_angle = _integrate_link_angle(measurements, joint)
     if link_angle is None or len(moved_rows) < MIN_SAMPLES:
         return None
     link_rad, drift_rad_per_sqrt_s = link_angle
-    encoder_rad = run.angle_rad[:, joint]
+    encoder_rad = measurements.angle_rad[:, joint]
 
     # The part of the record in which the joint moved, where the slopes are valid.
-    half_window = max(round(SLOPE_HALF_WINDOW_S / run.period_s), 1)
-    margin = round(MARGIN_S / run.period_s)
-    begin = max(moved_rows[0] - margin, 2 * half_window)
+    half_window = max(round(SLOPE_HALF_WINDOW_S / measurements.period_s), 1)
+    margin = round(MOTION_MARGIN_S / measurements.period_s)
+    start = max(moved_rows[0] - margin, 2 * half_window)
     end = min(moved_rows[-1] + margin, len(encoder_rad) - 2 * half_window)
-    window = slice(begin, end)
+    window = slice(start, end)
 
     # Ratio and delay.
-    whole_drive_rate = _slope(encoder_rad, half_window, run.period_s)
-    drive_rate = whole_drive_rate[window]
-    acceleration = _slope(whole_drive_rate, half_window, run.period_s)[window]
-    link_rate = _slope(link_rad, half_window, run.period_s)[window]
+    all_drive_rates = _compute_slopes(encoder_rad, half_window, measurements.period_s)
+    drive_rate = all_drive_rates[window]
+    acceleration = _compute_slopes(all_drive_rates, half_window, measurements.period_s)[window]
+    link_rate = _compute_slopes(link_rad, half_window, measurements.period_s)[window]
     approximate_ratio = _find_ratio(drive_rate, link_rate)
     if approximate_ratio is None:
         return None
@@ -80,32 +80,32 @@ def find_lost_motion(run: CheckMeasurements, joint: int) -> LostMotion | None:
     difference_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
     mean_window = np.full(2 * half_window - 1, 1 / (2 * half_window - 1))
     difference_rad = np.convolve(difference_rad, mean_window, "valid")
-    duration_s = len(difference_rad) * run.period_s
+    duration_s = len(difference_rad) * measurements.period_s
     gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s) / abs(ratio)
-    encoder_noise_rad = _measure_encoder_noise(run, joint) / np.sqrt(half_window)
+    encoder_noise_rad = _measure_encoder_noise(measurements, joint) / np.sqrt(half_window)
     noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
     return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
 
 
-def _measure_encoder_noise(run: CheckMeasurements, joint: int) -> float:
+def _measure_encoder_noise(measurements: CheckMeasurements, joint: int) -> float:
     """Return the standard deviation of the noise of a joint's encoder in rad, measured while the robot was at rest."""
-    differences_rad = np.diff(run.angle_rad[run.at_rest(), joint])
+    differences_rad = np.diff(measurements.angle_rad[measurements.is_at_rest(), joint])
     return float(np.std(differences_rad)) / np.sqrt(2)
 
 
 def _find_ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
     """Return the ratio on which most of the fast samples agree; None if too few do."""
-    highest = float(np.max(np.abs(drive_rate)))
-    fast = np.abs(drive_rate) > FAST_FRACTION * highest
+    max_rate = float(np.max(np.abs(drive_rate)))
+    is_fast = np.abs(drive_rate) > FAST_FRACTION * max_rate
     magnitudes = np.arange(MIN_RATIO, MAX_RATIO, RATIO_STEP)
     candidates = np.concatenate((magnitudes, -magnitudes))
-    distances = np.abs(link_rate[fast, None] - candidates * drive_rate[fast, None])  # (samples, candidates)
-    limits = AGREEMENT * highest * np.maximum(np.abs(candidates), MIN_ASSUMED_RATIO)
-    agreeing = np.mean(distances < limits, axis=0)
-    best = int(np.argmax(agreeing))
-    if agreeing[best] < MIN_AGREEING:
+    distances = np.abs(link_rate[is_fast, None] - candidates * drive_rate[is_fast, None])  # (samples, candidates)
+    max_distances = MAX_DISAGREEMENT_FRACTION * max_rate * np.maximum(np.abs(candidates), MIN_ASSUMED_RATIO)
+    agreeing_fractions = np.mean(distances < max_distances, axis=0)
+    best_index = int(np.argmax(agreeing_fractions))
+    if agreeing_fractions[best_index] < MIN_AGREEING_FRACTION:
         return None
-    return float(candidates[best])
+    return float(candidates[best_index])
 
 
 def _refine_ratio(ratio: float, drive_rate: Floats, link_rate: Floats, acceleration: Floats) -> tuple[float, float]:
@@ -113,67 +113,68 @@ def _refine_ratio(ratio: float, drive_rate: Floats, link_rate: Floats, accelerat
 
     link rate = ratio * (drive rate - delay * acceleration)
     """
-    highest = float(np.max(np.abs(drive_rate)))
+    max_rate = float(np.max(np.abs(drive_rate)))
     distances = np.abs(link_rate - ratio * drive_rate)
-    agrees = distances < 1.5 * AGREEMENT * highest * max(abs(ratio), MIN_ASSUMED_RATIO)
+    # The first ratio is one of a grid, so more samples are accepted than for the grid.
+    agrees = distances < 1.5 * MAX_DISAGREEMENT_FRACTION * max_rate * max(abs(ratio), MIN_ASSUMED_RATIO)
     regressors = np.column_stack((drive_rate[agrees], acceleration[agrees]))
-    values = np.linalg.lstsq(regressors, link_rate[agrees], rcond=None)[0]
-    delay_s = float(np.clip(-values[1] / values[0], -MAX_DELAY_S, MAX_DELAY_S))
-    return float(values[0]), delay_s
+    coefficients = np.linalg.lstsq(regressors, link_rate[agrees], rcond=None)[0]
+    delay_s = float(np.clip(-coefficients[1] / coefficients[0], -MAX_DELAY_S, MAX_DELAY_S))
+    return float(coefficients[0]), delay_s
 
 
-def _integrate_link_angle(run: CheckMeasurements, joint: int) -> tuple[Floats, float] | None:
+def _integrate_link_angle(measurements: CheckMeasurements, joint: int) -> tuple[Floats, float] | None:
     """Return a joint's angle by the gyros of its two links, and the drift of that angle by the gyros' noise.
 
     For the joint at the tail, motion capture may replace a missing gyro on the tail link.
 
     Args:
-        run: Measurements of the check.
+        measurements: Measurements of the check.
         joint: Index of the joint.
 
     Returns:
         (ticks,) angle in rad up to a constant, and the standard deviation of its drift after one second in rad, which
         grows with the square root of time; None if a link was not measured.
     """
-    component = run.component(joint)
-    gyro_behind = _read_gyro(run, joint, component)
-    gyro_ahead = _read_gyro(run, joint + 1, component)
+    component = measurements.find_axis_component(joint)
+    gyro_behind = _read_gyro(measurements, joint, component)
+    gyro_ahead = _read_gyro(measurements, joint + 1, component)
     if gyro_ahead is None:
         return None
     rate_ahead, drift_ahead = gyro_ahead
     if gyro_behind is not None:
         rate_behind, drift_behind = gyro_behind
-        angle_rad = _integrate(rate_ahead - rate_behind, run.period_s)
+        angle_rad = _integrate_rate(rate_ahead - rate_behind, measurements.period_s)
         return angle_rad, float(np.hypot(drift_ahead, drift_behind))
-    base_rad = run.base_turn_rad[:, component]
+    base_rad = measurements.base_rotation_rad[:, component]
     if joint == 0 and not np.isnan(base_rad).all():
         known_rows = np.flatnonzero(~np.isnan(base_rad))
         base_rad = np.interp(np.arange(len(base_rad)), known_rows, base_rad[known_rows])
-        return _integrate(rate_ahead, run.period_s) - base_rad, drift_ahead
+        return _integrate_rate(rate_ahead, measurements.period_s) - base_rad, drift_ahead
     return None
 
 
-def _read_gyro(run: CheckMeasurements, link: int, component: int) -> tuple[Floats, float] | None:
+def _read_gyro(measurements: CheckMeasurements, link: int, component: int) -> tuple[Floats, float] | None:
     """Return a link's rate at every tick, (n,), without its bias, and its drift after a second; None without a gyro."""
-    rate = run.link_rate_rad_s[:, link, component]
+    rate = measurements.link_rate_rad_s[:, link, component]
     known = np.flatnonzero(~np.isnan(rate))
-    at_rest = known[run.at_rest()[known]]
+    at_rest = known[measurements.is_at_rest()[known]]
     if len(at_rest) < MIN_SAMPLES:
         return None
     bias = np.median(rate[at_rest])
     noise = MAD_TO_SD * np.median(np.abs(rate[at_rest] - bias))  # a few outliers do not change it
-    sample_period_s = float(np.median(np.diff(known))) * run.period_s
+    sample_period_s = float(np.median(np.diff(known))) * measurements.period_s
     rate_at_ticks = np.interp(np.arange(len(rate)), known, rate[known] - bias)
     return rate_at_ticks, float(noise * np.sqrt(sample_period_s))
 
 
-def _integrate(rate: Floats, period_s: float) -> Floats:
+def _integrate_rate(rate: Floats, period_s: float) -> Floats:
     """Return the integral of a rate from the first tick, by trapezoids, (n,)."""
     steps = (rate[1:] + rate[:-1]) * period_s / 2
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
-def _slope(signal: Floats, half_window: int, period_s: float) -> Floats:
+def _compute_slopes(signal: Floats, half_window: int, period_s: float) -> Floats:
     """Return the slope of the line through the samples around each sample, (n,); not valid near the ends.
 
     slope = sum(k * signal[i + k]) / sum(k^2) / period       for k from -half_window to half_window

@@ -16,12 +16,12 @@ from snakesim_hal.wire.messages import Description, Imu
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
 
-COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
+SIGNAL_NAMES = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
 MIN_TARGET_MOTION_RAD = 1e-6  # a target that is further from its rest moves its joint
 CLAMPED_FRACTION = 0.9  # of the largest step from the measured angle; beyond, the command limiter set the target
 PITCH = 1  # y, component of a vector in a link's frame
 YAW = 2  # z
-Select = NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class CheckMeasurements:
     """The measurements of a run of the joint check; rows are ticks."""
 
     period_s: float
-    names: Sequence[str]
+    joint_names: Sequence[str]
     axes: Sequence[str]  # "yaw" or "pitch"
     drives: Sequence[Drive]  # from the robot file
     angle_rad: Floats  # (n, joints)
@@ -38,30 +38,30 @@ class CheckMeasurements:
     target_rad: Floats  # (n, joints)
     link_rate_rad_s: Floats  # (n, links, 3), in the link's frame; NaN where no IMU reported
     link_force_m_s2: Floats  # (n, links, 3): specific force, in the link's frame; at rest 1 g upwards
-    base_turn_rad: Floats  # (n, 3): integral of link 0's rate, in its frame; NaN without motion capture
+    base_rotation_rad: Floats  # (n, 3): integral of link 0's rate, in its frame; NaN without motion capture
 
-    def moved_by_target(self, joint: int) -> Select:
+    def is_moved_by_target(self, joint: int) -> Mask:
         """Return the ticks in which the joint's target is away from its rest, (n,)."""
         target_rad = self.target_rad[:, joint]
         return np.abs(target_rad - np.median(target_rad)) > MIN_TARGET_MOTION_RAD
 
-    def at_rest(self) -> Select:
+    def is_at_rest(self) -> Mask:
         """Return the ticks in which no joint's target is away from its rest, (n,)."""
-        moved = [self.moved_by_target(joint) for joint in range(len(self.names))]
+        moved = [self.is_moved_by_target(joint) for joint in range(len(self.joint_names))]
         return ~np.logical_or.reduce(moved)
 
-    def before_motion(self) -> Select:
+    def is_before_motion(self) -> Mask:
         """Return the ticks before the first joint is moved, (n,)."""
-        return np.logical_and.accumulate(self.at_rest())
+        return np.logical_and.accumulate(self.is_at_rest())
 
-    def moved_rad(self, joint: int) -> float:
+    def measure_motion_range_rad(self, joint: int) -> float:
         """Return how far the joint moved by its encoder, from end to end."""
-        moved = self.moved_by_target(joint)
+        moved = self.is_moved_by_target(joint)
         if not moved.any():
             return 0.0
         return float(np.ptp(self.angle_rad[moved, joint]))
 
-    def component(self, joint: int) -> int:
+    def find_axis_component(self, joint: int) -> int:
         """Return which component of a vector in a link's frame is about the joint's axis."""
         return YAW if self.axes[joint] == "yaw" else PITCH
 
@@ -75,22 +75,22 @@ def read_imus(record: RunRecord) -> Iterable[Imu]:
         yield decoder.decode(message.payload, message.encoding)
 
 
-def tick_numbers(record: RunRecord) -> list[int]:
-    """Return the tick of every row of a run log."""
+def compute_tick_numbers(record: RunRecord) -> list[int]:
+    """Return the tick number of every row of a run log."""
     return np.round(record.time_s * record.config.rate_hz).astype(int).tolist()
 
 
-def arrange_by_tick(imus: Iterable[Imu], ticks: Sequence[int], links: int) -> tuple[Floats, Floats]:
+def arrange_imus_by_tick(imus: Iterable[Imu], ticks: Sequence[int], link_count: int) -> tuple[Floats, Floats]:
     """Return angular rates and specific forces of the links, both (n, links, 3); NaN where no IMU reported."""
-    row_of_tick = {tick: row for row, tick in enumerate(ticks)}
-    rates = np.full((len(ticks), links, 3), np.nan)
-    forces = np.full((len(ticks), links, 3), np.nan)
+    row_by_tick = {tick: row for row, tick in enumerate(ticks)}
+    rates_rad_s = np.full((len(ticks), link_count, 3), np.nan)
+    forces_m_s2 = np.full((len(ticks), link_count, 3), np.nan)
     for imu in imus:
-        row = row_of_tick.get(imu.tick)
+        row = row_by_tick.get(imu.tick)
         if row is not None:
-            rates[row, imu.link] = imu.angular_velocity_rad_s
-            forces[row, imu.link] = imu.acceleration_m_s2
-    return rates, forces
+            rates_rad_s[row, imu.link] = imu.angular_velocity_rad_s
+            forces_m_s2[row, imu.link] = imu.acceleration_m_s2
+    return rates_rad_s, forces_m_s2
 
 
 def collect_measurements(
@@ -101,11 +101,15 @@ def collect_measurements(
     Args:
         config: Configuration of the run.
         robot: Description of the robot.
-        ticks: The tick of every row.
+        ticks: Tick number of every row.
         columns: Recorded signals by name, such as `angle_rad`, each with one row for each tick.
         imus: Every IMU message of the run.
+
+    Returns:
+        The measurements; poses are moved to the ticks at which they were true, and targets that the command limiter
+        changed are replaced.
     """
-    rates, forces = arrange_by_tick(imus, ticks, len(robot.links))
+    link_rates_rad_s, link_forces_m_s2 = arrange_imus_by_tick(imus, ticks, len(robot.links))
     pose_sensor = config.robot.sensors.pose
     delay_ticks = 0
     if pose_sensor is not None:
@@ -116,49 +120,55 @@ def collect_measurements(
     target_rad = remove_clamped_targets(columns["target"], columns["angle_rad"], config.robot.safety.max_step_rad)
     return CheckMeasurements(
         period_s=config.period_ns * 1e-9,
-        names=[joint.name for joint in robot.joints],
+        joint_names=[joint.name for joint in robot.joints],
         axes=[joint.axis for joint in robot.joints],
         drives=[joint.drive for joint in config.robot.joint_table],
         angle_rad=columns["angle_rad"],
         velocity_rad_s=columns["velocity_rad_s"],
         torque_nm=columns["torque_nm"],
         target_rad=target_rad,
-        link_rate_rad_s=rates,
-        link_force_m_s2=forces,
-        base_turn_rad=_integrate_base_rate(orientations_wxyz),
+        link_rate_rad_s=link_rates_rad_s,
+        link_force_m_s2=link_forces_m_s2,
+        base_rotation_rad=_integrate_base_rate(orientations_wxyz),
     )
 
 
 def remove_clamped_targets(target_rad: Floats, angle_rad: Floats, max_step_rad: float) -> Floats:
-    """Return the targets of the check, (n, joints), without those to which the command limiter brought them.
+    """Replace the targets that the command limiter changed by the joint's target at rest, and return all, (n, joints).
 
-    A joint without current is swung by the motion of others. Once it is `max_step_rad` from its target, the limiter
-    moves the target along with it, which is no motion of the check.
+    A joint without current is swung by the motion of other joints. Once it is `max_step_rad` away from its target, the
+    limiter moves the target along with the joint, which is no motion of the check.
     """
-    clamped = np.abs(target_rad - angle_rad) > CLAMPED_FRACTION * max_step_rad
-    at_rest_rad = np.nanmedian(np.where(clamped, np.nan, target_rad), axis=0)
-    return np.where(clamped, at_rest_rad, target_rad)
+    is_clamped = np.abs(target_rad - angle_rad) > CLAMPED_FRACTION * max_step_rad
+    at_rest_rad = np.nanmedian(np.where(is_clamped, np.nan, target_rad), axis=0)
+    return np.where(is_clamped, at_rest_rad, target_rad)
 
 
 def _integrate_base_rate(orientation_wxyz: Floats) -> Floats:
-    """Return the integral of the base's angular rate in its own frame from the first known orientation, (n, 3).
+    """Integrate the base's angular rate in its own frame from the first known orientation on, (n, 3) in rad.
 
     A gyro on the base would measure that rate. A rotation from the first orientation would not be about the axis of a
     joint any more once the body has rolled, as a straight body on a flat floor does. The rotation from one orientation
     to the next is small, so its vector is the antisymmetric part of its matrix.
     """
-    integral = np.full((len(orientation_wxyz), 3), np.nan)
+    integral_rad = np.full((len(orientation_wxyz), 3), np.nan)
     is_known = np.isfinite(orientation_wxyz).all(axis=1) & (np.abs(orientation_wxyz).sum(axis=1) > 0)
     known_rows = np.flatnonzero(is_known)
     if not len(known_rows):
-        return integral
-    angle = np.zeros(3)
-    before = rotation_from_quaternion(orientation_wxyz[known_rows[0]])
+        return integral_rad
+    rotation_rad = np.zeros(3)
+    previous_rotation = rotation_from_quaternion(orientation_wxyz[known_rows[0]])
     for row in known_rows:
-        now = rotation_from_quaternion(orientation_wxyz[row])
-        step = before.T @ now
-        twice_the_vector = np.array((step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]))
-        angle = angle + twice_the_vector / 2
-        integral[row] = angle
-        before = now
-    return integral
+        current_rotation = rotation_from_quaternion(orientation_wxyz[row])
+        rotation_step = previous_rotation.T @ current_rotation
+        doubled_step_rad = np.array(
+            (
+                rotation_step[2, 1] - rotation_step[1, 2],
+                rotation_step[0, 2] - rotation_step[2, 0],
+                rotation_step[1, 0] - rotation_step[0, 1],
+            )
+        )
+        rotation_rad = rotation_rad + doubled_step_rad / 2
+        integral_rad[row] = rotation_rad
+        previous_rotation = current_rotation
+    return integral_rad

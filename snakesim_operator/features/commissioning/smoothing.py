@@ -8,22 +8,22 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 
-HALF_WINDOW = 5  # ticks to either side; a smoothed signal is shorter by twice as many
+HALF_WINDOW_TICKS = 5  # ticks to either side; a smoothed signal is shorter by twice as many
 
 
 def smooth(signal: Floats) -> Floats:
-    """Return a signal smoothed along its first axis, (ticks - 2 HALF_WINDOW, ...)."""
-    return filter_columns(signal, _window())
+    """Return a signal smoothed along its first axis, (ticks - 2 HALF_WINDOW_TICKS, ...)."""
+    return filter_columns(signal, _make_window())
 
 
 def smooth_derivative(signal: Floats, period_s: float) -> Floats:
     """Return the time derivative of the smoothed signal, in the signal's unit per second."""
-    return filter_columns(signal, _window(1) / period_s)
+    return filter_columns(signal, _make_window(1) / period_s)
 
 
 def smooth_second_derivative(signal: Floats, period_s: float) -> Floats:
     """Return the second time derivative of the smoothed signal, in the signal's unit per second squared."""
-    return filter_columns(signal, _window(2) / period_s**2)
+    return filter_columns(signal, _make_window(2) / period_s**2)
 
 
 def filter_columns(signal: Floats, kernel: Floats) -> Floats:
@@ -31,19 +31,19 @@ def filter_columns(signal: Floats, kernel: Floats) -> Floats:
     return np.apply_along_axis(lambda column: np.convolve(column, kernel, "valid"), 0, signal)
 
 
-def mean_of_three(signal: Floats) -> Floats:
+def average_with_neighbors(signal: Floats) -> Floats:
     """Return the mean of each sample with its two neighbors, (ticks,)."""
     padded = np.pad(signal, 1, mode="edge")
     return (padded[:-2] + padded[1:-1] + padded[2:]) / 3
 
 
-def direction_of_motion(velocity_rad_s: Floats) -> Floats:
+def compute_motion_direction(velocity_rad_s: Floats) -> Floats:
     """Return the sign of a velocity averaged over each tick, (ticks,), from -1 to 1.
 
     Within the tick in which a joint reverses, the velocity is taken as a straight line, so the average of its sign is
     the fraction of the tick in forward motion minus the fraction in backward motion.
     """
-    velocity = mean_of_three(velocity_rad_s)
+    velocity = average_with_neighbors(velocity_rad_s)
     before = np.roll(velocity, 1)
     before[0] = velocity[0]
     after = np.roll(velocity, -1)
@@ -52,32 +52,34 @@ def direction_of_motion(velocity_rad_s: Floats) -> Floats:
     return np.clip(2 * velocity / change_in_tick, -1.0, 1.0)
 
 
-def is_slow(velocity_rad_s: Floats, limit_rad_s: float, max_fraction: float) -> NDArray[np.bool_]:
-    """Return where more than a fraction of the smoothing window is slower than a limit, (ticks - 2 HALF_WINDOW,)."""
-    slow = (np.abs(mean_of_three(velocity_rad_s)) < limit_rad_s).astype(float)
-    return smooth(slow) >= max_fraction
+def is_slow(velocity_rad_s: Floats, threshold_rad_s: float, max_fraction: float) -> NDArray[np.bool_]:
+    """Return where at least `max_fraction` of the smoothing window is slow, (ticks - 2 HALF_WINDOW_TICKS,)."""
+    is_slow_tick = (np.abs(average_with_neighbors(velocity_rad_s)) < threshold_rad_s).astype(float)
+    return smooth(is_slow_tick) >= max_fraction
 
 
-def _window(derivative: int = 0) -> Floats:
-    """Return the smoothing window or one of its derivatives with respect to ticks, (2 HALF_WINDOW + 1,).
+def _make_window(derivative_order: int = 0) -> Floats:
+    """Make the smoothing window or its first or second derivative with respect to ticks, (2 HALF_WINDOW_TICKS + 1,).
 
-    With s = pi / (2 HALF_WINDOW), at tick k from the middle:
+    With s = pi / (2 HALF_WINDOW_TICKS), at tick k from the middle:
 
         w(k)   = cos(s k)^4 / sum
         w'(k)  = -4 s cos(s k)^3 sin(s k) / sum
         w''(k) = s^2 (12 cos(s k)^2 sin(s k)^2 - 4 cos(s k)^4) / sum
 
+    `sum` is the sum of cos(s k)^4 over the window, so that w sums to 1.
+
     Differences of neighboring samples instead of w'' would make accelerations too small, and so rotors too heavy.
     """
-    s = np.pi / (2 * HALF_WINDOW)
-    phase = np.arange(-HALF_WINDOW, HALF_WINDOW + 1) * np.pi / (2 * HALF_WINDOW)
+    phase_step = np.pi / (2 * HALF_WINDOW_TICKS)
+    phase = np.arange(-HALF_WINDOW_TICKS, HALF_WINDOW_TICKS + 1) * np.pi / (2 * HALF_WINDOW_TICKS)
     cos = np.cos(phase)
     sin = np.sin(phase)
-    match derivative:
+    match derivative_order:
         case 0:
             shape = cos**4
         case 1:
-            shape = -4 * cos**3 * sin * s
+            shape = -4 * cos**3 * sin * phase_step
         case _:
-            shape = (12 * cos**2 * sin**2 - 4 * cos**4) * s**2
+            shape = (12 * cos**2 * sin**2 - 4 * cos**4) * phase_step**2
     return shape / np.sum(cos**4)

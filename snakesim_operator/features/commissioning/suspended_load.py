@@ -16,7 +16,7 @@ from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.solids import GRAVITY_M_S2
 
-AXES = {"yaw": (0.0, 0.0, 1.0), "pitch": (0.0, 1.0, 0.0)}
+UNIT_VECTOR_BY_AXIS = {"yaw": (0.0, 0.0, 1.0), "pitch": (0.0, 1.0, 0.0)}
 
 
 @dataclass(frozen=True)
@@ -36,27 +36,30 @@ def list_links(robot: RobotFile) -> Sequence[Link]:
     return [Link(length_m=length, mass_kg=mass) for length, mass in pairs]
 
 
-def load_nm(robot: RobotFile, angle_rad: Floats, velocity_rad_s: Floats, acceleration_rad_s2: Floats) -> Floats:
+def compute_link_loads_nm(
+    robot: RobotFile, angle_rad: Floats, velocity_rad_s: Floats, acceleration_rad_s2: Floats
+) -> Floats:
     """Return the torque that the links need at every joint, (n, joints); the rotors' inertia is not included.
 
     All arguments are (n, joints), tail to head.
     """
     links = list_links(robot)
     rotations = [
-        rotations_about(np.array(AXES[axis]), angle_rad[:, joint]) for joint, axis in enumerate(robot.axes)
+        make_rotations_about(np.array(UNIT_VECTOR_BY_AXIS[axis]), angle_rad[:, joint])
+        for joint, axis in enumerate(robot.axes)
     ]  # of each joint, from the frame of the link ahead to that of the link behind
-    motions = _move_links(robot, links, rotations, velocity_rad_s, acceleration_rad_s2)
-    return _torques_through_joints(robot, links, rotations, motions)
+    motions = _propagate_link_motions(robot, links, rotations, velocity_rad_s, acceleration_rad_s2)
+    return _compute_joint_torques_nm(robot, links, rotations, motions)
 
 
-def _move_links(
+def _propagate_link_motions(
     robot: RobotFile,
     links: Sequence[Link],
     rotations: Sequence[Floats],
     velocity_rad_s: Floats,
     acceleration_rad_s2: Floats,
 ) -> list[_LinkMotion]:
-    """Return the motion of the link ahead of each joint, from the tail to the head.
+    """Compute the motion of the link ahead of each joint, from the tail to the head (forward Newton-Euler recursion).
 
     With l to the link's front joint, R of the joint, z its axis and q its angle:
 
@@ -75,29 +78,35 @@ def _move_links(
         For each joint, the angular velocity, the angular acceleration and the acceleration of the link ahead of it, (n,
         3) each in the frame of that link; the acceleration includes gravity.
     """
-    count = len(velocity_rad_s)
-    omega = np.zeros((count, 3))
-    alpha = np.zeros((count, 3))
-    acceleration = np.tile([-GRAVITY_M_S2, 0.0, 0.0], (count, 1))
+    tick_count = len(velocity_rad_s)
+    omega_rad_s = np.zeros((tick_count, 3))
+    alpha_rad_s2 = np.zeros((tick_count, 3))
+    acceleration_m_s2 = np.tile([-GRAVITY_M_S2, 0.0, 0.0], (tick_count, 1))
     motions: list[_LinkMotion] = []
     for joint, axis_name in enumerate(robot.axes):
-        axis = np.array(AXES[axis_name])
-        to_front = np.array([links[joint].length_m, 0.0, 0.0])
-        acceleration = acceleration + np.cross(alpha, to_front) + np.cross(omega, np.cross(omega, to_front))
-        omega = _into_link_ahead(rotations[joint], omega)
-        alpha = _into_link_ahead(rotations[joint], alpha)
-        acceleration = _into_link_ahead(rotations[joint], acceleration)
+        axis = np.array(UNIT_VECTOR_BY_AXIS[axis_name])
+        to_front = np.array(
+            [links[joint].length_m, 0.0, 0.0]
+        )  # from the rear to the front of the link behind the joint
+        acceleration_m_s2 = (
+            acceleration_m_s2
+            + np.cross(alpha_rad_s2, to_front)
+            + np.cross(omega_rad_s, np.cross(omega_rad_s, to_front))
+        )
+        omega_rad_s = _rotate_into_link_ahead(rotations[joint], omega_rad_s)
+        alpha_rad_s2 = _rotate_into_link_ahead(rotations[joint], alpha_rad_s2)
+        acceleration_m_s2 = _rotate_into_link_ahead(rotations[joint], acceleration_m_s2)
         joint_rate = velocity_rad_s[:, joint, None] * axis
-        alpha = alpha + np.cross(omega, joint_rate) + acceleration_rad_s2[:, joint, None] * axis
-        omega = omega + joint_rate
-        motions.append(_LinkMotion(omega, alpha, acceleration))
+        alpha_rad_s2 = alpha_rad_s2 + np.cross(omega_rad_s, joint_rate) + acceleration_rad_s2[:, joint, None] * axis
+        omega_rad_s = omega_rad_s + joint_rate
+        motions.append(_LinkMotion(omega_rad_s, alpha_rad_s2, acceleration_m_s2))
     return motions
 
 
-def _torques_through_joints(
+def _compute_joint_torques_nm(
     robot: RobotFile, links: Sequence[Link], rotations: Sequence[Floats], motions: Sequence[_LinkMotion]
 ) -> Floats:
-    """Return the torque through every joint, by the forces on the links from the head to the tail.
+    """Compute the torque through every joint, from the head to the tail (backward Newton-Euler recursion).
 
     With c to the center of mass, l to the front joint, I the inertia about c, and f and m from the link ahead:
 
@@ -114,37 +123,37 @@ def _torques_through_joints(
     Returns:
         (n, joints) torques in N·m.
     """
-    count = len(motions[0].omega)
-    torque = np.zeros((count, len(motions)))
-    force = np.zeros((count, 3))  # of the link ahead on this one, in this link's frame
-    moment = np.zeros((count, 3))
+    tick_count = len(motions[0].omega)
+    torque_nm = np.zeros((tick_count, len(motions)))
+    force_n = np.zeros((tick_count, 3))  # of the link ahead on this one, in this link's frame
+    moment_nm = np.zeros((tick_count, 3))
     for joint in reversed(range(len(motions))):
-        link = links[joint + 1]
+        link = links[joint + 1]  # the link ahead of the joint
         motion = motions[joint]
         center = np.array(link.center)
         to_front = np.array([link.length_m, 0.0, 0.0])
         xx, yy, zz, xy, xz, yz = link.inertia(robot.module.radius_m)
-        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        inertia_kg_m2 = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         centripetal = np.cross(motion.omega, np.cross(motion.omega, center))
-        inertial_force = link.mass_kg * (motion.acceleration + np.cross(motion.alpha, center) + centripetal)
-        inertial_moment = motion.alpha @ inertia + np.cross(motion.omega, motion.omega @ inertia)
-        moment = inertial_moment + np.cross(center, inertial_force) + moment + np.cross(to_front, force)
-        force = inertial_force + force
-        torque[:, joint] = moment @ np.array(AXES[robot.axes[joint]])
-        force = _into_link_behind(rotations[joint], force)
-        moment = _into_link_behind(rotations[joint], moment)
-    return torque
+        inertial_force_n = link.mass_kg * (motion.acceleration + np.cross(motion.alpha, center) + centripetal)
+        inertial_moment_nm = motion.alpha @ inertia_kg_m2 + np.cross(motion.omega, motion.omega @ inertia_kg_m2)
+        moment_nm = inertial_moment_nm + np.cross(center, inertial_force_n) + moment_nm + np.cross(to_front, force_n)
+        force_n = inertial_force_n + force_n
+        torque_nm[:, joint] = moment_nm @ np.array(UNIT_VECTOR_BY_AXIS[robot.axes[joint]])
+        force_n = _rotate_into_link_behind(rotations[joint], force_n)
+        moment_nm = _rotate_into_link_behind(rotations[joint], moment_nm)
+    return torque_nm
 
 
-def _into_link_ahead(rotation: Floats, vector: Floats) -> Floats:
+def _rotate_into_link_ahead(rotation: Floats, vector: Floats) -> Floats:
     return np.einsum("nji,nj->ni", rotation, vector)
 
 
-def _into_link_behind(rotation: Floats, vector: Floats) -> Floats:
+def _rotate_into_link_behind(rotation: Floats, vector: Floats) -> Floats:
     return np.einsum("nij,nj->ni", rotation, vector)
 
 
-def rotations_about(axis: Floats, angle_rad: Floats) -> Floats:
+def make_rotations_about(axis: Floats, angle_rad: Floats) -> Floats:
     """Return the rotation matrices by angles, (n,), about a unit axis, (n, 3, 3).
 
     R = 1 + sin(a) K + (1 - cos(a)) K K, where K v = axis x v. Source: Rodrigues' formula.

@@ -9,32 +9,32 @@ from functools import partial
 from pathlib import Path
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
-from snakesim_hal.base.process import on_stop_signal, raise_open_files
+from snakesim_hal.base.process import call_on_stop_signals, raise_open_file_limit
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.base.workers import start_worker
-from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.base.workers import start_restarting_thread
+from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import read_config
-from snakesim_hal.network.local_registry import local_robots
+from snakesim_hal.network.local_registry import list_local_robots
 from snakesim_hal.network.session import Link
-from snakesim_hal.programs.arguments import add_network, add_parent, add_scenario
-from snakesim_hal.programs.service_program import process_options
+from snakesim_hal.programs.arguments import add_network_arguments, add_parent, add_scenario_arguments
+from snakesim_hal.programs.service_program import read_process_options
 from snakesim_operator.base import extras
 from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
-from snakesim_operator.base.targets import RobotSelection, only_robot
+from snakesim_operator.base.targets import RobotSelection, find_single_robot
 from snakesim_operator.run import children
-from snakesim_operator.run.console_front import start_front
+from snakesim_operator.run.console_front import start_console_front
 
 MAX_OPEN_FILES = 4096  # far more than connections of browsers may use
 
 
-def console(where: RobotSelection, port: int | None, commission: Path | None = None) -> int:
+def show_live_robot(selection: RobotSelection, port: int | None, robot_file: Path | None = None) -> int:
     """Show a running robot in the browser, on pages that can also control it, until Ctrl-C.
 
     Args:
-        where: Selects the robot.
-        port: Port of the page; None: the default port, or any free one.
-        commission: The robot file, into which pages may write what was measured by hand; None: pages write no file.
+        selection: Selects the robot.
+        port: Port of the page; None for the default port, or any free one.
+        robot_file: The robot file into which pages may write measured values; None if they may write no file.
 
     Returns:
         The exit code.
@@ -44,26 +44,26 @@ def console(where: RobotSelection, port: int | None, commission: Path | None = N
         ConfigError: An extra is missing, or the robot file is not valid.
     """
     _prepare_process()
-    if commission is not None:
-        extras.require("lab", "commissioning")
-        robot_text = read_part(str(commission), "robots")
-        decode(robot_text, RobotFile)  # an invalid file is an error now, rather than when a page writes it
-    from snakesim_operator.features.console.display_loop import show_live
+    if robot_file is not None:
+        extras.require_extra("lab", "commissioning")
+        robot_text = read_table_with_base(str(robot_file), "robots")
+        decode_table(robot_text, RobotFile)  # an invalid file is an error now, rather than when a page writes it
+    from snakesim_operator.features.console.display_loop import run_live_display
 
-    link = only_robot(where, "console")
-    stop = _stop_on_signal()
-    with _front_server(port, link, stop) as ports:
-        show_live(link, _find_surroundings(link), ports.pages, stop, commission=commission)
+    link = find_single_robot(selection, "console")
+    stop_event = _make_stop_event()
+    with _run_front_server(port, link, stop_event) as ports:
+        run_live_display(link, _find_surroundings(link), ports.pages, stop_event, robot_file=robot_file)
     return 0
 
 
-def show_record(folder: Path, at_s: float, port: int | None) -> int:
+def show_recorded_run(folder: Path, at_s: float, port: int | None) -> int:
     """Show a recorded run in the browser, with controls to play and to jump, until Ctrl-C.
 
     Args:
         folder: The folder of the run.
-        at_s: Time at which to begin, in seconds after the first instant.
-        port: Port of the page; None: the default port, or any free one.
+        at_s: Time to show first, in seconds after the first instant.
+        port: Port of the page; None for the default port, or any free one.
 
     Returns:
         The exit code.
@@ -72,36 +72,42 @@ def show_record(folder: Path, at_s: float, port: int | None) -> int:
         ConfigError: The folder is not one of a run.
     """
     _prepare_process()
-    from snakesim_operator.features.console.display_loop import show_recorded
+    from snakesim_operator.features.console.display_loop import run_recording_display
     from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
 
     run = RunPlayback(folder)
-    stop = _stop_on_signal()
-    with _front_server(port, None, stop) as ports:
-        return show_recorded(run, at_s, ports.pages, stop)
+    stop_event = _make_stop_event()
+    with _run_front_server(port, None, stop_event) as ports:
+        return run_recording_display(run, at_s, ports.pages, stop_event)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Serve the pages of the run that started this process, at a socket that the run has opened.
 
     The process ends with the run.
+
+    Args:
+        argv: Arguments of the command line; None for those of this process.
+
+    Returns:
+        The exit code, which is always 0.
     """
     parser = argparse.ArgumentParser(
         prog="snakesim_operator.features.console", description="Show a run in the browser."
     )
-    add_scenario(parser)
-    add_network(parser, "")
+    add_scenario_arguments(parser)
+    add_network_arguments(parser, "")
     add_parent(parser)
     parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited descriptor
-    options = process_options(parser.parse_args(argv))
+    options = read_process_options(parser.parse_args(argv))
     _prepare_process()
-    from snakesim_operator.features.console.display_loop import show_live
+    from snakesim_operator.features.console.display_loop import run_live_display
     from snakesim_operator.features.console.robot_data.snapshot import make_expected_snapshot
     from snakesim_operator.features.console.scene.drawing import Surroundings
 
-    listening = socket.socket(fileno=options.arguments.listening)
+    listening_socket = socket.socket(fileno=options.arguments.listening)
     expected = make_expected_snapshot(options.config)
-    show_live(options.link, Surroundings(options.config), listening, _stop_on_signal(), expected)
+    run_live_display(options.link, Surroundings(options.config), listening_socket, _make_stop_event(), expected)
     return 0
 
 
@@ -110,39 +116,39 @@ def _prepare_process() -> None:
 
     Modules that need the extra can be imported only after this.
     """
-    extras.require("console", "the console")
-    raise_open_files(MAX_OPEN_FILES)
+    extras.require_extra("console", "the console")
+    raise_open_file_limit(MAX_OPEN_FILES)
 
 
 @contextlib.contextmanager
-def _front_server(port: int | None, link: Link | None, stop: threading.Event) -> Iterator[ConsolePorts]:
-    """Run the front server in a process of its own, and print the address of the page.
+def _run_front_server(port: int | None, link: Link | None, stop_event: threading.Event) -> Iterator[ConsolePorts]:
+    """Run the front server as a child process for the duration of a `with` block, and print the page's address.
 
     Args:
-        port: Port of the page; None: the default port, or any free one.
-        link: How to reach the robot; None for a recording.
-        stop: Set when the front server ends, because the pages cannot be reached then.
+        port: Port of the page; None for the default port, or any free one.
+        link: Addresses with which the robot is reached; None for a recording.
+        stop_event: Set when the front server ends, because the pages cannot be reached then.
 
     Raises:
         NotConnectedError: The port is in use, or the front server has ended.
     """
     with open_console_ports(port) as ports:
-        front = start_front(ports, link, lambda output: print_line(output.decode(errors="replace").rstrip()))
+        front = start_console_front(ports, link, lambda output: print_line(output.decode(errors="replace").rstrip()))
         print_line(f"console: {ports.address}")
         ports.browsers.close()  # the front server has its own copy
-        start_worker("console front watch", partial(_set_after_end, front, stop))
+        start_restarting_thread("console front watch", partial(_set_after_exit, front, stop_event))
         try:
             yield ports
-            end = front.describe_end()
+            end_reason = front.describe_end()
         finally:
-            children.stop_all([front])
+            children.stop_children([front])
             if front.was_killed:
                 print_line(f"warning: {front.describe_end()}")
-    if end is not None:
-        raise NotConnectedError(f"no browser can connect any more: {end}")
+    if end_reason is not None:
+        raise NotConnectedError(f"no browser can connect any more: {end_reason}")
 
 
-def _set_after_end(child: children.Child, event: threading.Event) -> None:
+def _set_after_exit(child: children.Child, event: threading.Event) -> None:
     """Set an event once a child has ended."""
     child.process.wait()
     event.set()
@@ -152,7 +158,7 @@ def _find_surroundings(link: Link):
     """Return the true surroundings of a robot that runs on this computer, from its configuration; None for others."""
     from snakesim_operator.features.console.scene.drawing import Surroundings
 
-    for robot in local_robots():
+    for robot in list_local_robots():
         is_same_robot = (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace)
         if is_same_robot and robot.config is not None:
             try:
@@ -162,8 +168,8 @@ def _find_surroundings(link: Link):
     return None
 
 
-def _stop_on_signal() -> threading.Event:
+def _make_stop_event() -> threading.Event:
     """Return an event that is set when this process gets a signal to stop."""
     stop = threading.Event()
-    on_stop_signal(stop.set)
+    call_on_stop_signals(stop.set)
     return stop

@@ -9,13 +9,13 @@ class StateChangeLog:
     """Writes a line for each change between a message and the one before it."""
 
     def __init__(self, write: Callable[[str], None]) -> None:
-        """Know no message yet. write: called with each line."""
+        """Start without messages. `write` is called with each line."""
         self._write = write
         self._status: Status | None = None
         self._control: ControlState | None = None
         self._parameters: ControlParameters | None = None
 
-    def note(self, message: Status | ControlState | ControlParameters | None) -> None:
+    def log_change(self, message: Status | ControlState | ControlParameters | None) -> None:
         """Compare a message with the one before it of its type. The same message may be given again."""
         match message:
             case Status() if message is not self._status:

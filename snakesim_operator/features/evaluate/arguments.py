@@ -14,7 +14,7 @@ from snakesim_hal.programs.arguments import (
     add_seed,
     add_set,
     add_workers,
-    number_type,
+    make_number_parser,
 )
 from snakesim_hal.programs.commands import Command, Commands
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MAX_TITLE_CHARACTERS = 200  # of a suite
 
 
-def _add_evaluate(parser: argparse.ArgumentParser) -> None:
+def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE", help="name of a shipped suite, or path of a suite file")
     parser.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
     add_fields(parser, "for each row and controller (default: the suite's)")
@@ -40,18 +40,18 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
         help="pair with the score card there",
     )
     add_set(parser)
-    _add_shared(parser)
+    _add_shared_options(parser)
 
 
-def _add_sweep(parser: argparse.ArgumentParser) -> None:
+def _add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add_scenario_name(parser)
     _add_vary(parser, "values of a key: KEY=LOW:HIGH:COUNT, or KEY=[A, B] (may be repeated)")
     _add_seeds(parser, "runs for each value (default: 1)")
     add_set(parser)
-    _add_shared(parser)
+    _add_shared_options(parser)
 
 
-def _add_optimize(parser: argparse.ArgumentParser) -> None:
+def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim study optimize`, which searches the values of keys for the best result."""
     parser.add_argument(
         "scenario",
@@ -63,7 +63,11 @@ def _add_optimize(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
     parser.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
     parser.add_argument(
-        "--trials", type=number_type(1, 100_000), default=50, metavar="N", help="in the file at the end (default: 50)"
+        "--trials",
+        type=make_number_parser(1, 100_000),
+        default=50,
+        metavar="N",
+        help="in the file at the end (default: 50)",
     )
     _add_seeds(parser, "runs for each trial, or fields for each row (default: 1)")
     parser.add_argument(
@@ -86,10 +90,10 @@ def _add_vary(parser: argparse.ArgumentParser, about: str) -> None:
 
 
 def _add_seeds(parser: argparse.ArgumentParser, about: str) -> None:
-    parser.add_argument("--seeds", type=number_type(1, 100_000), default=1, metavar="N", help=about)
+    parser.add_argument("--seeds", type=make_number_parser(1, 100_000), default=1, metavar="N", help=about)
 
 
-def _add_shared(parser: argparse.ArgumentParser) -> None:
+def _add_shared_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
     add_out(parser, "folder of the results (default: runs/NAME-TIME)")
     add_resume(parser)
@@ -104,48 +108,55 @@ def _add_study_seed(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
-    return _guarded_if_one_run(arguments, _evaluate_with)
+def _run_evaluate(arguments: argparse.Namespace) -> int:
+    return _run_guarded_if_single_case(arguments, _evaluate_suite)
 
 
-def _sweep(arguments: argparse.Namespace) -> int:
-    return _guarded_if_one_run(arguments, _sweep_with)
+def _run_sweep(arguments: argparse.Namespace) -> int:
+    return _run_guarded_if_single_case(arguments, _evaluate_sweep)
 
 
-def _guarded_if_one_run(
-    arguments: argparse.Namespace, act: "Callable[[argparse.Namespace, SharedStepTimes | None], int]"
+def _run_guarded_if_single_case(
+    arguments: argparse.Namespace, run_command: "Callable[[argparse.Namespace, SharedStepTimes | None], int]"
 ) -> int:
-    """Run a command; with `--only` in a child process, which can be ended whatever its controller does."""
-    _check_extra()
+    """Run a command; with `--only`, run it in a child process that can be ended whatever its controller does.
+
+    Args:
+        arguments: The parsed command line.
+        run_command: Runs the command and returns its exit code; its second argument is None without `--only`.
+    """
+    _require_train_extra()
     if arguments.only is None:
-        return act(arguments, None)
-    from snakesim_operator.run.guarded_process import run_guarded
+        return run_command(arguments, None)
+    from snakesim_operator.run.guarded_process import run_in_guarded_child
 
-    return run_guarded(lambda step_times: act(arguments, step_times), owns_process=arguments.owns_process)
+    return run_in_guarded_child(
+        lambda step_times: run_command(arguments, step_times), owns_process=arguments.owns_process
+    )
 
 
-def _evaluate_with(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
+def _evaluate_suite(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
     """Run `snakesim study evaluate`, and return its exit code.
 
     Args:
         arguments: The parsed command line.
-        step_times: Shows another process that a single run makes progress; None if no process watches.
+        step_times: Shared memory that shows another process that a run makes progress; None if no process watches.
     """
-    from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
-    from snakesim_operator.features.evaluate.suite import override_suite, read_suite
+    from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, run_evaluation
+    from snakesim_operator.features.evaluate.suite import read_suite, set_suite_values
 
     suite, source = read_suite(arguments.suite)
-    suite = override_suite(suite, _parse_settings(arguments.set))
+    suite = set_suite_values(suite, _parse_set_options(arguments.set))
     names = (arguments.controllers or "").split(",")
     controllers = [name.strip() for name in names if name.strip()]
 
     # The command that runs one of the cases again, for the report.
-    command = ["snakesim", "study", "evaluate", arguments.suite]
+    command_words = ["snakesim", "study", "evaluate", arguments.suite]
     if controllers:
-        command += ["--controllers", ",".join(controllers)]
+        command_words += ["--controllers", ",".join(controllers)]
     if arguments.rows:
-        command += ["--rows", arguments.rows]
-    command += _repeat_option("--set", arguments.set)
+        command_words += ["--rows", arguments.rows]
+    command_words += _repeat_option("--set", arguments.set)
 
     request = EvaluationRequest(
         suite=suite,
@@ -155,19 +166,19 @@ def _evaluate_with(arguments: argparse.Namespace, step_times: "SharedStepTimes |
         fields=arguments.fields or suite.fields,
         rows=_parse_numbers(arguments.rows or "", "--rows"),
         against=arguments.against,
-        **_shared_values(arguments, command),
+        **_collect_shared_values(arguments, command_words),
     )
-    return evaluate(request, step_times)
+    return run_evaluation(request, step_times)
 
 
-def _sweep_with(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
+def _evaluate_sweep(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
     """Run `snakesim study sweep` as the evaluation of a suite that varies one scenario, and return its exit code.
 
     Args:
         arguments: The parsed command line.
-        step_times: Shows another process that a single run makes progress; None if no process watches.
+        step_times: Shared memory that shows another process that a run makes progress; None if no process watches.
     """
-    from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, evaluate
+    from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, run_evaluation
     from snakesim_operator.features.evaluate.suite import Suite, parse_vary
 
     title = f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"
@@ -175,14 +186,14 @@ def _sweep_with(arguments: argparse.Namespace, step_times: "SharedStepTimes | No
     suite = Suite(
         title=title[:MAX_TITLE_CHARACTERS],
         scenario=arguments.scenario,
-        set=_parse_settings(arguments.set),
+        set=_parse_set_options(arguments.set),
         vary=vary,
     )
 
     # The command that runs one of the cases again, for the report.
-    command = ["snakesim", "study", "sweep", arguments.scenario]
-    command += _repeat_option("--vary", arguments.vary)
-    command += _repeat_option("--set", arguments.set)
+    command_words = ["snakesim", "study", "sweep", arguments.scenario]
+    command_words += _repeat_option("--vary", arguments.vary)
+    command_words += _repeat_option("--set", arguments.set)
 
     request = EvaluationRequest(
         suite=suite,
@@ -190,49 +201,51 @@ def _sweep_with(arguments: argparse.Namespace, step_times: "SharedStepTimes | No
         name="sweep",
         controllers=[],
         fields=arguments.seeds,
-        **_shared_values(arguments, command),
+        **_collect_shared_values(arguments, command_words),
     )
-    return evaluate(request, step_times)
+    return run_evaluation(request, step_times)
 
 
-def _shared_values(arguments: argparse.Namespace, command: list[str]) -> dict[str, Any]:
-    """Return the values of an `EvaluationRequest` that both commands have. command: that runs one case again."""
+def _collect_shared_values(arguments: argparse.Namespace, command: list[str]) -> dict[str, Any]:
+    """Return the values of an `EvaluationRequest` that both commands have. `command` runs one of the cases again."""
     names = ("seed", "only", "out", "resume", "cluster", "workers")
     values = {name: getattr(arguments, name) for name in names}
     values["command"] = shlex.join(command)
     return values
 
 
-def _optimize(arguments: argparse.Namespace) -> int:
+def _run_optimize(arguments: argparse.Namespace) -> int:
     """Run `snakesim study optimize`, and return its exit code. If it is stopped, print how to continue it."""
-    _check_extra()
-    from snakesim_hal.base.process import stop_signals_raise
+    _require_train_extra()
+    from snakesim_hal.base.process import raise_on_stop_signals
     from snakesim_hal.base.terminal import print_line
-    from snakesim_operator.features.evaluate.optimize import SearchRequest, optimize
-    from snakesim_operator.run.conclusion import INTERRUPTED
-    from snakesim_operator.run.folder import default_folder
+    from snakesim_operator.features.evaluate.optimize import SearchRequest, run_optimization
+    from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
+    from snakesim_operator.run.folder import choose_default_folder
 
-    # Most fields of a request have the name of their option.
+    # Every field of `SearchRequest` has the name of its option; three of them are converted below.
     values = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchRequest)}
-    storage = arguments.storage or default_folder("optimize").with_suffix(".db")
+    # Without --storage, the file has the name that a new run folder would have.
+    storage = arguments.storage or choose_default_folder("optimize").with_suffix(".db")
     values["storage"] = storage
     values["rows"] = _parse_numbers(arguments.rows or "", "--rows")
+    # The option has no default, because the suite of `study evaluate` may draw its seed; a search does not.
     values["seed"] = 1 if arguments.seed is None else arguments.seed
-    with stop_signals_raise():
+    with raise_on_stop_signals():
         try:
-            return optimize(SearchRequest(**values))
+            return run_optimization(SearchRequest(**values))
         except KeyboardInterrupt:  # the storage keeps every finished trial
             if storage.is_file():
                 print_line(f"stopped: {storage} keeps the trials that are done; the same command continues with")
                 print_line(f"  --storage {shlex.quote(str(storage))}")
-            return INTERRUPTED
+            return EXIT_INTERRUPTED
 
 
-def _parse_settings(texts: list[str]) -> dict[str, Any]:
+def _parse_set_options(texts: list[str]) -> dict[str, Any]:
     """Return the values of `--set`, by key. Raises ConfigError."""
-    from snakesim_hal.model.scenario import parse_set
+    from snakesim_hal.model.scenario import parse_set_option
 
-    overrides = map(parse_set, texts)
+    overrides = map(parse_set_option, texts)
     return {override.key: override.value for override in overrides}
 
 
@@ -256,19 +269,19 @@ def _repeat_option(option: str, values: list[str]) -> list[str]:
     return words
 
 
-def _check_extra() -> None:
+def _require_train_extra() -> None:
     """Raise an error that names the extra `train` if it is not installed."""
     from snakesim_operator.base import extras
 
-    extras.require("train", "this command")
+    extras.require_extra("train", "this command")
 
 
 COMMANDS: Commands = (
     Command(
         name="study evaluate",
         help="Run controllers on many fields. Writes a table with confidence intervals, and a page.",
-        add=_add_evaluate,
-        run=_evaluate,
+        add=_add_evaluate_arguments,
+        run=_run_evaluate,
         details="Exit code 0: all cases ran, also if their runs failed. 1: some could not. 2: wrong input, nothing was "
         "run. 130: stopped by Ctrl-C, continue with --resume.",
         examples=(
@@ -279,8 +292,8 @@ COMMANDS: Commands = (
     Command(
         name="study sweep",
         help="Run a scenario with different values of any setting.",
-        add=_add_sweep,
-        run=_sweep,
+        add=_add_sweep_arguments,
+        run=_run_sweep,
         examples=(
             "study sweep peg_row --vary control.speed_kp_s=0.1:0.5:5",
             "study sweep peg_row --vary control.speed_kp_s=0.1:0.5:5 --seeds 4 --out runs/sweep",
@@ -289,8 +302,8 @@ COMMANDS: Commands = (
     Command(
         name="study optimize",
         help="Search settings for the best mean of a number of the summary.",
-        add=_add_optimize,
-        run=_optimize,
+        add=_add_optimize_arguments,
+        run=_run_optimize,
         examples=(
             "study optimize peg_row --vary control.speed_kp_s=0.1:0.5 --goal path_distance_m",
             "study optimize peg_row --vary control.speed_kp_s=0.1:0.5 --goal energy_j_per_m --minimize --trials 100",

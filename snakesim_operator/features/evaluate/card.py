@@ -16,12 +16,12 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scenario import RunConfig, config_hash
-from snakesim_operator.features.evaluate.case import Case, code_digest
+from snakesim_hal.model.scenario import RunConfig, compute_config_hash
+from snakesim_operator.features.evaluate.case import Case, compute_code_digest
 from snakesim_operator.features.evaluate.store import Results
-from snakesim_operator.features.evaluate.table import ResultRow, group_results, wilson_interval
+from snakesim_operator.features.evaluate.table import ResultRow, compute_wilson_interval, group_results_by_row
 
-CARD = "card.json"
+CARD_FILENAME = "card.json"
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Metric:
 
     label: str
     digits: int
-    of_crossed: bool = False  # of the runs that reached their goal, instead of all runs
+    only_crossed: bool = False  # of the runs that reached their goal, instead of all runs
 
 
 METRICS = {
-    "advance_m_s": Metric("speed, m/s", 3, of_crossed=True),
-    "body_lengths_s": Metric("speed, body lengths/s", 3, of_crossed=True),
-    "energy_j_per_m": Metric("energy, J/m", 1, of_crossed=True),
-    "cost_of_transport": Metric("cost of transport", 3, of_crossed=True),
-    "propulsive_efficiency": Metric("propulsive efficiency", 3, of_crossed=True),
+    "advance_m_s": Metric("speed, m/s", 3, only_crossed=True),
+    "body_lengths_s": Metric("speed, body lengths/s", 3, only_crossed=True),
+    "energy_j_per_m": Metric("energy, J/m", 1, only_crossed=True),
+    "cost_of_transport": Metric("cost of transport", 3, only_crossed=True),
+    "propulsive_efficiency": Metric("propulsive efficiency", 3, only_crossed=True),
     "displacement_m_s": Metric("net displacement: speed, m/s", 3),
     "displacement_energy_j_per_m": Metric("net displacement: energy, J/m", 1),
     "displacement_cost_of_transport": Metric("net displacement: cost of transport", 3),
@@ -46,7 +46,7 @@ METRICS = {
     "displacement_slip": Metric("slip along the path", 3),
     "lateral_slip": Metric("lateral slip", 3),
     "jam_ratio": Metric("jam ratio", 3),
-    "impulse_n_s_per_m": Metric("contact impulse, N·s/m", 1, of_crossed=True),
+    "impulse_n_s_per_m": Metric("contact impulse, N·s/m", 1, only_crossed=True),
     "torque_headroom": Metric("torque headroom", 2),
     "form_closure": Metric("form closure, share of time", 3),
     "planning_fraction": Metric("planning, share of turns", 2),
@@ -101,28 +101,36 @@ class Comparison(msgspec.Struct, frozen=True):
     p: float  # corrected for the number of comparisons
 
 
-def make_card(suite: str, cases: Sequence[Case], done: Results) -> Card:
-    """Return the score card of all cases that are done. suite: name of the evaluation."""
+def make_card(suite: str, cases: Sequence[Case], outcome_by_id: Results) -> Card:
+    """Make the score card of all cases that have an outcome.
+
+    Args:
+        suite: Name of the evaluation.
+        cases: All cases, in the order of the table.
+        outcome_by_id: The outcome of each finished case by its id.
+    """
     crossings: list[Crossing] = []
     for case in cases:
-        if case.id in done:
-            crossed = done[case.id].numbers.get("crossed") is True
-            crossings.append(Crossing(case.controller, case.setting, case.field, _hash_any_controller(case), crossed))
+        if case.id in outcome_by_id:
+            crossed = outcome_by_id[case.id].numbers.get("crossed") is True
+            crossings.append(
+                Crossing(case.controller, case.setting, case.field, _hash_without_controller(case), crossed)
+            )
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
     return Card(
         suite=suite,
         version=version("snakesim"),
-        code=code_digest(),
+        code=compute_code_digest(),
         machine=machine,
         fields=sorted({case.field for case in cases}),
-        scores=[_score(row) for row in group_results(cases, done)],
+        scores=[_make_score(row) for row in group_results_by_row(cases, outcome_by_id)],
         crossings=crossings,
     )
 
 
 def read_card(path: Path) -> Card:
     """Return the card in a file, or in the folder that holds it. Raises ConfigError."""
-    file = path / CARD if path.is_dir() else path
+    file = path / CARD_FILENAME if path.is_dir() else path
     try:
         return msgspec.json.decode(file.read_bytes(), type=Card)
     except (OSError, msgspec.DecodeError) as error:
@@ -131,26 +139,30 @@ def read_card(path: Path) -> Card:
         ) from None
 
 
-def compare(card: Card, others: Sequence[Card]) -> list[Comparison]:
+def compare_cards(card: Card, others: Sequence[Card]) -> list[Comparison]:
     """Compare controllers row by row, with p values corrected for the number of comparisons.
 
     The first controller of the card is compared with each of its other controllers. Then each of its controllers is
     compared with each controller of the other cards.
+
+    Args:
+        card: The score card of this evaluation.
+        others: Score cards of other evaluations.
     """
-    names = _controllers(card)
+    names = _list_controllers(card)
     comparisons: list[Comparison] = []
     for name in names[1:]:
-        comparisons += _compare_pair(card, names[0], card, name, label=name)
+        comparisons += _compare_controllers(card, names[0], card, name, label=name)
     for other in others:
         for name in names:
-            for other_name in _controllers(other):
+            for other_name in _list_controllers(other):
                 label = f"{other_name} ({other.version}, {other.code})"
-                comparisons += _compare_pair(card, name, other, other_name, label=label)
-    corrected = holm([comparison.p for comparison in comparisons])
+                comparisons += _compare_controllers(card, name, other, other_name, label=label)
+    corrected = correct_p_values_by_holm([comparison.p for comparison in comparisons])
     return [msgspec.structs.replace(comparison, p=p) for comparison, p in zip(comparisons, corrected, strict=True)]
 
 
-def mcnemar(only_one: int, only_other: int) -> float:
+def compute_mcnemar_p(only_one: int, only_other: int) -> float:
     """Return the two-sided p value of McNemar's exact test.
 
     It is the probability that the n discordant fields split as unevenly as this, if neither controller were better:
@@ -164,27 +176,27 @@ def mcnemar(only_one: int, only_other: int) -> float:
     return min(2 * tail, 1.0)
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
+def correct_p_values_by_holm(p_values: Sequence[float]) -> list[float]:
     """Return p values corrected for their number m: of the k-th smallest, the maximum over i <= k of (m - i + 1) p_i.
 
     Source: Holm (1979), "A simple sequentially rejective multiple test procedure".
     """
     count = len(p_values)
     corrected = [0.0] * count
-    highest = 0.0
-    ascending = sorted(range(count), key=lambda i: p_values[i])
-    for rank, i in enumerate(ascending):
-        highest = max(highest, min((count - rank) * p_values[i], 1.0))
-        corrected[i] = highest
+    running_max = 0.0
+    indices_by_p = sorted(range(count), key=lambda i: p_values[i])
+    for rank, i in enumerate(indices_by_p):
+        running_max = max(running_max, min((count - rank) * p_values[i], 1.0))
+        corrected[i] = running_max
     return corrected
 
 
-def card_lines(card: Card, comparisons: Sequence[Comparison]) -> list[str]:
+def format_card(card: Card, comparisons: Sequence[Comparison]) -> list[str]:
     """Return the card for a terminal: the numbers that the table does not have, and the comparisons."""
     lines = [f"score card: {card.suite}, snakesim {card.version}, code {card.code}, {card.machine}"]
     lines.append(f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that crossed")
     for score in card.scores:
-        lines += _score_lines(score)
+        lines += _format_score(score)
     for comparison in comparisons:
         counts = (
             f"{comparison.only_one} fields only by the first, {comparison.only_other} only by the second, "
@@ -198,7 +210,7 @@ def card_lines(card: Card, comparisons: Sequence[Comparison]) -> list[str]:
     return lines
 
 
-def _score_lines(score: Score) -> list[str]:
+def _format_score(score: Score) -> list[str]:
     crossed = "no goal"
     if score.crossed is not None:
         low, high = score.interval
@@ -213,36 +225,40 @@ def _score_lines(score: Score) -> list[str]:
     return lines
 
 
-def _score(row: ResultRow) -> Score:
-    medians = {key: _median(row.values(key, of_crossed=metric.of_crossed)) for key, metric in METRICS.items()}
+def _make_score(row: ResultRow) -> Score:
+    medians = {
+        key: _compute_median(row.list_values(key, of_crossed=metric.only_crossed)) for key, metric in METRICS.items()
+    }
     return Score(
         controller=row.controller,
         row=row.setting,
         runs=row.runs,
         crossed=row.crossed,
-        interval=wilson_interval(row.crossed or 0, row.runs),
+        interval=compute_wilson_interval(row.crossed or 0, row.runs),
         medians=medians,
     )
 
 
-def _median(values: Sequence[float]) -> float | None:
+def _compute_median(values: Sequence[float]) -> float | None:
     if not values:
         return None
     return float(np.median(values))
 
 
-def _hash_any_controller(case: Case) -> str:
+def _hash_without_controller(case: Case) -> str:
     """Return a hash of a case's configuration without its controller: it names the field and all that it sets."""
     config = msgspec.json.decode(case.config, type=RunConfig)
-    return config_hash(msgspec.structs.replace(config, controller="any", controllers={}))
+    return compute_config_hash(msgspec.structs.replace(config, controller="any", controllers={}))
 
 
-def _controllers(card: Card) -> list[str]:
+def _list_controllers(card: Card) -> list[str]:
     """Return the controllers of a card, in the order in which they were tried."""
     return list(dict.fromkeys(crossing.controller for crossing in card.crossings))
 
 
-def _compare_pair(card: Card, controller: str, other: Card, other_controller: str, *, label: str) -> list[Comparison]:
+def _compare_controllers(
+    card: Card, controller: str, other: Card, other_controller: str, *, label: str
+) -> list[Comparison]:
     """Compare the success of two controllers in each row in which both were tried on the same fields.
 
     McNemar's test of paired outcomes: only fields count in which exactly one of the controllers reached the goal. The
@@ -256,17 +272,19 @@ def _compare_pair(card: Card, controller: str, other: Card, other_controller: st
         label: Name under which the second controller is shown.
 
     Returns:
-        One comparison for each row, in the order of the first card.
+        One comparison for each row with shared fields, in the order of the first card.
     """
-    other_outcomes: dict[str, bool] = {}  # configuration without its controller -> whether it reached the goal
+    has_reached_goal_by_config: dict[
+        str, bool
+    ] = {}  # configuration without its controller -> whether it reached the goal
     for crossing in other.crossings:
         if crossing.controller == other_controller:
-            other_outcomes[crossing.same] = crossing.crossed
+            has_reached_goal_by_config[crossing.same] = crossing.crossed
 
     pairs_by_row: dict[str, list[tuple[bool, bool]]] = {}  # (first, second) reached the goal, for each shared field
     for crossing in card.crossings:
-        if crossing.controller == controller and crossing.same in other_outcomes:
-            pair = (crossing.crossed, other_outcomes[crossing.same])
+        if crossing.controller == controller and crossing.same in has_reached_goal_by_config:
+            pair = (crossing.crossed, has_reached_goal_by_config[crossing.same])
             pairs_by_row.setdefault(crossing.row, []).append(pair)
 
     comparisons: list[Comparison] = []
@@ -277,6 +295,6 @@ def _compare_pair(card: Card, controller: str, other: Card, other_controller: st
         pairs = pairs_by_row[row]
         only_first = pairs.count((True, False))
         only_second = pairs.count((False, True))
-        p = mcnemar(only_first, only_second)
+        p = compute_mcnemar_p(only_first, only_second)
         comparisons.append(Comparison(row, controller, label, len(pairs), only_first, only_second, p))
     return comparisons

@@ -10,27 +10,39 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.base.process import stop_signals_raise
+from snakesim_hal.base.process import raise_on_stop_signals
 from snakesim_hal.base.step_limit import SharedStepTimes
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.base.dask_cluster import check_address
+from snakesim_operator.base.dask_cluster import validate_address
 from snakesim_operator.features.evaluate import store
-from snakesim_operator.features.evaluate.card import CARD, Card, card_lines, compare, make_card, read_card
+from snakesim_operator.features.evaluate.card import (
+    CARD_FILENAME,
+    Card,
+    compare_cards,
+    format_card,
+    make_card,
+    read_card,
+)
 from snakesim_operator.features.evaluate.case import Case
-from snakesim_operator.features.evaluate.cluster import workers
-from snakesim_operator.features.evaluate.page import render_page
-from snakesim_operator.features.evaluate.progress import Progress
-from snakesim_operator.features.evaluate.suite import Suite, make_cases, select_rows
-from snakesim_operator.features.evaluate.table import best_controller, group_results, table_lines, worst_failures
-from snakesim_operator.run.conclusion import INTERRUPTED
-from snakesim_operator.run.folder import default_folder
+from snakesim_operator.features.evaluate.cluster import start_workers
+from snakesim_operator.features.evaluate.page import render_evaluation_page
+from snakesim_operator.features.evaluate.progress import CaseProgress
+from snakesim_operator.features.evaluate.suite import Suite, make_cases, select_cases_of_rows
+from snakesim_operator.features.evaluate.table import (
+    find_best_controller,
+    find_worst_failures,
+    format_table,
+    group_results_by_row,
+)
+from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
+from snakesim_operator.run.folder import choose_default_folder
 from snakesim_operator.run.in_process import run_in_process
 
 FIRST_DRAWN_FIELD = 1_000_000  # fields that a suite draws are beyond any that parameters were tuned on
 LAST_DRAWN_FIELD = 2_000_000_000
-PAGE = "evaluation.html"
+PAGE_FILENAME = "evaluation.html"
 
 
 @dataclass(frozen=True)
@@ -56,44 +68,49 @@ class EvaluationRequest:
     workers: int | None = None
 
 
-def evaluate(request: EvaluationRequest, step_times: SharedStepTimes | None = None) -> int:
+def run_evaluation(request: EvaluationRequest, step_times: SharedStepTimes | None = None) -> int:
     """Run all cases of an evaluation that have no result yet, or one case as a run with its own folder.
 
     Args:
-        request: the cases, the output folder, and the options of the command.
-        step_times: shows another process that a single run makes progress; None if no process watches.
+        request: The cases, the output folder, and the options of the command.
+        step_times: Shared memory that shows another process that a single run makes progress; None if no process
+            watches.
 
     Returns:
-        The exit code: 0; 1 if a case could not run; 130 if the operator stopped it. Finished cases are never lost.
+        The exit code: 0 if all cases ran; 1 if a case could not run; 130 if the user stopped it. Finished cases are
+        never lost.
     """
     if request.only is not None:
         return _run_one_case(request, request.only, step_times)
-    with stop_signals_raise():
+    with raise_on_stop_signals():
         try:
             return _run_all_cases(request)
         except KeyboardInterrupt:
             print_line("stopped before any case was begun")
-            return INTERRUPTED
+            return EXIT_INTERRUPTED
 
 
 def _run_all_cases(request: EvaluationRequest) -> int:
-    """Run all cases that have no result in the output folder yet, and write the results.
+    """Run all cases that have no result in the output folder yet, and write the report of all cases.
+
+    Args:
+        request: The cases, the output folder, and the options of the command.
 
     Returns:
-        The exit code: 0; 1 if a case could not run; INTERRUPTED if the operator stopped it.
+        The exit code: 0 if all cases ran; 1 if a case could not run; EXIT_INTERRUPTED if the user stopped it.
 
     Raises:
         ConfigError: The request is invalid.
     """
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out", code="command/invalid-option")
-    check_address(request.cluster)
+    validate_address(request.cluster)
     other_cards = [read_card(path) for path in request.against]
-    seed = choose_first_field(request)
-    cases = make_cases(request.suite, request.source, request.controllers, request.fields, seed)
-    cases = select_rows(cases, request.rows, request.source)
-    out = request.out or default_folder(request.name)
-    with store.open_store(out, resume=request.resume) as results:
+    first_seed = choose_first_seed(request)
+    cases = make_cases(request.suite, request.source, request.controllers, request.fields, first_seed)
+    cases = select_cases_of_rows(cases, request.rows, request.source)
+    output_folder = request.out or choose_default_folder(request.name)
+    with store.open_store(output_folder, resume=request.resume) as results:
         # Cases of two rows with the same configuration have the same id, and run once.
         cases_to_run = list({case.id: case for case in cases if case.id not in results.done}.values())
         cases_to_run.sort(key=lambda case: case.field)  # if it is stopped, every row has results of the same fields
@@ -101,28 +118,31 @@ def _run_all_cases(request: EvaluationRequest) -> int:
             print_line(f"{len(cases) - len(cases_to_run)} of {len(cases)} cases are done already")
         try:
             if cases_to_run:
-                _run_on_workers(request, cases_to_run, results, out)
-            _report(request, cases, results.done, out, other_cards)
+                _run_and_store_cases(request, cases_to_run, results, output_folder)
+            _report_results(request, cases, results.done, output_folder, other_cards)
         except KeyboardInterrupt:
             done_count = sum(case.id in results.done for case in cases)
             print_line(f"stopped: {done_count} of {len(cases)} cases are done; the same command continues with")
-            seed_option = f" --seed {seed}" if request.suite.fresh else ""
-            print_line(f"  --resume --out {shlex.quote(str(out))}{seed_option}")
-            return INTERRUPTED
+            seed_option = f" --seed {first_seed}" if request.suite.fresh else ""
+            print_line(f"  --resume --out {shlex.quote(str(output_folder))}{seed_option}")
+            return EXIT_INTERRUPTED
         has_errors = any(results.done[case.id].error is not None for case in cases)
         return 1 if has_errors else 0
 
 
-def choose_first_field(request: EvaluationRequest) -> int:
-    """Return the number of the first field, that is the seed of the first random scene.
+def choose_first_seed(request: EvaluationRequest) -> int:
+    """Choose the number of the first field, which is the seed of its random scene; print it if it was drawn now.
 
-    It is the requested number, a random number now if the suite asks for new fields, or 1.
+    It is the requested number, a random number if the suite asks for new fields, or 1.
 
     Args:
-        request: the options of the evaluation, with the suite.
+        request: The options of the evaluation, with the suite.
+
+    Returns:
+        The number of the first field; each following field has the next number.
 
     Raises:
-        ConfigError: an evaluation is resumed, and it is not known which fields were drawn.
+        ConfigError: An evaluation is resumed, and it is not known which fields were drawn.
     """
     if request.seed is not None:
         return request.seed
@@ -143,97 +163,108 @@ def _run_one_case(request: EvaluationRequest, only: str, step_times: SharedStepT
     case = find_case(request.suite, request.source, only)
     print_line(f"{case.setting}, {case.controller}, field {case.field}")
     config = msgspec.json.decode(case.config, type=RunConfig)
-    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s, step_times=step_times)
+    return run_in_process(
+        config, request.out, until_goal=True, stall_timeout_s=case.stall_timeout_s, step_times=step_times
+    )
 
 
 def find_case(suite: Suite, source: str, only: str) -> Case:
     """Return the case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
-    parts = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
-    if parts is None:
+    match = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
+    if match is None:
         raise ConfigError(
             f"--only {shorten(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1",
             code="command/invalid-option",
         )
-    cases = make_cases(suite, source, [parts["controller"]], 1, int(parts["field"]))
-    matching = [case for case in cases if parts["row"] is None or case.row == int(parts["row"])]
-    if len(matching) == 1:
-        return matching[0]
+    cases = make_cases(suite, source, [match["controller"]], 1, int(match["field"]))
+    matching_cases = [case for case in cases if match["row"] is None or case.row == int(match["row"])]
+    if len(matching_cases) == 1:
+        return matching_cases[0]
     rows = ", ".join(f"{case.row} ({case.setting})" for case in cases[:12])
     raise ConfigError(
-        f"--only {only}: add one of the rows, as in {name_case(cases[0])}; there are {rows}",
+        f"--only {only}: add one of the rows, as in {format_case_name(cases[0])}; there are {rows}",
         code="command/invalid-option",
     )
 
 
-def name_case(case: Case) -> str:
+def format_case_name(case: Case) -> str:
     """Return the name of a case as `--only` accepts it."""
     return f"{case.controller}:{case.field}:{case.row}"
 
 
-def _run_on_workers(request: EvaluationRequest, todo: Sequence[Case], results: store.ResultStore, out: Path) -> None:
+def _run_and_store_cases(
+    request: EvaluationRequest, cases: Sequence[Case], results: store.ResultStore, output_folder: Path
+) -> None:
     """Run cases on workers, and store each as it is done."""
-    with workers(request.cluster, request.workers) as pool, Progress(len(todo)) as progress:
-        where = request.cluster or "on this computer"
-        print_line(f"{len(todo)} cases on {pool.size()} workers, {where}")
-        print_line(f"results: {out}; if this ends early, --resume --out {out} continues")
-        for case, outcome in pool.solve(todo):
+    with start_workers(request.cluster, request.workers) as pool, CaseProgress(len(cases)) as progress:
+        location = request.cluster or "on this computer"
+        print_line(f"{len(cases)} cases on {pool.count_workers()} workers, {location}")
+        print_line(f"results: {output_folder}; if this ends early, --resume --out {output_folder} continues")
+        for case, outcome in pool.run_cases(cases):
             results.append(case, outcome)
-            progress.count(outcome)
+            progress.count_outcome(outcome)
 
 
-def _report(
-    request: EvaluationRequest, cases: Sequence[Case], done: store.Results, out: Path, other_cards: Sequence[Card]
+def _report_results(
+    request: EvaluationRequest,
+    cases: Sequence[Case],
+    outcome_by_id: store.Results,
+    output_folder: Path,
+    other_cards: Sequence[Card],
 ) -> None:
     """Print the table of results and the worst failures, and write tables, score card and page.
 
     Args:
         request: The options of the evaluation.
         cases: All cases, in the order of the table.
-        done: The outcome of each case by its id.
-        out: The output folder.
+        outcome_by_id: The outcome of each case by its id.
+        output_folder: The output folder.
         other_cards: Score cards of other evaluations to compare with.
     """
-    rows = group_results(cases, done)
-    for line in table_lines(rows):
+    rows = group_results_by_row(cases, outcome_by_id)
+    for line in format_table(rows):
         print_line(line)
     if any(row.runs == 1 and row.crossed is None for row in rows):
         print_line("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
-    _print_errors(cases, done)
+    _print_errors(cases, outcome_by_id)
 
-    best = best_controller(rows)
+    best = find_best_controller(rows)
     cases_of_best = [case for case in cases if case.controller == best]
-    failures = _find_failures(request, cases_of_best, done)
+    failures = _list_worst_failures(request, cases_of_best, outcome_by_id)
     _print_failures(best, failures)
 
-    table_paths = store.write_tables(out, cases, done)
-    card = make_card(request.name, cases, done)
+    table_paths = store.write_tables(output_folder, cases, outcome_by_id)
+    card = make_card(request.name, cases, outcome_by_id)
     if request.suite.fresh or other_cards:
-        for line in card_lines(card, compare(card, other_cards)):
+        for line in format_card(card, compare_cards(card, other_cards)):
             print_line(line)
-    card_path = out / CARD
-    page_path = out / PAGE
+    card_path = output_folder / CARD_FILENAME
+    page_path = output_folder / PAGE_FILENAME
     title = request.suite.title or request.name
     write_text(card_path, msgspec.json.format(msgspec.json.encode(card), indent=1).decode())
-    write_text(page_path, render_page(title, request.source, rows, failures))
+    write_text(page_path, render_evaluation_page(title, request.source, rows, failures))
     for path in (*table_paths, card_path, page_path):
         print_line(f"written: {path}")
 
 
-def _print_errors(cases: Sequence[Case], done: store.Results) -> None:
+def _print_errors(cases: Sequence[Case], outcome_by_id: store.Results) -> None:
     """Print how many cases could not run, and why the first of them could not."""
-    broken = [case for case in cases if done[case.id].error is not None]
-    if broken:
-        first = broken[0]
-        print_line(f"{len(broken)} could not run, the first: {name_case(first)}: {done[first.id].error}")
+    cases_with_error = [case for case in cases if outcome_by_id[case.id].error is not None]
+    if cases_with_error:
+        first_case = cases_with_error[0]
+        print_line(
+            f"{len(cases_with_error)} could not run, the first: {format_case_name(first_case)}: "
+            f"{outcome_by_id[first_case.id].error}"
+        )
 
 
-def _find_failures(
+def _list_worst_failures(
     request: EvaluationRequest, cases: Sequence[Case], done: store.Results
 ) -> list[tuple[str, str, str]]:
-    """Return the worst failures, each with its name, how it ended, and the command that runs it again."""
+    """Return the worst failures, each as name, reason, and the command that runs it again."""
     failures: list[tuple[str, str, str]] = []
-    for case, reason in worst_failures(cases, done):
-        name = name_case(case)
+    for case, reason in find_worst_failures(cases, done):
+        name = format_case_name(case)
         failures.append((f"{case.setting}, {name}", reason, f"{request.command} --only {shlex.quote(name)}"))
     return failures
 

@@ -5,63 +5,70 @@ from pathlib import Path
 
 import numpy as np
 
-from snakesim_operator.features.evaluate.table import ResultRow, best_controller, known_columns, wilson_interval
-from snakesim_operator.results.page.charts import Figure
-from snakesim_operator.results.page.html import render
+from snakesim_operator.features.evaluate.table import (
+    ResultRow,
+    compute_wilson_interval,
+    find_best_controller,
+    make_result_table,
+)
+from snakesim_operator.results.page.charts import PlotlyDict
+from snakesim_operator.results.page.html import render_page
 
-HEIGHT_PX = 300
+FIGURE_HEIGHT_PX = 300
 CONTROLLER_SPREAD = 0.5  # of the distance between two settings, over which the points of the controllers are spread
-Point = tuple[float, float, float]  # middle, lower and upper end
-PointOf = Callable[[ResultRow], Point | None]
+ValueWithInterval = tuple[float, float, float]  # middle, lower and upper end
+ComputeValue = Callable[[ResultRow], ValueWithInterval | None]
 
 
-def render_page(title: str, source: str, rows: Sequence[ResultRow], failures: Sequence[tuple[str, str, str]]) -> str:
+def render_evaluation_page(
+    title: str, source: str, rows: Sequence[ResultRow], failures: Sequence[tuple[str, str, str]]
+) -> str:
     """Return the page about an evaluation as HTML: its figures, the table of results, and the worst failures.
 
     Args:
-        title: heading of the page.
-        source: the suite file, or the command that stands for one.
-        rows: rows of the table of results.
-        failures: of the worst cases, each with its name, how it ended, and the command that runs it again.
+        title: Heading of the page.
+        source: Path of the suite file, or the command that stands for one.
+        rows: Rows of the table of results.
+        failures: The worst cases, each as name, reason, and the command that runs it again.
     """
     controllers = list(dict.fromkeys(row.controller for row in rows))
-    head, *cells = known_columns(rows)
-    return render(
+    headings, *table_rows = make_result_table(rows)
+    return render_page(
         Path(__file__).parent / "evaluation.html",
         len(controllers),
         title=title,
         about=source,
         runs=sum(row.runs for row in rows),
         figures=[
-            _draw_figure("Fields crossed, %", rows, controllers, _crossed_percent),
-            _draw_figure("Speed, m/s", rows, controllers, _quartiles_of("advance_m_s", of_crossed=True)),
-            _draw_figure("Energy, J/m", rows, controllers, _quartiles_of("energy_j_per_m", of_crossed=True)),
-            _draw_figure("Advance, m", rows, controllers, _quartiles_of("advance_m")),
-            _draw_figure("Net speed, m/s", rows, controllers, _quartiles_of("displacement_m_s")),
-            _draw_figure("Net energy, J/m", rows, controllers, _quartiles_of("displacement_energy_j_per_m")),
-            _draw_figure("Stalled time, s", rows, controllers, _quartiles_of("stalled_s")),
+            _draw_figure("Fields crossed, %", rows, controllers, _compute_success_rate_percent),
+            _draw_figure("Speed, m/s", rows, controllers, _make_quartile_function("advance_m_s", of_crossed=True)),
+            _draw_figure("Energy, J/m", rows, controllers, _make_quartile_function("energy_j_per_m", of_crossed=True)),
+            _draw_figure("Advance, m", rows, controllers, _make_quartile_function("advance_m")),
+            _draw_figure("Net speed, m/s", rows, controllers, _make_quartile_function("displacement_m_s")),
+            _draw_figure("Net energy, J/m", rows, controllers, _make_quartile_function("displacement_energy_j_per_m")),
+            _draw_figure("Stalled time, s", rows, controllers, _make_quartile_function("stalled_s")),
         ],
         goals=any(row.crossed is not None for row in rows),
-        head=head,
-        rows=cells,
+        head=headings,
+        rows=table_rows,
         worst=failures,
-        best=best_controller(rows),
+        best=find_best_controller(rows),
     )
 
 
-def _crossed_percent(row: ResultRow) -> Point | None:
+def _compute_success_rate_percent(row: ResultRow) -> ValueWithInterval | None:
     """Return the success rate with its 95 % interval, in percent; None without a goal."""
     if row.crossed is None:
         return None
-    low, high = wilson_interval(row.crossed, row.runs)
+    low, high = compute_wilson_interval(row.crossed, row.runs)
     return 100 * row.crossed / row.runs, 100 * low, 100 * high
 
 
-def _quartiles_of(name: str, *, of_crossed: bool = False) -> PointOf:
-    """Return a function that gives median and quartiles of a number of the summary; None if it is not known."""
+def _make_quartile_function(name: str, *, of_crossed: bool = False) -> ComputeValue:
+    """Return a function that computes median and quartiles of a metric in a row; it returns None if none is known."""
 
-    def quartiles(row: ResultRow) -> Point | None:
-        values = row.values(name, of_crossed=of_crossed)
+    def quartiles(row: ResultRow) -> ValueWithInterval | None:
+        values = row.list_values(name, of_crossed=of_crossed)
         if not values:
             return None
         middle, lower, upper = np.percentile(values, [50, 25, 75]).tolist()
@@ -70,81 +77,90 @@ def _quartiles_of(name: str, *, of_crossed: bool = False) -> PointOf:
     return quartiles
 
 
-def _draw_figure(axis: str, rows: Sequence[ResultRow], controllers: Sequence[str], point_of: PointOf) -> Figure | None:
+def _draw_figure(
+    axis_title: str, rows: Sequence[ResultRow], controllers: Sequence[str], compute_value: ComputeValue
+) -> PlotlyDict | None:
     """Draw a number of the results, with one point for each row and one color for each controller.
 
     Args:
-        axis: Title of the vertical axis.
+        axis_title: Title of the vertical axis.
         rows: Rows of the table of results.
         controllers: The controllers, in the order of their colors.
-        point_of: Returns the value of a row with its interval, or None if the row has no value.
+        compute_value: Returns the value of a row with its interval, or None if the row has no value.
 
     Returns:
         The figure as Plotly has it; None if no row has a value. If a number is varied, it is the horizontal axis.
         Otherwise the settings are.
     """
-    over_number = all(row.value is not None for row in rows)
-    traces: list[Figure] = []
-    for i, controller in enumerate(controllers):
-        points: list[tuple[ResultRow, Point]] = []
+    has_number_axis = all(row.value is not None for row in rows)
+    traces: list[PlotlyDict] = []
+    for color_index, controller in enumerate(controllers):
+        points: list[tuple[ResultRow, ValueWithInterval]] = []
         for row in rows:
-            point = point_of(row) if row.controller == controller else None
+            point = compute_value(row) if row.controller == controller else None
             if point is not None:
                 points.append((row, point))
         if points:
             # Controllers are drawn side by side, so that they do not hide each other.
-            offset = CONTROLLER_SPREAD * ((i + 0.5) / len(controllers) - 0.5)
-            traces.append(_draw_trace(controller, i, points, over_number=over_number, offset=offset))
+            offset = CONTROLLER_SPREAD * ((color_index + 0.5) / len(controllers) - 0.5)
+            traces.append(
+                _draw_trace(controller, color_index, points, has_number_axis=has_number_axis, x_offset=offset)
+            )
     if not traces:
         return None
-    x_axis: Figure = {"title": {"text": ""}}
-    if not over_number:
-        x_axis |= _setting_ticks(rows)
+    x_axis: PlotlyDict = {"title": {"text": ""}}
+    if not has_number_axis:
+        x_axis |= _make_setting_axis(rows)
     layout = {
-        "height": HEIGHT_PX,
+        "height": FIGURE_HEIGHT_PX,
         "hovermode": "closest",
         "showlegend": len(controllers) > 1,
         "xaxis": x_axis,
-        "yaxis": {"title": {"text": axis}, "rangemode": "tozero"},
+        "yaxis": {"title": {"text": axis_title}, "rangemode": "tozero"},
         "shapes": [],
         "annotations": [],
     }
-    return {"label": axis, "data": traces, "layout": layout}
+    return {"label": axis_title, "data": traces, "layout": layout}
 
 
 def _draw_trace(
-    controller: str, index: int, points: Sequence[tuple[ResultRow, Point]], *, over_number: bool, offset: float
-) -> Figure:
-    """Return the points of one controller as a Plotly trace with error bars.
+    controller: str,
+    color_index: int,
+    points: Sequence[tuple[ResultRow, ValueWithInterval]],
+    *,
+    has_number_axis: bool,
+    x_offset: float,
+) -> PlotlyDict:
+    """Make a Plotly trace with the points of one controller and their error bars.
 
     Args:
         controller: Name of the controller.
-        index: Index of its color.
+        color_index: Index of the controller's color.
         points: Rows with their values: middle, lower end and upper end of the interval.
-        over_number: Whether the horizontal axis is the number that is varied. Otherwise it is the number of the row.
-        offset: Added to the number of the row, so that controllers do not hide each other.
+        has_number_axis: Whether the horizontal axis is the varied number; otherwise it is the row's number.
+        x_offset: Added to the number of the row, so that controllers do not hide each other.
     """
-    x: list[float | None] = []
-    y: list[float] = []
-    error_up: list[float] = []
-    error_down: list[float] = []
+    x_values: list[float | None] = []
+    y_values: list[float] = []
+    upper_errors: list[float] = []
+    lower_errors: list[float] = []
     for row, (middle, lower, upper) in points:
-        x.append(row.value if over_number else row.row + offset)
-        y.append(round(middle, 6))
-        error_up.append(round(upper - middle, 6))
-        error_down.append(round(middle - lower, 6))
-    color = f"--joint-{index}"
+        x_values.append(row.value if has_number_axis else row.row + x_offset)
+        y_values.append(round(middle, 6))
+        upper_errors.append(round(upper - middle, 6))
+        lower_errors.append(round(middle - lower, 6))
+    color = f"--joint-{color_index}"
     return {
         "type": "scatter",
-        "mode": "lines+markers" if over_number else "markers",
+        "mode": "lines+markers" if has_number_axis else "markers",
         "name": controller,
-        "x": x,
-        "y": y,
+        "x": x_values,
+        "y": y_values,
         "error_y": {
             "type": "data",
             "symmetric": False,
-            "array": error_up,
-            "arrayminus": error_down,
+            "array": upper_errors,
+            "arrayminus": lower_errors,
             "thickness": 1.4,
         },
         "text": [row.setting for row, _ in points],
@@ -154,7 +170,7 @@ def _draw_trace(
     }
 
 
-def _setting_ticks(rows: Sequence[ResultRow]) -> Figure:
+def _make_setting_axis(rows: Sequence[ResultRow]) -> PlotlyDict:
     """Return the x axis with the name of each setting at its number."""
     names = {row.row: row.setting for row in rows}
     return {

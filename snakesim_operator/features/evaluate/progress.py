@@ -3,12 +3,12 @@
 import time
 
 from snakesim_operator.features.evaluate.case import CaseOutcome
-from snakesim_operator.run.progress import OneLine, format_duration
+from snakesim_operator.run.progress import StatusLine, format_duration
 
 PLAIN_PERIOD_S = 10.0  # between two lines where the output is no terminal
 
 
-class Progress(OneLine):
+class CaseProgress(StatusLine):
     """Counts the cases that are done, and prints how many there are."""
 
     def __init__(self, total: int) -> None:
@@ -23,25 +23,25 @@ class Progress(OneLine):
         self._start_s = time.monotonic()
         self._next_line_s = self._start_s + PLAIN_PERIOD_S
 
-    def count(self, outcome: CaseOutcome) -> None:
+    def count_outcome(self, outcome: CaseOutcome) -> None:
         """Count one more case, and print the line if it is due."""
-        crossed = outcome.numbers.get("crossed")
+        is_crossed = outcome.numbers.get("crossed")
         self._done += 1
-        self._with_goal += isinstance(crossed, bool)
-        self._crossed += crossed is True
+        self._with_goal += isinstance(is_crossed, bool)
+        self._crossed += is_crossed is True
         self._errors += outcome.error is not None
         now_s = time.monotonic()
-        if self.terminal or now_s >= self._next_line_s or self._done == self._total:
+        if self.is_terminal or now_s >= self._next_line_s or self._done == self._total:
             self._next_line_s = now_s + PLAIN_PERIOD_S
-            self.show_text(self._text(now_s))
+            self.show_text(self._format_text(now_s))
 
-    def _text(self, now_s: float) -> str:
-        passed_s = now_s - self._start_s
-        left_s = passed_s / self._done * (self._total - self._done)
+    def _format_text(self, now_s: float) -> str:
+        elapsed_s = now_s - self._start_s
+        remaining_s = elapsed_s / self._done * (self._total - self._done)
         parts = [f"{self._done} of {self._total} cases"]
         if self._with_goal:
             parts.append(f"{self._crossed} crossed")
         if self._errors:
             parts.append(f"{self._errors} could not run")
-        parts.append(f"{format_duration(passed_s)} passed, about {format_duration(left_s)} left")
+        parts.append(f"{format_duration(elapsed_s)} passed, about {format_duration(remaining_s)} left")
         return "  ".join(parts)

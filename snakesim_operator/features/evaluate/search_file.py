@@ -23,10 +23,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.evaluate.case import Case
 
-COMMAND = "snakesim_command"  # attribute of the study: the `SearchCommand` as JSON types
-NUMBER = "snakesim_number"  # attribute of a trial: as it was printed, from 1
-RESULTS = "snakesim_results"  # attribute of a trial: the goal of each of its runs
-STUCK = "snakesim_stuck"  # attribute of a trial: whether its first run was ended because it was stuck
+SEARCH_COMMAND_ATTRIBUTE = "snakesim_command"  # attribute of the study: the `SearchCommand` as JSON types
+TRIAL_NUMBER_ATTRIBUTE = "snakesim_number"  # attribute of a trial: as it was printed, from 1
+TRIAL_RESULTS_ATTRIBUTE = "snakesim_results"  # attribute of a trial: the goal of each of its runs
+IS_STUCK_ATTRIBUTE = "snakesim_stuck"  # attribute of a trial: whether its first run was ended because it was stuck
 
 # What SQLite, SQLAlchemy and Optuna raise for a file of another kind, a folder, a full disk, another version.
 STORAGE_ERRORS = (OSError, sqlite3.Error, SQLAlchemyError, OptunaError, RuntimeError)
@@ -47,7 +47,7 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
     configurations: str  # hash of what scenario, robot and scene files give at the ends of the ranges
     code: str  # hash of the installed code
 
-    def command_line(self, storage: Path) -> str:
+    def format_command_line(self, storage: Path) -> str:
         """Return the command that continues the search, as a user types it."""
         words = ["snakesim", "study", "optimize", self.scenario]
         if self.rows:
@@ -72,16 +72,16 @@ def hash_configurations(cases: Sequence[Case]) -> str:
 
 
 def open_study(path: Path, command: SearchCommand) -> Study:
-    """Open the search that a file holds, or begin a search in an empty or new file.
+    """Open the search that a file holds, or create a search in an empty or new file.
 
-    Trials that another process began and did not finish are queued again.
+    Trials that another process started and did not finish are queued again.
 
     Args:
         path: The SQLite file; its folder is made if it does not exist.
         command: The search; it must be the same as the search in the file.
 
     Returns:
-        The study of Optuna, with the trials so far.
+        The Optuna study with the trials so far.
 
     Raises:
         ConfigError: The file holds another search, or is not usable.
@@ -89,35 +89,39 @@ def open_study(path: Path, command: SearchCommand) -> Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        storage = _storage_in(path)
+        storage = _open_storage(path)
         summaries = optuna.get_all_study_summaries(storage)
-        started_searches = [summary for summary in summaries if summary.n_trials or COMMAND in summary.user_attrs]
+        started_searches = [
+            summary for summary in summaries if summary.n_trials or SEARCH_COMMAND_ATTRIBUTE in summary.user_attrs
+        ]
         if not started_searches:
             for summary in summaries:  # of a process that was killed before its first trial
                 optuna.delete_study(study_name=summary.study_name, storage=storage)
-            return _begin_study(storage, command)
-        stored = started_searches[0]
-        _check_same_search(path, stored.user_attrs.get(COMMAND), command)
-        study = optuna.load_study(study_name=stored.study_name, storage=storage)
+            return _create_study(storage, command)
+        stored_summary = started_searches[0]
+        _check_same_search(path, stored_summary.user_attrs.get(SEARCH_COMMAND_ATTRIBUTE), command)
+        study = optuna.load_study(study_name=stored_summary.study_name, storage=storage)
     except STORAGE_ERRORS as error:
         message = getattr(error, "strerror", None) or str(error)
         reason = message.splitlines()[0][:200]
         raise ConfigError(f"--storage {path}: {reason}; choose another file", code="file/not-writable") from None
-    _repeat_trials_without_result(study)
+    _requeue_unfinished_trials(study)
     return study
 
 
-def free_numbers(study: Study) -> Iterator[int]:
-    """Yield numbers to print for further trials, from 1: those that no trial with a result has."""
-    taken = {trial.user_attrs.get(NUMBER) for trial in study.get_trials(states=(TrialState.COMPLETE,))}
+def generate_unused_trial_numbers(study: Study) -> Iterator[int]:
+    """Yield the numbers from 1 that no trial with a result has, for further trials; there is no end."""
+    used_numbers = {
+        trial.user_attrs.get(TRIAL_NUMBER_ATTRIBUTE) for trial in study.get_trials(states=(TrialState.COMPLETE,))
+    }
     number = 0
     while True:
         number += 1
-        if number not in taken:
+        if number not in used_numbers:
             yield number
 
 
-def _storage_in(path: Path) -> RDBStorage:
+def _open_storage(path: Path) -> RDBStorage:
     """Open the file by its name. In a URL SQLAlchemy and Optuna give `?`, `%`, `#` and braces a meaning."""
     engine_options = {
         "creator": lambda: sqlite3.connect(path, check_same_thread=False),
@@ -126,15 +130,15 @@ def _storage_in(path: Path) -> RDBStorage:
     return RDBStorage("sqlite://", engine_options)
 
 
-def _begin_study(storage: BaseStorage, command: SearchCommand) -> Study:
+def _create_study(storage: BaseStorage, command: SearchCommand) -> Study:
     study = optuna.create_study(
         storage=storage, study_name=f"{command.scenario} {command.goal}", direction=command.direction
     )
-    study.set_user_attr(COMMAND, msgspec.to_builtins(command))
+    study.set_user_attr(SEARCH_COMMAND_ATTRIBUTE, msgspec.to_builtins(command))
     return study
 
 
-def _repeat_trials_without_result(study: Study) -> None:
+def _requeue_unfinished_trials(study: Study) -> None:
     """End the trials of a process that was killed, and enqueue their values again."""
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
         study.tell(trial.number, state=TrialState.FAIL)
@@ -142,12 +146,12 @@ def _repeat_trials_without_result(study: Study) -> None:
 
 
 def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
-    """Check that the search in a file is the one that this command asks for, because their trials would be mixed.
+    """Check that the search in a file is the one that this command asks for, because otherwise trials would be mixed.
 
     Args:
-        path: The file, for the message.
-        stored: The command in the file, as JSON values; it may be of any form.
-        command: The present command.
+        path: Path of the file, for the error message.
+        stored: The command in the file as JSON values, which may have any form.
+        command: The command that the user typed now.
 
     Raises:
         ConfigError: The searches differ; the error names each difference.
@@ -161,35 +165,35 @@ def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
             code="evaluation/other-search",
         ) from None
     this_command = msgspec.convert(msgspec.to_builtins(command), SearchCommand)
-    differences = list(_differences(stored_command, this_command))
+    differences = list(_describe_differences(stored_command, this_command))
     if not differences:
         return
     raise ConfigError(
         f"--storage {path}: the file holds another search, whose trials are not comparable with this one's. "
         f"{'; '.join(differences)}. Go on with that search by "
-        f"`{stored_command.command_line(path)}`, or choose another file",
+        f"`{stored_command.format_command_line(path)}`, or choose another file",
         code="evaluation/other-search",
     )
 
 
-def _differences(stored: SearchCommand, requested: SearchCommand) -> Iterator[str]:
-    """Yield each difference between two searches, in words of the command line.
+def _describe_differences(stored: SearchCommand, requested: SearchCommand) -> Iterator[str]:
+    """Describe each difference between two searches by the options of the command line.
 
     Args:
         stored: The search whose trials the file holds.
-        requested: The search that the present command asks for.
+        requested: The search that the user asks for now.
     """
     if stored.scenario != requested.scenario:
         yield f"scenario: {stored.scenario} there, {requested.scenario} here"
     if stored.rows != requested.rows:
         yield f"--rows: {_format_rows(stored)} there, {_format_rows(requested)} here"
-    yield from _differing_keys("--vary", stored.vary, requested.vary)
-    yield from _differing_keys("--set", stored.set, requested.set)
+    yield from _describe_differing_keys("--vary", stored.vary, requested.vary)
+    yield from _describe_differing_keys("--set", stored.set, requested.set)
     if stored.goal != requested.goal:
         yield f"--goal: {stored.goal} there, {requested.goal} here"
     if stored.direction != requested.direction:
-        set_or_not = {"minimize": "set", "maximize": "not set"}
-        yield f"--minimize: {set_or_not[stored.direction]} there, {set_or_not[requested.direction]} here"
+        is_set_text = {"minimize": "set", "maximize": "not set"}
+        yield f"--minimize: {is_set_text[stored.direction]} there, {is_set_text[requested.direction]} here"
     if stored.seeds != requested.seeds:
         yield f"--seeds: {stored.seeds} there, {requested.seeds} here"
     if stored.seed != requested.seed:
@@ -204,12 +208,12 @@ def _differences(stored: SearchCommand, requested: SearchCommand) -> Iterator[st
         yield "the same command gives another configuration: the files of scenario, robot, scene or suite have changed"
 
 
-def _differing_keys(option: str, there: dict[str, Any], here: dict[str, Any]) -> Iterator[str]:
-    for key in sorted(there.keys() | here.keys()):
-        before = there.get(key, "not set")
-        now = here.get(key, "not set")
-        if before != now:
-            yield f"{option} {key}: {before} there, {now} here"
+def _describe_differing_keys(option: str, stored: dict[str, Any], requested: dict[str, Any]) -> Iterator[str]:
+    for key in sorted(stored.keys() | requested.keys()):
+        stored_value = stored.get(key, "not set")
+        requested_value = requested.get(key, "not set")
+        if stored_value != requested_value:
+            yield f"{option} {key}: {stored_value} there, {requested_value} here"
 
 
 def _format_rows(command: SearchCommand) -> str:

@@ -38,12 +38,12 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.files import FileStruct, Table, decode, find_file, read_table
+from snakesim_hal.model.files import ConfigTable, FileStruct, decode_table, read_table, resolve_file_path
 from snakesim_hal.model.randomization import Randomization
-from snakesim_hal.model.scenario import Override, RunConfig, check, compose_table, encode_config
+from snakesim_hal.model.scenario import Override, RunConfig, compose_config_table, encode_config, validate_start_pose
 from snakesim_hal.model.textfiles import parse_toml
-from snakesim_hal.programs.preflight import check_plugins
-from snakesim_operator.features.evaluate.case import Case, case_id
+from snakesim_hal.programs.preflight import validate_and_complete_config
+from snakesim_operator.features.evaluate.case import Case, make_case_id
 
 MAX_CASES = 200_000
 Count = Annotated[int, Meta(ge=1, le=100_000)]
@@ -123,17 +123,17 @@ class SuiteSetting:
 
 def read_suite(name: str) -> tuple[Suite, str]:
     """Return a shipped suite or a suite file, and its path. Raises ConfigError."""
-    path = find_file(name, "suites")
-    return decode(read_table(path), Suite), str(path)
+    path = resolve_file_path(name, "suites")
+    return decode_table(read_table(path), Suite), str(path)
 
 
-def override_suite(suite: Suite, values: dict[str, Any]) -> Suite:
+def set_suite_values(suite: Suite, values: dict[str, Any]) -> Suite:
     """Return the suite with these keys set in every row, over what suite and row set."""
     rows = [msgspec.structs.replace(row, set={**row.set, **values}) for row in suite.row]
     return msgspec.structs.replace(suite, set={**suite.set, **values}, row=rows)
 
 
-def select_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Case]:
+def select_cases_of_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Case]:
     """Return the cases of some rows, by number; all cases without a row. Raises ConfigError for a missing row."""
     known = {case.row for case in cases}
     for row in rows:
@@ -144,101 +144,103 @@ def select_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list
     return [case for case in cases if case.row in rows]
 
 
-def make_settings(suite: Suite, source: str) -> list[SuiteSetting]:
-    """Return the rows of the table of results, each with the values that it sets in the scenario.
+def make_suite_settings(suite: Suite, source: str) -> list[SuiteSetting]:
+    """Make the rows of the table of results, each with the values that it sets in the scenario.
 
     Each named row of the suite is combined with each combination of the varied values.
 
     Args:
         suite: The suite.
-        source: Where it came from, for messages.
+        source: Path of the suite file or name of the command, for error messages.
 
     Raises:
         ConfigError: A value is invalid, or two rows have the same name.
     """
-    common = list(_flatten_overrides(suite.set, f"{source}: [set]"))
-    common += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
-    varied = {key: _list_values(key, values, source) for key, values in suite.vary.items()}
-    labels = _short_names(list(varied))
+    common_overrides = list(_flatten_overrides(suite.set, f"{source}: [set]"))
+    common_overrides += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
+    values_by_key = {key: _list_values(key, values, source) for key, values in suite.vary.items()}
+    label_by_key = _shorten_keys(list(values_by_key))
     settings: list[SuiteSetting] = []
     for row in suite.row or [SuiteRow(name="")]:
-        place = f"{source}: row {row.name!r}" if row.name else source
-        row_overrides = list(_flatten_overrides(row.set, place))
-        row_overrides += [Override(key, None, place) for key in row.unset]
-        randomizations = _find_randomizations(suite, row.without, place)
-        for combination in itertools.product(*varied.values()):
+        context = f"{source}: row {row.name!r}" if row.name else source
+        row_overrides = list(_flatten_overrides(row.set, context))
+        row_overrides += [Override(key, None, context) for key in row.unset]
+        randomizations = _select_randomizations(suite, row.without, context)
+        for combination in itertools.product(*values_by_key.values()):
             name_parts = [row.name] if row.name else []
             varied_overrides: list[Override] = []
-            for key, value in zip(varied, combination, strict=True):
-                name_parts.append(f"{labels[key]} {_short_text(value)}")
+            for key, value in zip(values_by_key, combination, strict=True):
+                name_parts.append(f"{label_by_key[key]} {_format_short_value(value)}")
                 varied_overrides.append(Override(key, value, f"{source}: [vary]"))
             name = ", ".join(name_parts) or "as it is"
-            number = None  # the place of the row on the horizontal axis, if a single number is varied
+            varied_number = None  # the place of the row on the horizontal axis, if a single number is varied
             if len(combination) == 1 and not row.name and _is_number(combination[0]):
-                number = combination[0]
-            overrides = [*common, *row_overrides, *varied_overrides]
-            settings.append(SuiteSetting(name, overrides, number, randomizations))
-    _check_names_differ(settings, source)
+                varied_number = combination[0]
+            overrides = [*common_overrides, *row_overrides, *varied_overrides]
+            settings.append(SuiteSetting(name, overrides, varied_number, randomizations))
+    _validate_unique_names(settings, source)
     return settings
 
 
-def _check_names_differ(settings: Sequence[SuiteSetting], source: str) -> None:
+def _validate_unique_names(settings: Sequence[SuiteSetting], source: str) -> None:
     counts = Counter(setting.name for setting in settings)
     repeated = [name for name, count in counts.items() if count > 1]
     if repeated:
         raise ConfigError(f"{source}: two rows are called {min(repeated)!r}; rename one", code="config/duplicate-name")
 
 
-def make_cases(suite: Suite, source: str, controllers: Sequence[str], fields: int, seed: int) -> list[Case]:
-    """Return every case of a suite in the order of the table, with its whole configuration.
+def make_cases(suite: Suite, source: str, controllers: Sequence[str], field_count: int, first_field: int) -> list[Case]:
+    """Make every case of a suite in the order of the table, each with its whole configuration.
 
     The values that the suite sets are checked here on the first field of each row. A later field that cannot be laid
     out is named in its result.
 
     Args:
-        suite: the suite.
-        source: the suite's file, for messages.
-        controllers: controllers to try; none: that of the scenario.
-        fields: number of fields for each row and controller.
-        seed: number of the first field.
+        suite: The suite.
+        source: Path of the suite file or name of the command, for error messages.
+        controllers: Names of the controllers to try; that of the scenario if empty.
+        field_count: Number of fields for each row and controller. A field is a seed, and the random scene made from it.
+        first_field: Number of the first field; each following field has the next number.
 
     Raises:
-        ConfigError: the suite is invalid, or has too many cases.
+        ConfigError: The suite is invalid, or has too many cases.
     """
-    settings = make_settings(suite, source)
-    count = len(settings) * len(controllers or [""]) * fields
-    if count > MAX_CASES:
-        raise ConfigError(f"{source}: {count} cases; at most {MAX_CASES} are allowed", code="command/invalid-option")
+    settings = make_suite_settings(suite, source)
+    case_count = len(settings) * len(controllers or [""]) * field_count
+    if case_count > MAX_CASES:
+        raise ConfigError(
+            f"{source}: {case_count} cases; at most {MAX_CASES} are allowed", code="command/invalid-option"
+        )
     cases: list[Case] = []
-    for number, setting in enumerate(settings, 1):
+    for row_number, setting in enumerate(settings, 1):
         for controller in controllers or [None]:
-            table = _compose_setting(suite, setting, controller)
-            for field in range(seed, seed + fields):
+            table = _compose_scenario(suite, setting, controller)
+            for field in range(first_field, first_field + field_count):
                 config = _configure_field(table, field, setting.randomizations)
-                if field == seed:
-                    _check_config(config, table, f"{source}, row {number} ({setting.name}), field {field}")
+                if field == first_field:
+                    _validate_config(config, table, f"{source}, row {row_number} ({setting.name}), field {field}")
                 cases.append(
                     Case(
-                        id=case_id(config, suite.give_up_s),
-                        row=number,
+                        id=make_case_id(config, suite.give_up_s),
+                        row=row_number,
                         setting=setting.name,
-                        controller=config.commander,
+                        controller=config.commander_name,
                         field=field,
                         config=encode_config(config),
-                        give_up_s=suite.give_up_s,
-                        limit_s=suite.limit_s,
+                        stall_timeout_s=suite.give_up_s,
+                        timeout_s=suite.limit_s,
                         value=setting.value,
                     )
                 )
     return cases
 
 
-def _compose_setting(suite: Suite, setting: SuiteSetting, controller: str | None) -> Table:
-    """Return the scenario with the values of a setting. controller: None: that of the scenario."""
+def _compose_scenario(suite: Suite, setting: SuiteSetting, controller: str | None) -> ConfigTable:
+    """Return the scenario with the values of a setting, and with another controller unless `controller` is None."""
     overrides = [Override("clock_mode", "lockstep", "--clock-mode lockstep")]
     if controller:
         overrides.append(Override("controller", controller, f"--controllers {controller}"))
-    return compose_table(suite.scenario, [*overrides, *setting.overrides])
+    return compose_config_table(suite.scenario, [*overrides, *setting.overrides])
 
 
 def parse_vary(text: str) -> tuple[str, list[Any] | str]:
@@ -260,16 +262,16 @@ def parse_vary(text: str) -> tuple[str, list[Any] | str]:
         ) from None
 
 
-def _check_config(config: RunConfig, table: Table, where: str) -> None:
+def _validate_config(config: RunConfig, table: ConfigTable, context: str) -> None:
     """Raise a ConfigError that names the place if a configuration cannot be run."""
     try:
-        check(config)
-        check_plugins(config, table)
+        validate_start_pose(config)
+        validate_and_complete_config(config, table)
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}", code=error.code) from None
+        raise ConfigError(f"{context}: {error}", code=error.code) from None
 
 
-def seed_keys(table: Table) -> list[str]:
+def list_seed_keys(table: ConfigTable) -> list[str]:
     """Return the keys that are set to a field's number: the run's seed, and that of every random field."""
     scene = table.values.get("scene")
     random_fields = scene.get("random_field") if isinstance(scene, dict) else None
@@ -277,36 +279,36 @@ def seed_keys(table: Table) -> list[str]:
     return ["seed", *(f"scene.random_field.{i}.seed" for i in range(count))]
 
 
-def _configure_field(table: Table, field: int, randomizations: Sequence[Randomization]) -> RunConfig:
+def _configure_field(table: ConfigTable, field: int, randomizations: Sequence[Randomization]) -> RunConfig:
     """Return the configuration of one field, with the values that are drawn for it."""
-    for key in seed_keys(table):
+    for key in list_seed_keys(table):
         table.set_value(key, field, "--seed")
     for randomization in randomizations:
-        for override in randomization.overrides_for_scene(field):
+        for override in randomization.sample_overrides(field):
             table.set_value(override.key, override.value, override.flag)
-    return decode(table, RunConfig)
+    return decode_table(table, RunConfig)
 
 
-def _find_randomizations(suite: Suite, without: Sequence[str], where: str) -> list[Randomization]:
+def _select_randomizations(suite: Suite, excluded_keys: Sequence[str], context: str) -> list[Randomization]:
     """Return the suite's randomizations without the keys that a row leaves out.
 
     Args:
-        suite: the suite, with its randomizations.
-        without: keys that the row does not randomize.
-        where: the row, for the message.
+        suite: The suite with its randomizations.
+        excluded_keys: Keys that the row does not randomize.
+        context: Name of the row, for the error message.
 
     Raises:
         ConfigError: The row leaves out a key that is not randomized.
     """
     randomized_keys = {key for randomization in suite.randomize for key in randomization.set}
-    for key in without:
+    for key in excluded_keys:
         if key not in randomized_keys:
             raise ConfigError(
-                f"{where}: `without` names {key!r}, which no [[randomize]] sets", code="command/invalid-option"
+                f"{context}: `without` names {key!r}, which no [[randomize]] sets", code="command/invalid-option"
             )
     randomizations: list[Randomization] = []
     for randomization in suite.randomize:
-        remaining_keys = [key for key in randomization.set if key not in without]
+        remaining_keys = [key for key in randomization.set if key not in excluded_keys]
         if remaining_keys:
             randomizations.append(msgspec.structs.replace(randomization, set=remaining_keys))
     return randomizations
@@ -324,30 +326,38 @@ def _flatten_overrides(values: dict[str, Any], origin: str, prefix: str = "") ->
 def _list_values(key: str, values: list[Any] | str, source: str) -> list[Any]:
     """Return the values of a `[vary]` entry: those of the list, or evenly spaced ones. Raises ConfigError."""
     if isinstance(values, str):
-        return space_evenly(values, f"{source}: `vary.{key}`")
+        return parse_even_spacing(values, f"{source}: `vary.{key}`")
     if not values:
         raise ConfigError(f"{source}: `vary.{key}` is empty; give at least one value", code="command/invalid-option")
     return values
 
 
-def space_evenly(values: str, where: str) -> list[float]:
-    """Return the numbers of `low:high:count`, both ends included. Raises ConfigError. where: for the message."""
+def parse_even_spacing(values: str, context: str) -> list[float]:
+    """Parse `low:high:count`, and return evenly spaced numbers with both ends.
+
+    Args:
+        values: The text to parse.
+        context: Name of the key that the values are for, for the error message.
+
+    Raises:
+        ConfigError: The text has another form.
+    """
     try:
-        low, high, count = (float(part) for part in values.split(":"))
-        is_finite = math.isfinite(low) and math.isfinite(high)
+        first_value, last_value, count = (float(part) for part in values.split(":"))
+        is_finite = math.isfinite(first_value) and math.isfinite(last_value)
         is_a_count = count.is_integer() and 2 <= count <= 1000
         if not (is_finite and is_a_count):
             raise ValueError
     except ValueError:
         raise ConfigError(
-            f"{where} = {shorten(values)!r}: give low:high:count with a count of 2 to 1000, such as "
+            f"{context} = {shorten(values)!r}: give low:high:count with a count of 2 to 1000, such as "
             "0.05:0.2:4, or a list",
             code="command/invalid-option",
         ) from None
-    return [round(low + (high - low) * i / (count - 1), 12) for i in range(int(count))]
+    return [round(first_value + (last_value - first_value) * i / (count - 1), 12) for i in range(int(count))]
 
 
-def _short_names(keys: list[str]) -> dict[str, str]:
+def _shorten_keys(keys: list[str]) -> dict[str, str]:
     """Return the last part of each dotted key, or the whole key if two keys share the last part."""
     last_parts = [key.rpartition(".")[2] for key in keys]
     names: dict[str, str] = {}
@@ -357,7 +367,7 @@ def _short_names(keys: list[str]) -> dict[str, str]:
     return names
 
 
-def _short_text(value: object) -> str:
+def _format_short_value(value: object) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     return shorten(str(value), 40)

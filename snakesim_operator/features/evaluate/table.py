@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_operator.features.evaluate.case import GAVE_UP, Case, CaseOutcome
+from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, Case, CaseOutcome
 from snakesim_operator.features.evaluate.store import Results
-from snakesim_operator.results.metrics.intervals import Z95, mean_interval
+from snakesim_operator.results.metrics.intervals import Z95, compute_mean_interval
 
-UNKNOWN = "–"
+UNKNOWN_TEXT = "–"
 # Headings of the columns. "crossed": runs that reached their goal. "net": of runs without a goal, whose displacement
 # from start to end counts, in any direction.
 SETTING = "setting"
@@ -29,7 +29,7 @@ NET_ENERGY_J_PER_M = "net J/m"
 STALLED_S = "stood s"
 DURATION_S = "time s"
 ERRORS = "errors"
-HEAD = (
+HEADINGS = (
     SETTING,
     CONTROLLER,
     CROSSED,
@@ -46,8 +46,8 @@ HEAD = (
     DURATION_S,
     ERRORS,
 )  # in the order of the table
-TEXT_COLUMNS = 2  # setting and controller: always shown, and aligned to the left
-MAX_FAILURES = 5  # that are listed
+TEXT_COLUMN_COUNT = 2  # setting and controller: always shown, and aligned to the left
+MAX_LISTED_FAILURES = 5  # that are listed
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,12 @@ class ResultRow:
             return None
         return sum(crossed is True for crossed in crossings)
 
-    def values(self, name: str, *, of_crossed: bool = False) -> list[float]:
-        """Return the known values of one number of the summary.
+    def list_values(self, name: str, *, of_crossed: bool = False) -> list[float]:
+        """Return the values of one field of the summary in all runs in which it is known.
 
         Args:
-            name: of the number.
-            of_crossed: only of the runs that reached their goal, and of those that had none.
+            name: Name of a field of the summary.
+            of_crossed: Whether to leave out the runs that had a goal and did not reach it.
         """
         values: list[float] = []
         for outcome in self.outcomes:
@@ -95,8 +95,8 @@ class ResultRow:
         return values
 
     @property
-    def cells(self) -> list[str]:
-        """Return the texts of this row of the table of results, one for each heading in HEAD; some are UNKNOWN.
+    def format_cells(self) -> list[str]:
+        """Return the texts of this row of the table of results, one for each heading in HEADINGS; some are UNKNOWN.
 
         Distances and stalls are those of all runs. Speed, energy and time are those of the runs that reached their
         goal, or that had none. Each number is a median, but intervals are 95 % confidence intervals of means.
@@ -105,90 +105,90 @@ class ResultRow:
         cells = {
             SETTING: self.setting,
             CONTROLLER: self.controller,
-            CROSSED: self._crossed_of_runs(),
-            CROSSED_INTERVAL: self._crossed_interval(),
-            ADVANCE_M: _format_median(self.values("advance_m"), 2),
-            ADVANCE_INTERVAL_M: self._mean_interval("advance_m"),
-            SPEED_M_S: _format_median(self.values("advance_m_s", of_crossed=True), 3),
-            ENERGY_J_PER_M: _format_median(self.values("energy_j_per_m", of_crossed=True), 1),
-            **self._net_displacement_cells(),
-            STALLED_S: _format_median(self.values("stalled_s"), 1),
-            DURATION_S: _format_median(self.values(duration, of_crossed=True), 1),
+            CROSSED: self._format_success_count(),
+            CROSSED_INTERVAL: self._format_success_interval(),
+            ADVANCE_M: _format_median(self.list_values("advance_m"), 2),
+            ADVANCE_INTERVAL_M: self._format_mean_interval("advance_m"),
+            SPEED_M_S: _format_median(self.list_values("advance_m_s", of_crossed=True), 3),
+            ENERGY_J_PER_M: _format_median(self.list_values("energy_j_per_m", of_crossed=True), 1),
+            **self._format_net_displacement_cells(),
+            STALLED_S: _format_median(self.list_values("stalled_s"), 1),
+            DURATION_S: _format_median(self.list_values(duration, of_crossed=True), 1),
             ERRORS: str(self.errors or ""),
         }
-        return [cells[heading] for heading in HEAD]
+        return [cells[heading] for heading in HEADINGS]
 
-    def _crossed_of_runs(self) -> str:
+    def _format_success_count(self) -> str:
         if self.crossed is None:
-            return UNKNOWN
+            return UNKNOWN_TEXT
         return f"{self.crossed}/{self.runs}"
 
-    def _crossed_interval(self) -> str:
+    def _format_success_interval(self) -> str:
         if self.crossed is None:
-            return UNKNOWN
-        low, high = wilson_interval(self.crossed, self.runs)
+            return UNKNOWN_TEXT
+        low, high = compute_wilson_interval(self.crossed, self.runs)
         return f"{100 * low:.0f}-{100 * high:.0f}"
 
-    def _net_displacement_cells(self) -> dict[str, str]:
+    def _format_net_displacement_cells(self) -> dict[str, str]:
         """Return the cells about the displacement from start to end, by heading.
 
         They are UNKNOWN for runs with a goal, for which the advance towards the goal counts instead.
         """
         if self.crossed is not None:
-            return dict.fromkeys((NET_M, NET_INTERVAL_M, NET_SPEED_M_S, NET_ENERGY_J_PER_M), UNKNOWN)
+            return dict.fromkeys((NET_M, NET_INTERVAL_M, NET_SPEED_M_S, NET_ENERGY_J_PER_M), UNKNOWN_TEXT)
         return {
-            NET_M: _format_median(self.values("net_displacement_m"), 2),
-            NET_INTERVAL_M: self._mean_interval("net_displacement_m"),
-            NET_SPEED_M_S: _format_median(self.values("displacement_m_s"), 3),
-            NET_ENERGY_J_PER_M: _format_median(self.values("displacement_energy_j_per_m"), 1),
+            NET_M: _format_median(self.list_values("net_displacement_m"), 2),
+            NET_INTERVAL_M: self._format_mean_interval("net_displacement_m"),
+            NET_SPEED_M_S: _format_median(self.list_values("displacement_m_s"), 3),
+            NET_ENERGY_J_PER_M: _format_median(self.list_values("displacement_energy_j_per_m"), 1),
         }
 
-    def _mean_interval(self, name: str) -> str:
+    def _format_mean_interval(self, name: str) -> str:
         """Return the interval of a mean; with a goal, the success rate has an interval instead."""
-        values = self.values(name)
+        values = self.list_values(name)
         if self.crossed is not None or len(values) < 2:
-            return UNKNOWN
-        low, high = mean_interval(values)
+            return UNKNOWN_TEXT
+        low, high = compute_mean_interval(values)
         return f"{low:.2f} to {high:.2f}"
 
 
-def group_results(cases: Sequence[Case], done: Results) -> list[ResultRow]:
+def group_results_by_row(cases: Sequence[Case], outcome_by_id: Results) -> list[ResultRow]:
     """Return a row for each setting and controller that has results, in the order of the cases."""
     rows: dict[tuple[int, str], ResultRow] = {}
     for case in cases:
-        if case.id in done:
+        if case.id in outcome_by_id:
             key = (case.row, case.controller)
             row = rows.setdefault(key, ResultRow(case.row, case.setting, case.controller, case.value, []))
-            row.outcomes.append(done[case.id])
+            row.outcomes.append(outcome_by_id[case.id])
     return list(rows.values())
 
 
-def known_columns(rows: Sequence[ResultRow]) -> list[list[str]]:
-    """Return HEAD and the cells of each row, without the columns in which nothing is known."""
-    table = [list(HEAD), *(row.cells for row in rows)]
-    varying: list[int] = []
-    for column in range(len(HEAD)):
-        has_a_value = any(cells[column].strip(UNKNOWN) for cells in table[1:])
-        if column < TEXT_COLUMNS or has_a_value:
-            varying.append(column)
-    return [[cells[column] for column in varying] for cells in table]
+def make_result_table(rows: Sequence[ResultRow]) -> list[list[str]]:
+    """Return HEADINGS and the cells of each row, without the columns in which nothing is known."""
+    table = [list(HEADINGS), *(row.format_cells for row in rows)]
+    shown_columns: list[int] = []
+    for column in range(len(HEADINGS)):
+        has_a_value = any(cells[column].strip(UNKNOWN_TEXT) for cells in table[1:])
+        if column < TEXT_COLUMN_COUNT or has_a_value:
+            shown_columns.append(column)
+    return [[cells[column] for column in shown_columns] for cells in table]
 
 
-def table_lines(rows: Sequence[ResultRow]) -> list[str]:
+def format_table(rows: Sequence[ResultRow]) -> list[str]:
     """Return the table for a terminal. Speed, energy and time are medians of the runs that crossed, others of all."""
-    table = known_columns(rows)
+    table = make_result_table(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines: list[str] = []
     for cells in table:
         padded: list[str] = []
         for column, (cell, width) in enumerate(zip(cells, widths, strict=True)):
-            is_text = column < TEXT_COLUMNS
+            is_text = column < TEXT_COLUMN_COUNT
             padded.append(cell.ljust(width) if is_text else cell.rjust(width))
         lines.append("  ".join(padded).rstrip())
     return lines
 
 
-def best_controller(rows: Sequence[ResultRow]) -> str:
+def find_best_controller(rows: Sequence[ResultRow]) -> str:
     """Return the controller that crossed most often; its failures are the most interesting ones."""
     crossed: Counter[str] = Counter()
     for row in rows:
@@ -196,14 +196,14 @@ def best_controller(rows: Sequence[ResultRow]) -> str:
     return max(crossed, key=lambda name: crossed[name], default="")
 
 
-def worst_failures(cases: Sequence[Case], done: Results) -> list[tuple[Case, str]]:
+def find_worst_failures(cases: Sequence[Case], outcome_by_id: Results) -> list[tuple[Case, str]]:
     """Return the cases that failed and advanced least, each with how it ended, as far as that is known."""
-    failed = [case for case in cases if case.id in done and not _succeeded(done[case.id])]
-    failed.sort(key=lambda case: _advance_fraction(done[case.id]))
-    return [(case, _describe_end(done[case.id])) for case in failed[:MAX_FAILURES]]
+    failed = [case for case in cases if case.id in outcome_by_id and not _has_succeeded(outcome_by_id[case.id])]
+    failed.sort(key=lambda case: _compute_advance_fraction(outcome_by_id[case.id]))
+    return [(case, _describe_end(outcome_by_id[case.id])) for case in failed[:MAX_LISTED_FAILURES]]
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+def compute_wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Return the 95 % confidence interval of a success rate.
 
     With p = successes / n, n trials and z = 1.96:
@@ -223,11 +223,11 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 def _format_median(values: list[float], digits: int) -> str:
     if not values:
-        return UNKNOWN
+        return UNKNOWN_TEXT
     return f"{np.median(values):.{digits}f}"
 
 
-def _succeeded(outcome: CaseOutcome) -> bool:
+def _has_succeeded(outcome: CaseOutcome) -> bool:
     """Return whether a run reached its goal; without a goal, whether it ran to its end."""
     if outcome.error is not None:
         return False
@@ -237,7 +237,7 @@ def _succeeded(outcome: CaseOutcome) -> bool:
     return crossed is True
 
 
-def _advance_fraction(outcome: CaseOutcome) -> float:
+def _compute_advance_fraction(outcome: CaseOutcome) -> float:
     """Return the advance as a fraction of the way to the goal, to sort by; -1 without a run, in m without a goal."""
     advance_m = outcome.numbers.get("advance_m")
     goal_m = outcome.numbers.get("goal_m")
@@ -252,28 +252,31 @@ def _describe_end(outcome: CaseOutcome) -> str:
     """Describe the end of one run: its advance, the last state that its controller reported, and how it ended.
 
     Args:
-        outcome: the numbers of the run's summary, or the error of a case that could not run.
+        outcome: The metrics of the run's summary, or the error of a case that could not run.
+
+    Returns:
+        Phrases separated by semicolons, or the error.
     """
     if outcome.error is not None:
         return outcome.error
-    numbers = outcome.numbers
-    advance_m = numbers.get("advance_m")
-    goal_m = numbers.get("goal_m")
-    advance = f"{advance_m:.2f} m" if isinstance(advance_m, float) else "unknown"
+    metrics = outcome.numbers
+    advance_m = metrics.get("advance_m")
+    goal_m = metrics.get("goal_m")
+    advance_text = f"{advance_m:.2f} m" if isinstance(advance_m, float) else "unknown"
     if isinstance(goal_m, float):
-        advance += f" of {goal_m:g} m"
-    state = numbers.get("last_state")
-    reason = numbers.get("last_reason")
+        advance_text += f" of {goal_m:g} m"
+    state = metrics.get("last_state")
+    reason = metrics.get("last_reason")
     if state is None:  # the pose is unknown, and with it the motion
-        state = numbers.get("reported_state")
-        reason = numbers.get("reported_reason")
-    parts = [advance]
+        state = metrics.get("reported_state")
+        reason = metrics.get("reported_reason")
+    phrases = [advance_text]
     if reason:
-        parts.append(f"{state}: {reason}")
+        phrases.append(f"{state}: {reason}")
     else:
-        parts.append(str(state or "controller reported nothing"))
-    if numbers.get("ended") != "complete":
-        parts.append(str(numbers.get("ended")))
-    if numbers.get(GAVE_UP):
-        parts.append("ended early: no advance for too long")
-    return "; ".join(parts)
+        phrases.append(str(state or "controller reported nothing"))
+    if metrics.get("ended") != "complete":
+        phrases.append(str(metrics.get("ended")))
+    if metrics.get(GAVE_UP_FIELD):
+        phrases.append("ended early: no advance for too long")
+    return "; ".join(phrases)

@@ -2,12 +2,12 @@
 
 import argparse
 
-from snakesim_hal.programs.arguments import add_out, number_type
+from snakesim_hal.programs.arguments import add_out, make_number_parser
 from snakesim_hal.programs.commands import Command, Commands
-from snakesim_operator.playback.arguments import add_span
+from snakesim_operator.playback.arguments import add_span_options
 
 
-def _add_plot(parser: argparse.ArgumentParser) -> None:
+def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim recording plot`, which draws signals, paths or the figures of the paper."""
     parser.add_argument(
         "arguments",
@@ -29,26 +29,26 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "FILE.pdf, .svg or .png, or a folder with --paper (default: in RUN)")
     parser.add_argument(
         "--width-in",
-        type=number_type(1.0, 40.0, "inches"),
+        type=make_number_parser(1.0, 40.0, "inches"),
         default=3.5,
         metavar="INCHES",
         help="width of the figure in inches (default: 3.5, one column)",
     )
     parser.add_argument("--dark", action="store_true", help="on black, for slides")
-    add_span(parser)
+    add_span_options(parser)
 
 
-def _plot(arguments: argparse.Namespace) -> int:
+def _run_plot(arguments: argparse.Namespace) -> int:
     """Run `snakesim recording plot`: draw signals of one or several runs into a file. Return the exit code."""
     from snakesim_operator.base import extras
 
-    extras.require("report", "`snakesim recording plot`")
+    extras.require_extra("report", "`snakesim recording plot`")
     from snakesim_operator.features.figures.inherited import import_matplotlib
 
     import_matplotlib()  # without the user's MPLBACKEND; must precede the import of `drawn`
-    from snakesim_operator.features.figures.drawn import plot
+    from snakesim_operator.features.figures.drawn import plot_runs
 
-    return plot(
+    return plot_runs(
         arguments.arguments,
         arguments.out,
         mean=arguments.mean,
@@ -64,8 +64,8 @@ COMMANDS: Commands = (
     Command(
         name="recording plot",
         help="Draw figures of runs for a paper: signals over time, the path, or those of the SnakeSIM paper.",
-        add=_add_plot,
-        run=_plot,
+        add=_add_plot_arguments,
+        run=_run_plot,
         details="Signals are named as in `snakesim recording export`. A comma puts several of one unit on one pair of "
         "axes: angle_rad.joint_7,target.joint_7. Several runs are overlaid, each in its color. Exit code 0: made. 2: "
         "wrong input. 3: made, but something is missing in a recording.",

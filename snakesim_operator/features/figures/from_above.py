@@ -7,20 +7,20 @@ from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.results.report.top_view import outline_w
+from snakesim_operator.results.report.top_view import find_outline_w
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.time_axis import zero_s
+from snakesim_operator.results.time_axis import get_time_origin_s
 
-BODY = "#9aa5b1"
-OBSTACLE = "#d9dde2"
-HEAD = "#c0392b"
-TAIL = "#2c6fbb"
-MAX_POINTS = 2000  # of a path; a run of many minutes has more ticks than a figure can show
+BODY_COLOR = "#9aa5b1"
+OBSTACLE_COLOR = "#d9dde2"
+HEAD_COLOR = "#c0392b"
+TAIL_COLOR = "#2c6fbb"
+MAX_PATH_POINTS = 2000  # of a path; a run of many minutes has more ticks than a figure can show
 MARGIN_M = 0.1  # around everything that is drawn
 MIN_HEIGHT_IN = 1.2
 
 
-def draw_paths(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> Figure:
+def draw_head_and_tail_paths(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> Figure:
     """Draw the paths of head and tail, with the obstacles, and the body where it began and ended.
 
     Args:
@@ -31,37 +31,39 @@ def draw_paths(record: RunRecord, width_in: float, span_s: tuple[float, float]) 
     Raises:
         ConfigError: The pose is unknown in this part of the run.
     """
-    nodes_w = _find_nodes(record, span_s)
-    xy_w = nodes_w[:, :, :2]
+    body_points_w = _sample_body_points_w(record, span_s)
+    xy_w = body_points_w[:, :, :2]
     head_w = xy_w[:, -1]
     tail_w = xy_w[:, 0]
-    low_w = np.nanmin(xy_w, axis=(0, 1)) - MARGIN_M
-    high_w = np.nanmax(xy_w, axis=(0, 1)) + MARGIN_M
-    width_m, height_m = high_w - low_w
+    min_corner_w = np.nanmin(xy_w, axis=(0, 1)) - MARGIN_M
+    max_corner_w = np.nanmax(xy_w, axis=(0, 1)) + MARGIN_M
+    width_m, height_m = max_corner_w - min_corner_w
 
     figure = Figure((width_in, max(width_in * float(height_m / width_m) + 0.5, MIN_HEIGHT_IN)))
     axes = figure.subplots()
     plot_obstacles(axes, record)
     plot_body(axes, record, xy_w[0], alpha=0.4)
     plot_body(axes, record, xy_w[-1])
-    axes.plot(*tail_w.T, color=TAIL, label="tail")
-    axes.plot(*head_w.T, color=HEAD, label="head")
+    axes.plot(*tail_w.T, color=TAIL_COLOR, label="tail")
+    axes.plot(*head_w.T, color=HEAD_COLOR, label="head")
     axes.set_aspect("equal")
-    axes.set(xlim=(low_w[0], high_w[0]), ylim=(low_w[1], high_w[1]), xlabel="x [m]", ylabel="y [m]")
+    axes.set(
+        xlim=(min_corner_w[0], max_corner_w[0]), ylim=(min_corner_w[1], max_corner_w[1]), xlabel="x [m]", ylabel="y [m]"
+    )
     axes.locator_params(axis="y", nbins=4)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure
 
 
-def _find_nodes(record: RunRecord, span_s: tuple[float, float]) -> Floats:
+def _sample_body_points_w(record: RunRecord, span_s: tuple[float, float]) -> Floats:
     """Return tail end, joints and head end in the world at evenly chosen ticks, (n, joints + 2, 3)."""
-    time_s = record.time_s - zero_s(record)
-    rows = np.flatnonzero(record.posed & (time_s >= span_s[0]) & (time_s <= span_s[1]))
-    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_POINTS)).astype(int))]
-    nodes_w = [nodes for nodes in map(record.nodes_w, chosen.tolist()) if nodes is not None]
+    time_s = record.time_s - get_time_origin_s(record)
+    rows = np.flatnonzero(record.has_pose & (time_s >= span_s[0]) & (time_s <= span_s[1]))
+    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_PATH_POINTS)).astype(int))]
+    nodes_w = [nodes for nodes in map(record.find_body_points_w, chosen.tolist()) if nodes is not None]
     if not nodes_w:
         raise ConfigError(
-            f"{record.folder}: the pose is unknown in this part of the run, so there is no path; a path needs a robot "
+            f"{record.path}: the pose is unknown in this part of the run, so there is no path; a path needs a robot "
             "with a pose sensor; signals such as angle_rad can be drawn of any run",
             code="recording/missing-data",
         )
@@ -69,33 +71,33 @@ def _find_nodes(record: RunRecord, span_s: tuple[float, float]) -> Floats:
 
 
 def plot_obstacles(axes: Axes, record: RunRecord) -> None:
-    """Plot all obstacles to scale."""
-    for placed in record.placed:
+    """Plot all obstacles of a run to scale, seen from above."""
+    for placed in record.placed_obstacles:
         obstacle = placed.obstacle
         if obstacle.shape == "box":
-            axes.add_patch(Polygon(outline_w(obstacle), closed=True, color=OBSTACLE))
+            axes.add_patch(Polygon(find_outline_w(obstacle), closed=True, color=OBSTACLE_COLOR))
         else:
-            axes.add_patch(Circle(obstacle.position_w[:2], obstacle.radius_m, color=OBSTACLE))
+            axes.add_patch(Circle(obstacle.position_w[:2], obstacle.radius_m, color=OBSTACLE_COLOR))
 
 
-def plot_body(axes: Axes, record: RunRecord, nodes_w: Floats, *, alpha: float = 1.0) -> None:
+def plot_body(axes: Axes, record: RunRecord, body_points_w: Floats, *, alpha: float = 1.0) -> None:
     """Plot links and joints of a robot to scale, seen from above.
 
     Args:
         axes: Axes to plot into.
         record: The run, which has the radius of the links.
-        nodes_w: (joints + 2, 2) tail end, joints and head end, m.
+        body_points_w: (joints + 2, 2) tail end, joints and head end, m.
         alpha: Opacity; 1: opaque, 0: invisible.
     """
-    joints_w = nodes_w[1:-1]
-    for rear, front, link in zip(nodes_w[:-1], nodes_w[1:], record.description.links, strict=True):
+    joints_w = body_points_w[1:-1]
+    for rear, front, link in zip(body_points_w[:-1], body_points_w[1:], record.description.links, strict=True):
         length_m = max(float(np.hypot(*(front - rear))), 1e-9)
-        along = (front - rear) / length_m
-        side = link.radius_m * np.array([-along[1], along[0]])
-        corners = [rear + side, front + side, front - side, rear - side]
-        axes.add_patch(Polygon(corners, closed=True, color=BODY, linewidth=0, alpha=alpha))
+        along_link = (front - rear) / length_m
+        half_width_w = link.radius_m * np.array([-along_link[1], along_link[0]])
+        corners = [rear + half_width_w, front + half_width_w, front - half_width_w, rear - half_width_w]
+        axes.add_patch(Polygon(corners, closed=True, color=BODY_COLOR, linewidth=0, alpha=alpha))
     for joint_w in joints_w:
         axes.add_patch(
-            Circle(tuple(joint_w), record.description.links[0].radius_m, color=BODY, linewidth=0, alpha=alpha)
+            Circle(tuple(joint_w), record.description.links[0].radius_m, color=BODY_COLOR, linewidth=0, alpha=alpha)
         )
     axes.plot(*joints_w.T, ".", color="white", markersize=2.0)

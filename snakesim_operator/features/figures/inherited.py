@@ -5,8 +5,8 @@ import os
 import sys
 from typing import Any
 
-BACKEND = "MPLBACKEND"
-PLAIN_TEXT: Any = {"text.usetex": False}  # LaTeX may be missing, and takes the `_` of our names for a subscript
+BACKEND_VARIABLE = "MPLBACKEND"
+PLAIN_TEXT_STYLE: Any = {"text.usetex": False}  # LaTeX may be missing, and takes the `_` of our names for a subscript
 
 
 def import_matplotlib() -> None:
@@ -16,9 +16,9 @@ def import_matplotlib() -> None:
     """
     if "matplotlib" in sys.modules:
         return
-    backend_name = os.environ.pop(BACKEND, None)
+    backend_name = os.environ.pop(BACKEND_VARIABLE, None)
     try:
         importlib.import_module("matplotlib")
     finally:
         if backend_name is not None:
-            os.environ[BACKEND] = backend_name
+            os.environ[BACKEND_VARIABLE] = backend_name

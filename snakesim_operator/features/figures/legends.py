@@ -5,7 +5,7 @@ import math
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-LINE_HEIGHT = 1.35  # of a row of a legend, in font sizes
+LEGEND_ROW_HEIGHT = 1.35  # of a row of a legend, in font sizes
 POINTS_PER_INCH = 72.0
 
 
@@ -37,7 +37,7 @@ def _place_legend(axes: Axes, names: list[str]) -> float:
         if fits or column_count == 1:
             font_size_pt = legend.get_texts()[0].get_fontproperties().get_size_in_points()
             row_count = math.ceil(len(names) / column_count)
-            return row_count * LINE_HEIGHT * font_size_pt / POINTS_PER_INCH
+            return row_count * LEGEND_ROW_HEIGHT * font_size_pt / POINTS_PER_INCH
         column_count -= 1
 
 

@@ -5,12 +5,12 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.figures.inherited import PLAIN_TEXT
+from snakesim_operator.features.figures.inherited import PLAIN_TEXT_STYLE
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.time_axis import zero_s
+from snakesim_operator.results.time_axis import get_time_origin_s
 
-STYLE: Any = {
-    **PLAIN_TEXT,
+FIGURE_STYLE: Any = {
+    **PLAIN_TEXT_STYLE,
     "font.size": 8.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -35,4 +35,4 @@ def plot_over_time(axes: Axes, record: RunRecord, values: Floats, name: str = ""
         name: Name in the legend.
         **look: Properties of the line, as matplotlib's `plot` takes them.
     """
-    axes.plot(record.time_s - zero_s(record), values, label=name, **look)  # pyright: ignore[reportArgumentType]
+    axes.plot(record.time_s - get_time_origin_s(record), values, label=name, **look)  # pyright: ignore[reportArgumentType]

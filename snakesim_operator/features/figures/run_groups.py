@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import leaves
+from snakesim_hal.model.files import iterate_leaves
 from snakesim_operator.results.run_log import RunRecord
 
-SEED = "seed"  # last part of each key that only decides random numbers
+SEED_KEY = "seed"  # last part of each key that only decides random numbers
 MAX_KEYS_IN_LABEL = 2
 
 
@@ -28,8 +28,8 @@ class RunGroup:
         return min(float(record.time_s[-1] - record.time_s[0]) for record in self.records)
 
 
-def split_arguments(arguments: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """Split what stands on the command line into runs and signals.
+def split_runs_and_signals(arguments: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """Split the arguments of the command line into paths of runs and names of signals.
 
     Every argument up to the last one that names a file or folder is a run. No signal has a slash in its name.
 
@@ -43,7 +43,7 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[Path], list[str]]:
     return [Path(argument) for argument in arguments[:run_count]], list(arguments[run_count:])
 
 
-def load_runs(paths: Sequence[Path]) -> list[RunRecord]:
+def load_armed_runs(paths: Sequence[Path]) -> list[RunRecord]:
     """Load runs that were armed. Raises ConfigError for one that was not."""
     records: list[RunRecord] = []
     for path in paths:
@@ -56,55 +56,65 @@ def load_runs(paths: Sequence[Path]) -> list[RunRecord]:
     return records
 
 
-def make_single_groups(records: Sequence[RunRecord]) -> list[RunGroup]:
+def make_single_run_groups(records: Sequence[RunRecord]) -> list[RunGroup]:
     """Return a group for each run, labeled with the name of its folder, or with its path if names are equal."""
-    names = [record.folder.name for record in records]
+    names = [record.path.name for record in records]
     if len(set(names)) < len(names):
-        names = [str(record.folder) for record in records]
+        names = [str(record.path) for record in records]
     return [RunGroup(name, [record]) for name, record in zip(names, records, strict=True)]
 
 
-def group_by_seed(records: Sequence[RunRecord]) -> list[RunGroup]:
-    """Return groups of runs whose configurations are equal but for their seeds, in the order of the first runs.
+def group_runs_by_configuration(records: Sequence[RunRecord]) -> list[RunGroup]:
+    """Group runs whose configurations are equal except for their seeds, in the order of the first runs.
+
+    Args:
+        records: The runs.
+
+    Returns:
+        The groups, each with a label that names the settings in which it differs from the other groups.
 
     Raises:
         ConfigError: No two runs differ in their seeds alone, or the same run is given twice.
     """
-    grouped: dict[str, list[RunRecord]] = {}
-    settings: dict[str, dict[str, Any]] = {}
+    records_by_key: dict[str, list[RunRecord]] = {}
+    settings_by_key: dict[str, dict[str, Any]] = {}
     for record in records:
         values = _read_settings(record)
         key = msgspec.json.encode(values, order="deterministic").decode()
-        grouped.setdefault(key, []).append(record)
-        settings[key] = values
-    if all(len(members) == 1 for members in grouped.values()):
+        records_by_key.setdefault(key, []).append(record)
+        settings_by_key[key] = values
+    if all(len(members) == 1 for members in records_by_key.values()):
         raise ConfigError(
             f"--mean: no two of these {len(records)} runs differ in their seeds alone; give runs of one scenario with "
             "different --seed, or leave --mean out",
             code="command/invalid-option",
         )
-    for members in grouped.values():
-        _check_seeds_differ(members)
-    labels = _make_labels(list(settings.values()), list(grouped.values()))
-    return [RunGroup(label, members) for label, members in zip(labels, grouped.values(), strict=True)]
+    for members in records_by_key.values():
+        _validate_seeds_differ(members)
+    labels = _make_labels(list(settings_by_key.values()), list(records_by_key.values()))
+    return [RunGroup(label, members) for label, members in zip(labels, records_by_key.values(), strict=True)]
 
 
 def _read_settings(record: RunRecord) -> dict[str, Any]:
     """Return the configuration of a run by dotted keys, without its seeds."""
-    values = leaves(msgspec.to_builtins(record.config))
-    return {key: value for key, value in values if key.rpartition(".")[2] != SEED}
+    values = iterate_leaves(msgspec.to_builtins(record.config))
+    return {key: value for key, value in values if key.rpartition(".")[2] != SEED_KEY}
 
 
-def _check_seeds_differ(members: Sequence[RunRecord]) -> None:
+def _validate_seeds_differ(members: Sequence[RunRecord]) -> None:
     """Raise ConfigError if two runs have one seed: they are the same run, and not independent."""
     folders: dict[str, Path] = {}
     for record in members:
-        seeds = [value for key, value in leaves(msgspec.to_builtins(record.config)) if key.rpartition(".")[2] == SEED]
-        first = folders.setdefault(str(seeds), record.folder)
-        if first is not record.folder:
+        seeds = [
+            value
+            for key, value in iterate_leaves(msgspec.to_builtins(record.config))
+            if key.rpartition(".")[2] == SEED_KEY
+        ]
+        first_folder = folders.setdefault(str(seeds), record.path)
+        if first_folder is not record.path:
             raise ConfigError(
-                f"--mean: {first} and {record.folder} have the same configuration and seed {record.config.seed}, so "
-                "they count as one run; leave one of them out",
+                f"--mean: {first_folder} and {record.path} have the same configuration and seed "
+                f"{record.config.seed}, so they count as one run; leave one of them out",
                 code="command/invalid-option",
             )
 
@@ -117,7 +127,7 @@ def _make_labels(settings: Sequence[dict[str, Any]], groups: Sequence[Sequence[R
     for values, members in zip(settings, groups, strict=True):
         names = [_describe_setting(key, values) for key in differing]
         if not names or len(names) > MAX_KEYS_IN_LABEL:
-            names = [members[0].config.name if not names else members[0].folder.name]
+            names = [members[0].config.name if not names else members[0].path.name]
         count = f"mean of {len(members)} runs" if len(members) > 1 else "1 run"
         labels.append(f"{', '.join(names)} ({count})")
     return labels

@@ -6,14 +6,14 @@ from typing import Any
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, MAX_IMAGE_BYTES, MAX_PAYLOAD_BYTES
-from snakesim_hal.wire.roles import Permission, Role, list_permissions
-from snakesim_operator.features.lab.identities import Identity, identities
-from snakesim_operator.features.lab.lab_file import ALL, Lab
+from snakesim_hal.wire.roles import Permission, Role, iterate_permissions
+from snakesim_operator.features.lab.identities import Identity, iterate_identities
+from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, Lab
 
-ANY = "**"
+ANY_KEY = "**"
 # Tools look for robots with a wildcard in the place of the namespace, as in `**/alive/hal`.
-SEARCHED = ("declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber")
-EVERY_MESSAGE = (
+SEARCH_MESSAGES = ("declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber")
+ALL_MESSAGES = (
     "put",
     "delete",
     "query",
@@ -24,12 +24,12 @@ EVERY_MESSAGE = (
     "liveliness_query",
     "declare_liveliness_subscriber",
 )
-REQUEST_BYTES = 16 * 1024  # of a query, and of its answer where nothing is latched
-COMMAND_BYTES = 64 * 1024  # of a command to 256 joints, or what a person asks for
-ENVELOPE_BYTES = 4096  # key and encoding beside a payload
+MAX_REQUEST_BYTES = 16 * 1024  # of a query, and of its answer where nothing is latched
+MAX_COMMAND_BYTES = 64 * 1024  # of a command to 256 joints, or what a person asks for
+MAX_ENVELOPE_BYTES = 4096  # key and encoding beside a payload
 
 
-def access_control(lab: Lab) -> dict[str, Any]:
+def make_access_control(lab: Lab) -> dict[str, Any]:
     """Return Zenoh's `access_control` section for the routers of a lab.
 
     Everything that no rule allows is denied.
@@ -44,9 +44,9 @@ def access_control(lab: Lab) -> dict[str, Any]:
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for identity in identities(lab):
+    for identity in iterate_identities(lab):
         name = identity.common_name
-        identity_rules = _rules(identity, lab)
+        identity_rules = _make_rules(identity, lab)
         rule_ids = [rule["id"] for rule in identity_rules]
         rules += identity_rules
         subjects.append({"id": name, "cert_common_names": [name]})
@@ -60,7 +60,7 @@ def access_control(lab: Lab) -> dict[str, Any]:
     }
 
 
-def _rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
+def _make_rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
     """Return the rules of Zenoh's access control for one identity.
 
     All keys at which the same messages may pass in the same direction (flow) share one rule.
@@ -72,18 +72,20 @@ def _rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
     Returns:
         The rules as Zenoh's configuration file has them, each with an id.
     """
-    messages_at_key: dict[tuple[str, str], set[str]] = defaultdict(set)  # (key, flow) -> messages
-    for flow, message, key in _permitted(identity, lab):
-        messages_at_key[key, flow].add(message)
+    messages_by_key_and_flow: dict[tuple[str, str], set[str]] = defaultdict(set)  # (key, flow) -> messages
+    for flow, message, key in _iterate_permissions(identity, lab):
+        messages_by_key_and_flow[key, flow].add(message)
 
-    keys_of_rule: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(list)  # (flow, messages) -> keys
-    for (key, flow), messages in messages_at_key.items():
-        keys_of_rule[flow, tuple(sorted(messages))].append(key)
+    keys_by_flow_and_messages: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(
+        list
+    )  # (flow, messages) -> keys
+    for (key, flow), messages in messages_by_key_and_flow.items():
+        keys_by_flow_and_messages[flow, tuple(sorted(messages))].append(key)
 
     rules: list[dict[str, Any]] = []
-    for number, ((flow, rule_messages), rule_keys) in enumerate(sorted(keys_of_rule.items()), 1):
+    for rule_number, ((flow, rule_messages), rule_keys) in enumerate(sorted(keys_by_flow_and_messages.items()), 1):
         rule = {
-            "id": f"{identity.common_name}/{number}",
+            "id": f"{identity.common_name}/{rule_number}",
             "permission": "allow",
             "flows": [flow],
             "messages": list(rule_messages),
@@ -93,7 +95,7 @@ def _rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
     return rules
 
 
-def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
+def _iterate_permissions(identity: Identity, lab: Lab) -> Iterator[Permission]:
     """Yield every kind of message that may pass between a router and an identity.
 
     Keys begin with the robot's namespace, unlike those of the table of roles.
@@ -106,33 +108,33 @@ def _permitted(identity: Identity, lab: Lab) -> Iterator[Permission]:
         Direction, kind of message and key.
     """
     if identity.role is None:
-        yield from _permitted_to_router()
+        yield from _iterate_router_permissions()
         return
-    for robot in identity.robots(lab):
+    for robot in identity.list_robots(lab):
         faults = lab.file.robots[robot].faults
-        for flow, message, key in list_permissions(identity.role, identity.services, faults=faults):
+        for flow, message, key in iterate_permissions(identity.role, identity.services, allow_fault_injection=faults):
             yield Permission(flow, message, f"{robot}/{key}")
-            if key == ANY or message not in SEARCHED:
+            if key == ANY_KEY or message not in SEARCH_MESSAGES:
                 continue
             # Tools search for robots with a wildcard instead of the namespace. A process of one robot may search only
             # within its namespace, because a query with a wildcard reaches every queryable.
-            searches_one_robot = flow == "ingress" and identity.of != ALL
-            namespace = f"{robot}/{ANY}" if searches_one_robot else ANY
+            searches_one_robot = flow == "ingress" and identity.subject != ALL_ROBOTS
+            namespace = f"{robot}/{ANY_KEY}" if searches_one_robot else ANY_KEY
             yield Permission(flow, message, f"{namespace}/{key}")
     if identity.role is Role.ADMINISTRATOR:
-        yield Permission("ingress", "query", f"@/{ANY}")
-        yield Permission("egress", "reply", f"@/{ANY}")
+        yield Permission("ingress", "query", f"@/{ANY_KEY}")
+        yield Permission("egress", "reply", f"@/{ANY_KEY}")
 
 
-def _permitted_to_router() -> Iterator[Permission]:
+def _iterate_router_permissions() -> Iterator[Permission]:
     """Yield everything, because another router has already checked what it forwards."""
     for flow in ("ingress", "egress"):
-        for message in EVERY_MESSAGE:
-            yield Permission(flow, message, ANY)
-            yield Permission(flow, message, f"{ANY}/@adv/{ANY}")
+        for message in ALL_MESSAGES:
+            yield Permission(flow, message, ANY_KEY)
+            yield Permission(flow, message, f"{ANY_KEY}/@adv/{ANY_KEY}")
 
 
-def size_limits() -> list[dict[str, Any]]:
+def make_size_limits() -> list[dict[str, Any]]:
     """Return Zenoh's `low_pass_filter` section: the maximum size of a message in bytes, by key.
 
     Routers drop longer messages. Every key of the key space belongs to one of four groups with a common maximum.
@@ -143,21 +145,21 @@ def size_limits() -> list[dict[str, Any]]:
     grouped_keys = (*image_keys, *query_keys, *command_keys)
     other_keys = [row.key for row in keys.SPACE if row.message and row.key not in grouped_keys]
     # Zenoh transfers the stored values of latched keys below `@adv`.
-    stored_keys = [f"{row.key}/@adv/{ANY}" for row in keys.SPACE if row.kind == "latched"]
+    stored_keys = [f"{row.key}/@adv/{ANY_KEY}" for row in keys.SPACE if row.kind == "latched"]
     return [
-        _size_limit("images", image_keys, MAX_IMAGE_BYTES),
-        _size_limit("requests", query_keys, REQUEST_BYTES),
-        _size_limit("commands", command_keys, COMMAND_BYTES),
-        _size_limit("others", [*other_keys, *stored_keys], MAX_PAYLOAD_BYTES),
+        _make_size_limit("images", image_keys, MAX_IMAGE_BYTES),
+        _make_size_limit("requests", query_keys, MAX_REQUEST_BYTES),
+        _make_size_limit("commands", command_keys, MAX_COMMAND_BYTES),
+        _make_size_limit("others", [*other_keys, *stored_keys], MAX_PAYLOAD_BYTES),
     ]
 
 
-def _size_limit(name: str, limited_keys: list[str], max_bytes: int) -> dict[str, Any]:
+def _make_size_limit(name: str, key_list: list[str], max_bytes: int) -> dict[str, Any]:
     """Return one entry of the `low_pass_filter` section, for keys in any namespace."""
     return {
         "id": name,
         "flows": ["ingress"],
         "messages": ["put", "delete", "query", "reply"],
-        "key_exprs": [f"{ANY}/{key}" for key in limited_keys],
+        "key_exprs": [f"{ANY_KEY}/{key}" for key in key_list],
         "size_limit": max_bytes,
     }

@@ -22,12 +22,12 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.network.private_keys import check_permissions
-from snakesim_operator.features.lab.identities import Identity, identities
+from snakesim_operator.features.lab.identities import Identity, iterate_identities
 from snakesim_operator.features.lab.lab_file import Lab
 
-AUTHORITY = "authority"
+AUTHORITY_NAME = "authority"
 CLOCK_SLACK = timedelta(minutes=10)  # a robot's clock may be behind
-RENEW_AT = 1 / 3  # a certificate is renewed when less than this part of its life is left
+RENEWAL_FRACTION = 1 / 3  # a certificate is renewed when less than this part of its life is left
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Issuer:
     key: ec.EllipticCurvePrivateKey
 
 
-def make_authority(folder: Path, lab: Lab) -> Issuer:
-    """Return the certificate authority in a folder, which is created if it does not exist.
+def load_or_create_authority(folder: Path, lab: Lab) -> Issuer:
+    """Load the lab's certificate authority from a folder, or create a new one if the folder has none.
 
     The private key of the authority stays in this folder: it is copied to no machine.
 
@@ -50,20 +50,20 @@ def make_authority(folder: Path, lab: Lab) -> Issuer:
     Raises:
         ConfigError: The files in the folder are damaged, or other users may read them.
     """
-    certificate_path = folder / f"{AUTHORITY}.pem"
-    key_path = folder / f"{AUTHORITY}.key"
+    certificate_path = folder / f"{AUTHORITY_NAME}.pem"
+    key_path = folder / f"{AUTHORITY_NAME}.key"
     if certificate_path.exists() or key_path.exists():
         return _read_authority(certificate_path, key_path)
-    _make_private(folder)
+    _make_private_folder(folder)
     key = ec.generate_private_key(ec.SECP256R1())
-    certificate = _sign_authority(key, lab)
-    _write(key_path, _encode_key(key), 0o600)
-    _write(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    certificate = _make_authority_certificate(key, lab)
+    _write_file_with_mode(key_path, _encode_key(key), 0o600)
+    _write_file_with_mode(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
     return Issuer(certificate, key)
 
 
-def _sign_authority(key: ec.EllipticCurvePrivateKey, lab: Lab) -> x509.Certificate:
-    """Return a certificate that the authority signs for itself. It may only sign certificates and revocation lists.
+def _make_authority_certificate(key: ec.EllipticCurvePrivateKey, lab: Lab) -> x509.Certificate:
+    """Make the authority's own certificate, signed by itself. It may only sign certificates and revocation lists.
 
     Args:
         key: Private key of the authority.
@@ -82,7 +82,7 @@ def _sign_authority(key: ec.EllipticCurvePrivateKey, lab: Lab) -> x509.Certifica
         decipher_only=False,
     )
     return (
-        _builder(name, name, timedelta(days=lab.file.authority_days))
+        _make_certificate_builder(name, name, timedelta(days=lab.file.authority_days))
         .public_key(key.public_key())
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
@@ -90,7 +90,7 @@ def _sign_authority(key: ec.EllipticCurvePrivateKey, lab: Lab) -> x509.Certifica
     )
 
 
-def _make_private(folder: Path) -> None:
+def _make_private_folder(folder: Path) -> None:
     """Create a folder that only its owner may use. Raises ConfigError for an existing one that others may use."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -147,37 +147,39 @@ def _read_authority(certificate_path: Path, key_path: Path) -> Issuer:
     return Issuer(certificate, key)
 
 
-def issue(issuer: Issuer, identity: Identity, lab: Lab, life: timedelta | None = None) -> tuple[bytes, bytes]:
+def issue_certificate(
+    issuer: Issuer, identity: Identity, lab: Lab, lifetime: timedelta | None = None
+) -> tuple[bytes, bytes]:
     """Create a private key and a certificate that identifies one machine of a lab with its role.
 
     Args:
         issuer: The authority that signs.
         identity: The router, robot or machine that the certificate is for.
         lab: The lab.
-        life: How long the certificate is valid; None takes `certificate_days` of the lab file.
+        lifetime: Time for which the certificate is valid; None for `certificate_days` of the lab file.
 
     Returns:
         Certificate and private key as PEM.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity.common_name)])
-    if life is None:
-        life = timedelta(days=lab.file.certificate_days)
+    if lifetime is None:
+        lifetime = timedelta(days=lab.file.certificate_days)
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role is None:  # a router
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
     builder = (
-        _builder(subject, issuer.certificate.subject, life)
+        _make_certificate_builder(subject, issuer.certificate.subject, lifetime)
         .public_key(key.public_key())
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-        .add_extension(x509.SubjectAlternativeName(_names(identity, lab)), critical=False)
+        .add_extension(x509.SubjectAlternativeName(_list_alternative_names(identity, lab)), critical=False)
     )
     certificate = builder.sign(issuer.key, hashes.SHA256())
     return certificate.public_bytes(serialization.Encoding.PEM), _encode_key(key)
 
 
-def _names(identity: Identity, lab: Lab) -> list[x509.GeneralName]:
+def _list_alternative_names(identity: Identity, lab: Lab) -> list[x509.GeneralName]:
     """Return the address of a router, which its clients compare; a role has no address, only its name."""
     address = lab.file.machines[identity.machine].address if identity.role is None else None
     if address is None:
@@ -189,50 +191,50 @@ def _names(identity: Identity, lab: Lab) -> list[x509.GeneralName]:
 
 
 def write_certificates(
-    lab: Lab, folder: Path, authority: Path, *, rotate: bool = False
+    lab: Lab, folder: Path, authority_folder: Path, *, rotate: bool = False
 ) -> list[tuple[Identity, str, datetime]]:
     """Write the certificates of all identities into `folder/MACHINE/tls`.
 
     Args:
         lab: The lab.
         folder: The output folder.
-        authority: The folder of the certificate authority.
+        authority_folder: The folder of the certificate authority.
         rotate: Renew all certificates. Otherwise those of another authority, for another address, or with less than
-            RENEW_AT of their life left are renewed.
+            RENEWAL_FRACTION of their life left are renewed.
 
     Returns:
         Each identity with what was done ("made", "renewed" or "kept"), and the end of its certificate.
     """
-    issuer = make_authority(authority, lab)
+    issuer = load_or_create_authority(authority_folder, lab)
     authority_pem = issuer.certificate.public_bytes(serialization.Encoding.PEM)
     results: list[tuple[Identity, str, datetime]] = []
-    for identity in identities(lab):
+    for identity in iterate_identities(lab):
         tls_folder = folder / identity.machine / "tls"
         tls_folder.mkdir(parents=True, exist_ok=True)
         path = tls_folder / f"{identity.label}.pem"
         is_valid = _is_still_valid(path, issuer, identity, lab)
         if is_valid and not rotate:
-            state = "kept"
+            action = "kept"
         elif is_valid or path.exists():
-            state = "renewed"
+            action = "renewed"
         else:
-            state = "made"
-        if state != "kept":
-            certificate, key = issue(issuer, identity, lab)
-            _write(path.with_suffix(".key"), key, 0o600)
-            _write(path, certificate, 0o644)
-        _write(tls_folder / f"{AUTHORITY}.pem", authority_pem, 0o644)
-        results.append((identity, state, read_certificate(path).not_valid_after_utc))
+            action = "made"
+        if action != "kept":
+            certificate, key = issue_certificate(issuer, identity, lab)
+            _write_file_with_mode(path.with_suffix(".key"), key, 0o600)
+            _write_file_with_mode(path, certificate, 0o644)
+        _write_file_with_mode(tls_folder / f"{AUTHORITY_NAME}.pem", authority_pem, 0o644)
+        results.append((identity, action, read_certificate(path).not_valid_after_utc))
     return results
 
 
-def read_certificate(at: Path) -> x509.Certificate:
+def read_certificate(path: Path) -> x509.Certificate:
     """Read a certificate from a file. Raises ConfigError."""
     try:
-        return x509.load_pem_x509_certificate(read_bytes(at))
+        return x509.load_pem_x509_certificate(read_bytes(path))
     except ValueError as error:
         raise ConfigError(
-            f"{at}: not a certificate: {error}; remove it and run `snakesim lab certs`",
+            f"{path}: not a certificate: {error}; remove it and run `snakesim lab certs`",
             code="certificate/invalid-authority",
         ) from None
 
@@ -247,12 +249,12 @@ def _is_still_valid(path: Path, issuer: Issuer, identity: Identity, lab: Lab) ->
     except (ValueError, TypeError, InvalidSignature):
         return False
     names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    life = certificate.not_valid_after_utc - certificate.not_valid_before_utc
-    left = certificate.not_valid_after_utc - datetime.now(UTC)
-    return list(names) == _names(identity, lab) and left > life * RENEW_AT
+    lifetime = certificate.not_valid_after_utc - certificate.not_valid_before_utc
+    remaining = certificate.not_valid_after_utc - datetime.now(UTC)
+    return list(names) == _list_alternative_names(identity, lab) and remaining > lifetime * RENEWAL_FRACTION
 
 
-def _builder(subject: x509.Name, issuer: x509.Name, life: timedelta) -> x509.CertificateBuilder:
+def _make_certificate_builder(subject: x509.Name, issuer: x509.Name, lifetime: timedelta) -> x509.CertificateBuilder:
     now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()
@@ -260,7 +262,7 @@ def _builder(subject: x509.Name, issuer: x509.Name, life: timedelta) -> x509.Cer
         .issuer_name(issuer)
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCK_SLACK)
-        .not_valid_after(now + life)
+        .not_valid_after(now + lifetime)
     )
 
 
@@ -270,12 +272,12 @@ def _encode_key(key: ec.EllipticCurvePrivateKey) -> bytes:
     )
 
 
-def _write(path: Path, content: bytes, mode: int) -> None:
+def _write_file_with_mode(path: Path, content: bytes, mode: int) -> None:
     """Replace a file atomically; a private key is readable for its owner only."""
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    temporary_path = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(temporary_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     with os.fdopen(descriptor, "wb") as file:
         os.fchmod(descriptor, mode)
         file.write(content)
         os.fsync(descriptor)
-    beside.replace(path)
+    temporary_path.replace(path)

@@ -22,24 +22,24 @@ from snakesim_hal.base.terminal import PrintLine, discard_line, print_json, prin
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.private_keys import check_permissions
 from snakesim_hal.network.probe import open_probe
-from snakesim_hal.network.process_entries import HOST, find_differences
+from snakesim_hal.network.process_entries import HOST, describe_differences
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Process, Status
-from snakesim_hal.wire.roles import RECORDER, TABLE, Role
-from snakesim_operator.features.lab.certificates import RENEW_AT, read_certificate
-from snakesim_operator.features.lab.drive_buses import SIMULATOR, is_to_be_real
-from snakesim_operator.features.lab.identities import Identity, identities
+from snakesim_hal.wire.roles import ACCESS_RULES, RECORDER, Role
+from snakesim_operator.features.lab.certificates import RENEWAL_FRACTION, read_certificate
+from snakesim_operator.features.lab.drive_buses import SIMULATOR_BACKEND, has_real_drives
+from snakesim_operator.features.lab.identities import Identity, iterate_identities
 from snakesim_operator.features.lab.lab_file import Lab
 from snakesim_operator.features.lab.lab_robot import LabRobot
-from snakesim_operator.features.lab.zenoh_files import session_settings, tls_files
+from snakesim_operator.features.lab.zenoh_files import make_session_settings, make_tls_paths
 
-CONNECT_MS = 2000
+CONNECT_TIMEOUT_MS = 2000
 LISTEN_S = 1.0
-CLOCK_LIMIT_S = 0.5  # by which a clock may differ; Zenoh's routers restamp what is further in the future
-ASKABLE = (keys.LEASE, keys.LIFECYCLE)  # an empty query there has no effect
-WRITERS = {  # the process that publishes at a key all the time
+MAX_CLOCK_OFFSET_S = 0.5  # by which a clock may differ; Zenoh's routers restamp what is further in the future
+QUERIED_KEYS = (keys.LEASE, keys.LIFECYCLE)  # an empty query there has no effect
+WRITER_BY_KEY = {  # the process that publishes at a key all the time
     keys.CLOCK: HOST,
     keys.WORLD: "guidance",
     keys.TRAJECTORY: "navigation",
@@ -48,27 +48,27 @@ WRITERS = {  # the process that publishes at a key all the time
 
 
 @dataclass
-class Findings:
-    """Prints the results of the checks, and keeps them."""
+class CheckResults:
+    """Prints the results of the checks, keeps them, and counts the failures."""
 
     print_text: PrintLine
     wrong: int = 0
     results: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
-    def passed(self, text: str) -> None:
+    def report_passed(self, text: str) -> None:
         """Print a result that is as it should be."""
         self.results.append({"passed": True, "text": text})
         self.print_text(f"  {text}")
 
-    def failed(self, text: str) -> None:
+    def report_failed(self, text: str) -> None:
         """Print a result that is wrong, and count it."""
         self.wrong += 1
         self.results.append({"passed": False, "text": text})
         self.print_text(f"! {text}")
 
 
-def check(lab: Lab, folder: Path, print_text: PrintLine = print_line, *, as_json: bool = False) -> int:
-    """Check certificates, routers, robots and roles of a lab.
+def check_running_lab(lab: Lab, folder: Path, print_text: PrintLine = print_line, *, as_json: bool = False) -> int:
+    """Check certificates, routers, robots and roles of a running lab, and print the results.
 
     Args:
         lab: The lab.
@@ -80,138 +80,141 @@ def check(lab: Lab, folder: Path, print_text: PrintLine = print_line, *, as_json
         The exit code: 0 if all matches the lab file, 1 otherwise.
     """
     if as_json:
-        findings = Findings(discard_line)
-        exit_code = _check_all(lab, folder, findings)
-        print_json({"ok": exit_code == 0, "results": findings.results}, print_text)
+        results = CheckResults(discard_line)
+        exit_code = _run_all_checks(lab, folder, results)
+        print_json({"ok": exit_code == 0, "results": results.results}, print_text)
         return exit_code
-    return _check_all(lab, folder, Findings(print_text))
+    return _run_all_checks(lab, folder, CheckResults(print_text))
 
 
-def _check_all(lab: Lab, folder: Path, findings: Findings) -> int:
+def _run_all_checks(lab: Lab, folder: Path, results: CheckResults) -> int:
     """Check certificates, then routers, then robots and roles, which are reached through the routers.
 
     Args:
         lab: The lab.
         folder: The output folder of `lab certs`.
-        findings: Collects and prints the result of each check.
+        results: Collects and prints the result of each check.
 
     Returns:
         The exit code: 0 if all matches the lab file, 1 otherwise.
     """
-    print_text = findings.print_text
+    print_text = results.print_text
     print_text("certificates")
-    for identity in identities(lab):
-        _check_certificate(identity, folder, findings)
+    for identity in iterate_identities(lab):
+        _check_certificate(identity, folder, results)
     print_text("routers")
-    reachable_routers = [name for name in lab.file.routers if _check_router(name, lab, folder, findings)]
+    reachable_routers = [name for name in lab.file.routers if _check_router(name, lab, folder, results)]
     if not reachable_routers:
-        findings.results.append({"passed": False, "text": "no router can be reached"})
+        results.results.append({"passed": False, "text": "no router can be reached"})
         print_text("no router can be reached, and so neither robots nor roles can be looked at")
         return 1
     for robot in lab.file.robots:
         print_text(f"robot {robot}")
-        _check_robot(robot, lab, folder, findings)
+        _check_robot(robot, lab, folder, results)
     print_text("roles: what each may request")
-    for identity in identities(lab):
+    for identity in iterate_identities(lab):
         if identity.role is not None:
-            _check_role(identity, identity.role, lab, folder, findings)
-    if findings.wrong:
-        print_text(f"{findings.wrong} marked with ! need a look")
+            _check_role_permissions(identity, identity.role, lab, folder, results)
+    if results.wrong:
+        print_text(f"{results.wrong} marked with ! need a look")
         return 1
     print_text("all is as it should be")
     return 0
 
 
-def _check_certificate(identity: Identity, folder: Path, findings: Findings) -> None:
+def _check_certificate(identity: Identity, folder: Path, results: CheckResults) -> None:
     """Check that the certificate of an identity is there and valid, and that only its owner can read its key."""
-    path = _certificate_path(identity, folder)
+    path = _get_certificate_path(identity, folder)
     try:
         certificate = read_certificate(path)
     except ConfigError as error:
-        findings.failed(f"{identity.common_name}: {error}")
+        results.report_failed(f"{identity.common_name}: {error}")
         return
-    _check_expiry(identity.common_name, certificate, "run `snakesim lab certs` and install it", findings)
+    _check_expiry(identity.common_name, certificate, "run `snakesim lab certs` and install it", results)
     warning = check_permissions(path.with_suffix(".key"))
     if warning:
-        findings.failed(f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`")
+        results.report_failed(f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`")
 
 
-def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, findings: Findings) -> None:
-    """Check that a certificate is valid for more than the part of its life at which it is renewed."""
+def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, results: CheckResults) -> None:
+    """Check that a certificate is not due for renewal, and report when it ends."""
     end = certificate.not_valid_after_utc
-    life = end - certificate.not_valid_before_utc
-    left = end - datetime.now(UTC)
-    text = f"{name}: ends {end:%Y-%m-%d %H:%M} UTC, in {left.total_seconds() / 86400:.1f} days"
-    if left > life * RENEW_AT:
-        findings.passed(text)
+    lifetime = end - certificate.not_valid_before_utc
+    remaining = end - datetime.now(UTC)
+    text = f"{name}: ends {end:%Y-%m-%d %H:%M} UTC, in {remaining.total_seconds() / 86400:.1f} days"
+    if remaining > lifetime * RENEWAL_FRACTION:
+        results.report_passed(text)
     else:
-        findings.failed(f"{text}; {remedy}")
+        results.report_failed(f"{text}; {remedy}")
 
 
-def _check_router(name: str, lab: Lab, folder: Path, findings: Findings) -> bool:
+def _check_router(name: str, lab: Lab, folder: Path, results: CheckResults) -> bool:
     """Check that a router accepts a client of the lab, shows its newest certificate, and refuses other clients.
 
     Args:
         name: Name of the router in the lab file.
         lab: The lab.
         folder: The output folder of `lab certs`.
-        findings: Collects the results.
+        results: Collects and prints the results.
 
     Returns:
         Whether the router's port can be reached.
     """
-    endpoint = lab.endpoint(name)
+    endpoint = lab.make_endpoint(name)
     router = Identity(lab.file.routers[name].machine, None, name)
     try:
-        _plain_connection(endpoint).close()
+        _connect_without_tls(endpoint).close()
     except OSError as error:
-        findings.failed(
+        results.report_failed(
             f"{name}: nothing answers on {endpoint}: {error}; start it on {router.machine}, or open the port"
         )
         return False
-    clients = [identity for identity in identities(lab) if identity.role is not None]
+    clients = [identity for identity in iterate_identities(lab) if identity.role is not None]
     if not clients:
         return True
     client = clients[0]
-    settings = _probe_settings(client, lab, folder, [endpoint])
+    settings = _make_probe_settings(client, lab, folder, [endpoint])
     try:
         with open_probe(json.dumps(settings)) as probe:
-            round_trip_ms = 1e3 * probe.round_trip_s()
-            findings.passed(f"{name}: {endpoint}, round trip {round_trip_ms:.2f} ms")
+            round_trip_ms = 1e3 * probe.measure_round_trip_s()
+            results.report_passed(f"{name}: {endpoint}, round trip {round_trip_ms:.2f} ms")
     except NotConnectedError as error:
-        findings.failed(f"{name}: {endpoint} lets {client.common_name} not in: {error}")
+        results.report_failed(f"{name}: {endpoint} lets {client.common_name} not in: {error}")
         return True
-    presented = _read_shown_certificate(endpoint, settings["transport"]["link"]["tls"])
-    stored = read_certificate(_certificate_path(router, folder))
+    # A router that was not restarted presents the certificate that it had at its start.
+    presented = _read_presented_certificate(endpoint, settings["transport"]["link"]["tls"])
+    stored = read_certificate(_get_certificate_path(router, folder))
     if presented.serial_number != stored.serial_number:
-        _check_expiry(f"{name} shows an earlier certificate", presented, f"restart it on {router.machine}", findings)
-    _check_refuses_unknown_clients(name, settings, findings)
+        _check_expiry(f"{name} shows an earlier certificate", presented, f"restart it on {router.machine}", results)
+    _check_refuses_unknown_clients(name, settings, results)
     return True
 
 
-def _check_refuses_unknown_clients(name: str, settings: dict[str, Any], findings: Findings) -> None:
-    """Check that a router refuses a client without a certificate. settings: those of a client with one."""
+def _check_refuses_unknown_clients(name: str, settings: dict[str, Any], results: CheckResults) -> None:
+    """Check that a router refuses clients without a certificate. `settings` are those of a client with one."""
     tls = settings["transport"]["link"]["tls"]
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
     try:
         with open_probe(json.dumps(settings)):
-            findings.failed(f"{name}: accepts clients without a certificate; it does not run with the rendered file")
+            results.report_failed(
+                f"{name}: accepts clients without a certificate; it does not run with the rendered file"
+            )
     except NotConnectedError:
-        findings.passed(f"{name}: refuses clients without a certificate")
+        results.report_passed(f"{name}: refuses clients without a certificate")
 
 
-def _plain_connection(endpoint: str) -> socket.socket:
+def _connect_without_tls(endpoint: str) -> socket.socket:
     """Connect to a router without TLS. Raises OSError."""
     host, _, port = endpoint.removeprefix("tls/").rpartition(":")
-    return socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_MS / 1000)
+    return socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_MS / 1000)
 
 
-def _read_shown_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Certificate:
-    """Return the certificate that a router shows to its clients. tls: the files of a client."""
+def _read_presented_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Certificate:
+    """Return the certificate that a router presents to its clients. `tls` are the certificate files of a client."""
     host = endpoint.removeprefix("tls/").rpartition(":")[0].strip("[]")
     context = ssl.create_default_context(cafile=tls["root_ca_certificate"])
     context.load_cert_chain(tls["connect_certificate"], tls["connect_private_key"])
-    with _plain_connection(endpoint) as plain, context.wrap_socket(plain, server_hostname=host) as wrapped:
+    with _connect_without_tls(endpoint) as plain, context.wrap_socket(plain, server_hostname=host) as wrapped:
         return x509.load_der_x509_certificate(wrapped.getpeercert(binary_form=True) or b"")
 
 
@@ -226,51 +229,52 @@ class _RobotState:
     clock_offsets_s: dict[str, float]  # by key: how far the publisher's clock is ahead of this computer's
 
 
-def _check_robot(robot: str, lab: Lab, folder: Path, findings: Findings) -> None:
+def _check_robot(robot: str, lab: Lab, folder: Path, results: CheckResults) -> None:
     """Check the processes of a robot: where they run, their versions and settings, and their clocks.
 
     Args:
         robot: Name of the robot in the lab file.
         lab: The lab.
         folder: The output folder of `lab certs`, with the certificate that the check connects with.
-        findings: Collects the results.
+        results: Collects and prints the results.
     """
-    involved = [identity for identity in identities(lab) if robot in identity.robots(lab)]
+    involved_identities = [identity for identity in iterate_identities(lab) if robot in identity.list_robots(lab)]
     roles = list(Role)
-    watcher = max(involved, key=lambda identity: roles.index(identity.role or Role.ROBOT))
+    # Roles are listed from the one with the fewest permissions on; the last one may read the most.
+    observer = max(involved_identities, key=lambda identity: roles.index(identity.role or Role.ROBOT))
     try:
-        state = _observe_robot(watcher, robot, lab, folder)
+        state = _observe_robot(observer, robot, lab, folder)
     except NotConnectedError as error:
-        findings.failed(f"cannot be looked at as {watcher.common_name}: {error}")
+        results.report_failed(f"cannot be looked at as {observer.common_name}: {error}")
         return
     if state.status is not None:
-        findings.passed(f"{state.status.lifecycle} - {state.status.reason}")
-        check_what_moves(lab.file.robots[robot], state.description, findings)
+        results.report_passed(f"{state.status.lifecycle} - {state.status.reason}")
+        check_emulation(lab.file.robots[robot], state.description, results)
     host = next((process for process in state.processes if process.name == HOST), None)
-    for name, machine in _expected_processes(robot, lab, involved).items():
+    for name, machine in _find_expected_processes(robot, lab, involved_identities).items():
         running = [process for process in state.processes if process.name == name]
         if not running or name not in state.live_services:
-            findings.failed(f"{name}: not running; it belongs on {machine}")
+            results.report_failed(f"{name}: not running; it belongs on {machine}")
         for process in running:
-            _check_process(process, host, state.clock_offsets_s, findings)
+            _check_process(process, host, state.clock_offsets_s, results)
 
 
 def _observe_robot(watcher: Identity, robot: str, lab: Lab, folder: Path) -> _RobotState:
     """Connect as one identity and collect what a robot publishes. Raises NotConnectedError."""
     with _open_session(watcher, robot, lab, folder) as session:
-        status = session.latest(keys.STATUS, Status, LISTEN_S)
-        description = session.latest(keys.DESCRIPTION, Description, LISTEN_S) if status is not None else None
-        live_keys = session.present(keys.PROCESS_ALL)
-        reader = session.latched_reader(keys.PROCESS_ALL, Process)
-        settings = {**_probe_settings(watcher, lab, folder), "namespace": robot}
+        status = session.wait_for_latched(keys.STATUS, Status, LISTEN_S)
+        description = session.wait_for_latched(keys.DESCRIPTION, Description, LISTEN_S) if status is not None else None
+        live_keys = session.list_tokens(keys.PROCESS_ALL)
+        reader = session.declare_latched_reader(keys.PROCESS_ALL, Process)
+        settings = {**_make_probe_settings(watcher, lab, folder), "namespace": robot}
         with open_probe(json.dumps(settings)) as probe:
-            clock_offsets_s = probe.clock_offsets_s(list(WRITERS), LISTEN_S)
+            clock_offsets_s = probe.measure_clock_offsets_s(list(WRITER_BY_KEY), LISTEN_S)
         processes = reader.drain()
     live_services = frozenset(keys.parse_service(key).rpartition("-")[0] for key in live_keys)
     return _RobotState(status, description, live_services, processes, clock_offsets_s)
 
 
-def _expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> dict[str, str]:
+def _find_expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> dict[str, str]:
     """Return the machine of each process that the lab file gives a robot."""
     expected = {HOST: lab.file.robots[robot].machine}
     for identity in involved:
@@ -281,82 +285,88 @@ def _expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> dict[
     return expected
 
 
-def check_what_moves(robot: LabRobot, description: Description | None, findings: Findings) -> None:
+def check_emulation(robot: LabRobot, description: Description | None, results: CheckResults) -> None:
     """Check that a robot is emulated if, and only if, the lab file names no bus for it.
 
     Args:
         robot: The robot's entry in the lab file.
-        description: What its host publishes; None if it publishes none.
-        findings: The findings, which are extended.
+        description: Description that the host of the robot publishes; None if there is none.
+        results: Collects and prints the results.
     """
-    words = describe_what_moves(description)
+    statement = describe_what_moves(description)
     if description is None:
-        findings.failed(words)
-    elif is_to_be_real(robot) and description.emulated:
-        findings.failed(f"{words}, but the lab file names its bus; render again, install, and restart the host")
-    elif (robot.backend == SIMULATOR or robot.emulated) and not description.emulated:
-        findings.failed(f"{words}, but by the lab file nothing real is to move; see which host runs")
+        results.report_failed(statement)
+    elif has_real_drives(robot) and description.emulated:
+        results.report_failed(
+            f"{statement}, but the lab file names its bus; render again, install, and restart the host"
+        )
+    elif (robot.backend == SIMULATOR_BACKEND or robot.emulated) and not description.emulated:
+        results.report_failed(f"{statement}, but by the lab file nothing real is to move; see which host runs")
     else:
-        findings.passed(words)
+        results.report_passed(statement)
 
 
 def _check_process(
-    process: Process, host: Process | None, clock_offsets_s: dict[str, float], findings: Findings
+    process: Process, host: Process | None, clock_offsets_s: dict[str, float], results: CheckResults
 ) -> None:
     """Check version and settings of a process against those of the host, and its clock against this computer's.
 
     Args:
         process: The process.
         host: The host of the robot; None if it does not run.
-        clock_offsets_s: How far clocks are ahead of this computer's, by the key of the messages that show it.
-        findings: Collects the results.
+        clock_offsets_s: Offsets of clocks ahead of this computer, by the key of the messages that show them.
+        results: Collects and prints the results.
     """
-    findings.passed(f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}")
+    results.report_passed(f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}")
     if host is not None:
         if process.version != host.version:
-            findings.failed(f"{process.name}: snakesim {process.version}, but the host has {host.version}")
-        for difference in find_differences(process, host):
-            findings.failed(f"{process.name}: {difference}")
-    for key, writer in WRITERS.items():
-        if writer != process.name or key not in clock_offsets_s:
+            results.report_failed(f"{process.name}: snakesim {process.version}, but the host has {host.version}")
+        for difference in describe_differences(process, host):
+            results.report_failed(f"{process.name}: {difference}")
+    for key, process_name in WRITER_BY_KEY.items():
+        if process_name != process.name or key not in clock_offsets_s:
             continue
         offset_s = clock_offsets_s[key]
         text = f"{process.name}: clock {offset_s:+.3f} s against this computer's"
-        if abs(offset_s) < CLOCK_LIMIT_S:
-            findings.passed(text)
+        if abs(offset_s) < MAX_CLOCK_OFFSET_S:
+            results.report_passed(text)
         else:
-            findings.failed(text)
+            results.report_failed(text)
 
 
-def _check_role(identity: Identity, role: Role, lab: Lab, folder: Path, findings: Findings) -> None:
+def _check_role_permissions(identity: Identity, role: Role, lab: Lab, folder: Path, results: CheckResults) -> None:
     """Check that an identity can connect, and that the routers forward exactly those queries that its role allows.
 
     Args:
         identity: The identity to connect as.
-        role: Its role.
+        role: Role of the identity.
         lab: The lab.
         folder: The output folder of `lab certs`, with the identity's certificate.
-        findings: Collects the results.
+        results: Collects and prints the results.
     """
-    settings = json.dumps(_probe_settings(identity, lab, folder))
+    settings = json.dumps(_make_probe_settings(identity, lab, folder))
     try:
         with open_probe(settings) as probe:
-            round_trip_ms = 1e3 * probe.round_trip_s()
+            round_trip_ms = 1e3 * probe.measure_round_trip_s()
             for robot in lab.file.robots:
-                is_involved = robot in identity.robots(lab)
-                for line in TABLE:
-                    if line.key not in ASKABLE:
+                may_use_robot = robot in identity.list_robots(lab)
+                for access_rule in ACCESS_RULES:
+                    if access_rule.key not in QUERIED_KEYS:
                         continue
-                    may_ask = is_involved and "ask" in line.acts(role)
-                    has_answer = probe.answers(f"{robot}/{line.key}")
-                    query = f"{identity.common_name}: {robot}/{line.key}"
-                    if has_answer and not may_ask:
-                        findings.failed(f"{query} answers, though the role may not ask; the router has other rules")
-                    elif may_ask and not has_answer:
-                        findings.failed(f"{query} does not answer, though the role may ask; no host, or other rules")
-            findings.passed(f"{identity.common_name}: round trip {round_trip_ms:.2f} ms")
+                    may_query = may_use_robot and "ask" in access_rule.list_actions(role)
+                    response_count = probe.count_answers(f"{robot}/{access_rule.key}")
+                    query_name = f"{identity.common_name}: {robot}/{access_rule.key}"
+                    if response_count and not may_query:
+                        results.report_failed(
+                            f"{query_name} answers, though the role may not ask; the router has other rules"
+                        )
+                    elif may_query and not response_count:
+                        results.report_failed(
+                            f"{query_name} does not answer, though the role may ask; no host, or other rules"
+                        )
+            results.report_passed(f"{identity.common_name}: round trip {round_trip_ms:.2f} ms")
     except NotConnectedError as error:
-        findings.failed(f"{identity.common_name}: not let in: {error}")
+        results.report_failed(f"{identity.common_name}: not let in: {error}")
 
 
 @contextmanager
@@ -364,28 +374,34 @@ def _open_session(identity: Identity, robot: str, lab: Lab, folder: Path) -> Ite
     """Open a session to a robot as one identity. Raises NotConnectedError."""
     with TemporaryDirectory() as scratch:
         path = Path(scratch) / "session.json5"
-        path.write_text(json.dumps(_probe_settings(identity, lab, folder)), encoding="utf-8")
+        path.write_text(json.dumps(_make_probe_settings(identity, lab, folder)), encoding="utf-8")
         link = Link.from_session_file(read_session(path), robot)
-        with open_session(link, CONNECT_MS / 1000) as session:
+        with open_session(link, CONNECT_TIMEOUT_MS / 1000) as session:
             yield session
 
 
-def _probe_settings(identity: Identity, lab: Lab, folder: Path, endpoints: list[str] | None = None) -> dict[str, Any]:
+def _make_probe_settings(
+    identity: Identity, lab: Lab, folder: Path, endpoints: list[str] | None = None
+) -> dict[str, Any]:
     """Return Zenoh's settings for a session as one identity, with whole keys and the certificate in `folder`.
 
-    endpoints: routers to connect to; None takes all of the lab.
+    Args:
+        identity: The identity to connect as.
+        lab: The lab.
+        folder: The output folder of `lab certs`.
+        endpoints: Endpoints of the routers to connect to; None for all routers of the lab.
     """
-    settings = session_settings(identity, lab)
+    settings = make_session_settings(identity, lab)
     settings.pop("namespace", None)
-    settings["connect"]["timeout_ms"] = CONNECT_MS
-    settings["connect"]["endpoints"] = endpoints or lab.endpoints()
-    settings["transport"]["link"]["tls"] |= tls_files(identity, str(_tls_folder(identity, folder)), "connect")
+    settings["connect"]["timeout_ms"] = CONNECT_TIMEOUT_MS
+    settings["connect"]["endpoints"] = endpoints or lab.list_endpoints()
+    settings["transport"]["link"]["tls"] |= make_tls_paths(identity, str(_get_tls_folder(identity, folder)), "connect")
     return settings
 
 
-def _tls_folder(identity: Identity, folder: Path) -> Path:
+def _get_tls_folder(identity: Identity, folder: Path) -> Path:
     return folder.absolute() / identity.machine / "tls"
 
 
-def _certificate_path(identity: Identity, folder: Path) -> Path:
-    return _tls_folder(identity, folder) / f"{identity.label}.pem"
+def _get_certificate_path(identity: Identity, folder: Path) -> Path:
+    return _get_tls_folder(identity, folder) / f"{identity.label}.pem"

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.features.lab.lab_file import ALL, Lab
+from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, Lab
 
 ROUTER = "router"
 
@@ -15,29 +15,29 @@ class Identity:
 
     machine: str
     role: Role | None  # None: a router
-    of: str  # the robot, `all`, or the name of the router
+    subject: str  # the robot, `all`, or the name of the router
     services: tuple[str, ...] = ()  # of a gnc
 
     @property
     def label(self) -> str:
         """The name on its machine and of its files: `gnc.planar13`, `router.main`."""
-        return f"{self.role or ROUTER}.{self.of}"
+        return f"{self.role or ROUTER}.{self.subject}"
 
     @property
     def common_name(self) -> str:
         """The name in the certificate, in the access rules and in the routers' logs: `gnc.planar13.ws1`."""
         return f"{self.label}.{self.machine}"
 
-    def robots(self, lab: Lab) -> list[str]:
+    def list_robots(self, lab: Lab) -> list[str]:
         """Return the robots whose keys the identity may use; none for a router."""
-        if self.of == ALL:
+        if self.subject == ALL_ROBOTS:
             return list(lab.file.robots)
         if self.role is None:
             return []
-        return [self.of]
+        return [self.subject]
 
 
-def identities(lab: Lab) -> Iterator[Identity]:
+def iterate_identities(lab: Lab) -> Iterator[Identity]:
     """Yield all identities of a lab: routers, robots, then the roles in the file's order."""
     for name, router in lab.file.routers.items():
         yield Identity(router.machine, None, name)

@@ -9,14 +9,14 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.files import FileStruct, Table, decode, read_table
+from snakesim_hal.model.files import ConfigTable, FileStruct, decode_table, read_table
 from snakesim_hal.wire.quantities import from_zero
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.features.lab.drive_buses import check_buses
+from snakesim_operator.features.lab.drive_buses import validate_robot_buses
 from snakesim_operator.features.lab.lab_robot import LabRobot, Name
 
-EXAMPLE = Path(__file__).parent / "example.toml"
-ALL = "all"
+EXAMPLE_PATH = Path(__file__).parent / "example.toml"
+ALL_ROBOTS = "all"
 GNC_SERVICES = ("guidance", "navigation", "control")
 
 Address = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9.:-]{0,252}$")]
@@ -102,11 +102,11 @@ class Lab:
     file: LabFile
     path: Path
 
-    def endpoints(self) -> list[str]:
+    def list_endpoints(self) -> list[str]:
         """Return the endpoints of the routers, in the file's order."""
-        return [self.endpoint(name) for name in self.file.routers]
+        return [self.make_endpoint(name) for name in self.file.routers]
 
-    def endpoint(self, router: str) -> str:
+    def make_endpoint(self, router: str) -> str:
         """Return the endpoint of a router: `tls/ADDRESS:PORT`."""
         entry = self.file.routers[router]
         address = self.file.machines[entry.machine].address or ""
@@ -116,13 +116,13 @@ class Lab:
 def load_lab(path: Path) -> Lab:
     """Read and check a lab file. Raises ConfigError that names field, value and what is allowed."""
     table = read_table(path)
-    file = decode(table, LabFile)
-    _check(file, table)
-    check_buses(file.robots, table.source)
+    file = decode_table(table, LabFile)
+    _validate_references(file, table)
+    validate_robot_buses(file.robots, table.source)
     return Lab(file, path)
 
 
-def _check(file: LabFile, table: Table) -> None:
+def _validate_references(file: LabFile, table: ConfigTable) -> None:
     """Check that the entries of a lab file refer to existing machines, and do not contradict each other.
 
     Args:
@@ -138,24 +138,24 @@ def _check(file: LabFile, table: Table) -> None:
             code="lab/invalid-file",
         )
     for name, router in file.routers.items():
-        _known(table, f"routers.{name}.machine", router.machine, file.machines)
+        _require_known_name(table, f"routers.{name}.machine", router.machine, file.machines)
         if file.machines[router.machine].address is None:
             raise ConfigError(
                 f"{table.source}: `machines.{router.machine}.address` is missing; the router `{name}` listens there",
                 code="lab/invalid-file",
             )
-    _check_ports_differ(file, table)
+    _validate_unique_ports(file, table)
     for name, robot in file.robots.items():
-        if name == ALL:
+        if name == ALL_ROBOTS:
             raise ConfigError(
-                f"{table.source}: `robots.{ALL}`: this name stands for every robot; choose another",
+                f"{table.source}: `robots.{ALL_ROBOTS}`: this name stands for every robot; choose another",
                 code="lab/invalid-file",
             )
-        _known(table, f"robots.{name}.machine", robot.machine, file.machines)
-    _check_roles(file, table)
+        _require_known_name(table, f"robots.{name}.machine", robot.machine, file.machines)
+    _validate_roles(file, table)
 
 
-def _check_ports_differ(file: LabFile, table: Table) -> None:
+def _validate_unique_ports(file: LabFile, table: ConfigTable) -> None:
     """Raise ConfigError if two routers listen at the same port of a machine."""
     ports = [(router.machine, router.port) for router in file.routers.values()]
     for name, router in file.routers.items():
@@ -166,7 +166,7 @@ def _check_ports_differ(file: LabFile, table: Table) -> None:
             )
 
 
-def _check_roles(file: LabFile, table: Table) -> None:
+def _validate_roles(file: LabFile, table: ConfigTable) -> None:
     """Check the entries of `[[roles]]`, each of which grants a role on a robot to a machine.
 
     Args:
@@ -177,30 +177,35 @@ def _check_roles(file: LabFile, table: Table) -> None:
         ConfigError: An entry refers to something that does not exist, is repeated, or is not allowed.
     """
     earlier_grants: set[tuple[str, str, str]] = set()  # (machine, role, robot)
-    for i, grant in enumerate(file.roles):
-        place = f"roles.{i}"
-        _known(table, f"{place}.machine", grant.machine, file.machines)
-        _known(table, f"{place}.robot", grant.robot, [*file.robots, ALL])
-        if grant.role == Role.GNC and grant.robot == ALL:
+    for index, grant in enumerate(file.roles):
+        entry_key = f"roles.{index}"
+        _require_known_name(table, f"{entry_key}.machine", grant.machine, file.machines)
+        _require_known_name(table, f"{entry_key}.robot", grant.robot, [*file.robots, ALL_ROBOTS])
+        if grant.role == Role.GNC and grant.robot == ALL_ROBOTS:
             raise ConfigError(
-                f"{table.source}: `{place}.robot` = 'all': a gnc commands one robot; name it", code="lab/invalid-file"
+                f"{table.source}: `{entry_key}.robot` = 'all': a gnc commands one robot; name it",
+                code="lab/invalid-file",
             )
         machine_role_robot = (grant.machine, grant.role, grant.robot)
         if machine_role_robot in earlier_grants:
             raise ConfigError(
-                f"{table.source}: `{place}` grants {' '.join(machine_role_robot)} a second time; leave one out",
+                f"{table.source}: `{entry_key}` grants {' '.join(machine_role_robot)} a second time; leave one out",
                 code="lab/invalid-file",
             )
         earlier_grants.add(machine_role_robot)
         if "hal" in grant.services:
             raise ConfigError(
-                f"{table.source}: `{place}.services` = 'hal': only the robot itself is that", code="lab/invalid-file"
+                f"{table.source}: `{entry_key}.services` = 'hal': only the robot itself is that",
+                code="lab/invalid-file",
             )
 
 
-def _known(table: Table, field: str, name: str, among: Sequence[str] | dict[str, Machine]) -> None:
-    if name not in among:
+def _require_known_name(
+    table: ConfigTable, field: str, name: str, known_names: Sequence[str] | dict[str, Machine]
+) -> None:
+    if name not in known_names:
         raise ConfigError(
-            f"{table.origin_of(field)}: `{field}` = {shorten(name)!r} is not in this file; it has {', '.join(among)}",
+            f"{table.find_origin(field)}: `{field}` = {shorten(name)!r} is not in this file; it has "
+            f"{', '.join(known_names)}",
             code="lab/invalid-file",
         )

@@ -4,12 +4,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.features.lab.drive_buses import can_interfaces, devices, host_settings, uses_bus
-from snakesim_operator.features.lab.identities import Identity, identities
+from snakesim_operator.features.lab.drive_buses import (
+    is_on_bus,
+    list_can_interfaces,
+    list_device_files,
+    make_host_settings,
+)
+from snakesim_operator.features.lab.identities import Identity, iterate_identities
 from snakesim_operator.features.lab.lab_file import Lab
 from snakesim_operator.features.lab.lab_robot import LabRobot
 
-STATE = "/var/lib/snakesim"
+STATE_FOLDER = "/var/lib/snakesim"
 
 
 @dataclass(frozen=True)
@@ -17,17 +22,17 @@ class Program:
     """A program that a machine starts by itself. Operators, viewers and administrators start theirs by hand."""
 
     identity: Identity
-    about: str
+    description: str
     arguments: tuple[str, ...]  # of the `snakesim` command
     service: str = ""  # of a gnc
-    of_robot: str = ""  # of a recorder
+    recorded_robot: str = ""  # of a recorder
     interfaces: tuple[str, ...] = ()  # of the kernel's CAN, that must be up before it
     devices: tuple[str, ...] = ()  # device files that it opens
 
     @property
     def name(self) -> str:
         """The name of its unit and its container."""
-        label = f"{self.kind}.{self.of_robot}" if self.of_robot else self.identity.label
+        label = f"{self.kind}.{self.recorded_robot}" if self.recorded_robot else self.identity.label
         if self.service:
             return f"snakesim-{label}-{self.service}"
         return f"snakesim-{label}"
@@ -38,7 +43,7 @@ class Program:
         return self.identity.label.partition(".")[0]
 
 
-def programs(lab: Lab, machine: str) -> Iterator[Program]:
+def iterate_programs(lab: Lab, machine: str) -> Iterator[Program]:
     """Yield all programs that a machine of the lab runs all the time.
 
     Args:
@@ -46,47 +51,47 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
         machine: Name of the machine in the lab file.
     """
     folder = lab.file.machines[machine].folder
-    for identity in identities(lab):
+    for identity in iterate_identities(lab):
         if identity.machine != machine:
             continue
         session_file = f"{folder}/{identity.label}.json5"
         match identity.role:
             case None:
-                yield Program(identity, f"Zenoh router {identity.of}", ("start", "router", session_file))
+                yield Program(identity, f"Zenoh router {identity.subject}", ("start", "router", session_file))
             case Role.ROBOT:
-                yield _host_program(identity, lab, session_file)
+                yield _make_host_program(identity, lab, session_file)
             case Role.GNC:
-                scenario = _scenario(lab.file.robots[identity.of])
+                scenario = _make_scenario_options(lab.file.robots[identity.subject])
                 for service in identity.services:
                     arguments = ("start", "service", service, *scenario, "--session", session_file)
-                    yield Program(identity, f"{service} of {identity.of}", arguments, service)
+                    yield Program(identity, f"{service} of {identity.subject}", arguments, service)
             case Role.RECORDER:
-                for robot_name in identity.robots(lab):
+                for robot_name in identity.list_robots(lab):
                     # Without `--out`, the recording gets a name with the time.
                     arguments = ("record", "--session", session_file, "--namespace", robot_name)
-                    yield Program(identity, f"recorder of {robot_name}", arguments, of_robot=robot_name)
+                    yield Program(identity, f"recorder of {robot_name}", arguments, recorded_robot=robot_name)
             case _:
                 pass  # operators, viewers and administrators start their programs by hand
 
 
-def _host_program(identity: Identity, lab: Lab, session_file: str) -> Program:
+def _make_host_program(identity: Identity, lab: Lab, session_file: str) -> Program:
     """Return the program that runs the HAL host of a robot."""
-    robot = lab.file.robots[identity.of]
-    out = f"{STATE}/{identity.of}"
+    robot = lab.file.robots[identity.subject]
+    out = f"{STATE_FOLDER}/{identity.subject}"
     return Program(
         identity,
-        f"HAL host of {identity.of}",
-        ("start", "host", *_scenario(robot), "--session", session_file, "--out", out),
-        interfaces=tuple(interface.name for interface in can_interfaces(robot)),
-        devices=tuple(devices(robot)),
+        f"HAL host of {identity.subject}",
+        ("start", "host", *_make_scenario_options(robot), "--session", session_file, "--out", out),
+        interfaces=tuple(interface.name for interface in list_can_interfaces(robot)),
+        devices=tuple(list_device_files(robot)),
     )
 
 
-def _scenario(robot: LabRobot) -> tuple[str, ...]:
+def _make_scenario_options(robot: LabRobot) -> tuple[str, ...]:
     """Return the options for the scenario. Host and services get the same, because they compare them."""
     words = [robot.scenario, "--backend", robot.backend]
-    if uses_bus(robot):
+    if is_on_bus(robot):
         words += ["--clock-mode", "realtime"]  # the only one of drives on a bus, whatever mode the scenario has
-    for setting in (*host_settings(robot), *robot.set):
+    for setting in (*make_host_settings(robot), *robot.set):
         words += ["--set", setting]
     return tuple(words)

@@ -6,48 +6,55 @@ from pathlib import Path
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_text, write_text
-from snakesim_operator.features.lab.identities import identities
+from snakesim_operator.features.lab.identities import iterate_identities
 from snakesim_operator.features.lab.lab_file import Lab
-from snakesim_operator.features.lab.units import unit_files
-from snakesim_operator.features.lab.zenoh_files import router_settings, session_settings
+from snakesim_operator.features.lab.units import render_unit_files
+from snakesim_operator.features.lab.zenoh_files import make_router_settings, make_session_settings
 
-WRITTEN = "rendered.txt"  # names of the files that were written, so that the next time leaves none of an earlier lab
+WRITTEN_FILES_LIST = (
+    "rendered.txt"  # names of the files that were written, so that the next time leaves none of an earlier lab
+)
 
 
-def render(lab: Lab, folder: Path) -> list[Path]:
+def write_lab_files(lab: Lab, folder: Path) -> list[Path]:
     """Write the files of all machines; return their paths. Files of an earlier lab are removed."""
-    files = dict(rendered(lab))
+    files = dict(render_files(lab))
     written: list[Path] = []
     for machine in lab.file.machines:
-        own = {name: text for (at, name), text in files.items() if at == machine}
-        place = folder / machine
-        for old in _written_before(place):
-            if old not in own:
-                (place / old).unlink(missing_ok=True)
-        for name, text in {**own, WRITTEN: "".join(f"{name}\n" for name in sorted(own))}.items():
-            write_text(place / name, text)
-            written.append(place / name)
+        machine_files = {name: text for (file_machine, name), text in files.items() if file_machine == machine}
+        machine_folder = folder / machine
+        for old_name in _read_written_files(machine_folder):
+            if old_name not in machine_files:
+                (machine_folder / old_name).unlink(missing_ok=True)
+        for name, text in {
+            **machine_files,
+            WRITTEN_FILES_LIST: "".join(f"{name}\n" for name in sorted(machine_files)),
+        }.items():
+            write_text(machine_folder / name, text)
+            written.append(machine_folder / name)
     return written
 
 
-def _written_before(place: Path) -> list[str]:
+def _read_written_files(folder: Path) -> list[str]:
     try:
-        names = read_text(place / WRITTEN).splitlines()
+        names = read_text(folder / WRITTEN_FILES_LIST).splitlines()
     except ConfigError:
         return []
     return [name for name in names if not name.startswith("/") and ".." not in name]
 
 
-def rendered(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
+def render_files(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
     """Yield every file as ((machine, path in the machine's folder), text)."""
-    for identity in identities(lab):
-        settings = router_settings(identity, lab) if identity.role is None else session_settings(identity, lab)
-        text = f"// {_origin(lab, identity.common_name)}\n{json.dumps(settings, indent=2)}\n"  # JSON is JSON5
+    for identity in iterate_identities(lab):
+        settings = (
+            make_router_settings(identity, lab) if identity.role is None else make_session_settings(identity, lab)
+        )
+        text = f"// {_describe_origin(lab, identity.common_name)}\n{json.dumps(settings, indent=2)}\n"  # JSON is JSON5
         yield (identity.machine, f"{identity.label}.json5"), text
     for machine in lab.file.machines:
-        for name, text in unit_files(lab, machine, _origin(lab, machine)):
+        for name, text in render_unit_files(lab, machine, _describe_origin(lab, machine)):
             yield (machine, name), text
 
 
-def _origin(lab: Lab, what: str) -> str:
+def _describe_origin(lab: Lab, what: str) -> str:
     return f"{what}, of {lab.file.name}: made from {lab.path.name} by `snakesim lab render`; change it there."

@@ -8,16 +8,16 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from snakesim_hal.base.process import SERVICE_PRIORITY
-from snakesim_operator.features.lab.drive_buses import can_interfaces
+from snakesim_operator.features.lab.drive_buses import list_can_interfaces
 from snakesim_operator.features.lab.lab_file import Lab
-from snakesim_operator.features.lab.programs import STATE, Program, programs
+from snakesim_operator.features.lab.programs import STATE_FOLDER, Program, iterate_programs
 
 CONTAINER_USER = "10001:10001"
 NEEDS_QUOTES = re.compile(r"[\s';]")
 
 
-def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
-    """Yield the service files of a machine: systemd units, and a Compose file with the same programs.
+def render_unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
+    """Render the service files of a machine: systemd units, and a Compose file with the same programs.
 
     Args:
         lab: The lab.
@@ -35,38 +35,40 @@ def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]
         keep_trailing_newline=True,
         autoescape=False,
     )
-    variables = {
+    template_variables = {
         "machine": lab.file.machines[machine],
         "origin": origin,
-        "state": STATE,
+        "state": STATE_FOLDER,
         "uid": CONTAINER_USER,
         "priority": SERVICE_PRIORITY,
     }
-    machine_programs = list(programs(lab, machine))
+    machine_programs = list(iterate_programs(lab, machine))
     unit_template = templates.get_template("unit.j2")
     for program in machine_programs:
-        command = _command_line(lab, program)
-        text = unit_template.render(**variables, program=program, command=command, addresses=_addresses(lab))
+        command = _format_command_line(lab, program)
+        text = unit_template.render(
+            **template_variables, program=program, command=command, addresses=_list_router_addresses(lab)
+        )
         yield f"systemd/{program.name}.service", text
     can_template = templates.get_template("can.j2")
     for robot in lab.file.robots.values():
         if robot.machine != machine:
             continue
-        for interface in can_interfaces(robot):
-            text = can_template.render(**variables, interface=interface)
+        for interface in list_can_interfaces(robot):
+            text = can_template.render(**template_variables, interface=interface)
             yield f"systemd/snakesim-{interface.name}.service", text
     if machine_programs:
         commands = [(program, ["snakesim", *program.arguments]) for program in machine_programs]
-        yield "compose.yaml", templates.get_template("compose.j2").render(**variables, programs=commands)
+        yield "compose.yaml", templates.get_template("compose.j2").render(**template_variables, programs=commands)
 
 
-def _command_line(lab: Lab, program: Program) -> str:
+def _format_command_line(lab: Lab, program: Program) -> str:
     """Return the command as systemd splits it. The file's types allow no double quotes, `%`, `$` or backslashes."""
     words = (lab.file.machines[program.identity.machine].program, *program.arguments)
     return " ".join(f'"{word}"' if NEEDS_QUOTES.search(word) else word for word in words)
 
 
-def _addresses(lab: Lab) -> list[str]:
+def _list_router_addresses(lab: Lab) -> list[str]:
     """Return the addresses of the routers, or none if one of them is a name."""
     addresses = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
     try:

@@ -3,16 +3,16 @@
 from typing import Any
 
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_operator.features.lab.access import ENVELOPE_BYTES, access_control, size_limits
+from snakesim_operator.features.lab.access import MAX_ENVELOPE_BYTES, make_access_control, make_size_limits
 from snakesim_operator.features.lab.identities import Identity
-from snakesim_operator.features.lab.lab_file import ALL, Lab
+from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, Lab
 
-ALONE = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
-STAMPED = {"enabled": {"router": True, "peer": True, "client": True}}
-LEASE_MS = 2000  # after which a silent link is closed
+NO_SCOUTING = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+TIMESTAMPS = {"enabled": {"router": True, "peer": True, "client": True}}
+LINK_LEASE_MS = 2000  # after which a silent link is closed
 
 
-def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
+def make_router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
     """Return the Zenoh configuration of a router, with certificates, access rules and limits of message sizes.
 
     The router listens with TLS on its machine's address, requires a certificate of every client, and enforces the
@@ -23,63 +23,63 @@ def router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
         lab: The lab.
     """
     names = list(lab.file.routers)
-    earlier_routers = names[: names.index(identity.of)]
+    earlier_routers = names[: names.index(identity.subject)]
     folder = f"{lab.file.machines[identity.machine].folder}/tls"
-    listen_files = tls_files(identity, folder, "listen")
-    connect_files = tls_files(identity, folder, "connect")
+    listen_files = make_tls_paths(identity, folder, "listen")
+    connect_files = make_tls_paths(identity, folder, "connect")
     tls = {**listen_files, **connect_files, "enable_mtls": True}
     return {
         "mode": "router",
-        "listen": {"endpoints": [lab.endpoint(identity.of)], "exit_on_failure": True},
+        "listen": {"endpoints": [lab.make_endpoint(identity.subject)], "exit_on_failure": True},
         "connect": {
-            "endpoints": [lab.endpoint(name) for name in earlier_routers],
+            "endpoints": [lab.make_endpoint(name) for name in earlier_routers],
             "timeout_ms": -1,  # tries without end
             "exit_on_failure": False,
         },
-        "scouting": ALONE,
-        "timestamping": STAMPED,
+        "scouting": NO_SCOUTING,
+        "timestamping": TIMESTAMPS,
         "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
         "transport": {
             "unicast": {"accept_timeout": 2000, "accept_pending": 200, "max_sessions": 500},
-            "link": _link(tls),
+            "link": _make_link_settings(tls),
             "shared_memory": {"enabled": False},
         },
-        "access_control": access_control(lab),
-        "low_pass_filter": size_limits(),
+        "access_control": make_access_control(lab),
+        "low_pass_filter": make_size_limits(),
     }
 
 
-def session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
+def make_session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
     """Return the settings of a session of one role: a client of the routers that does not listen."""
     folder = f"{lab.file.machines[identity.machine].folder}/tls"
     settings: dict[str, Any] = {
         "mode": "client",
-        "connect": {"endpoints": lab.endpoints(), "timeout_ms": 5000, "exit_on_failure": True},
+        "connect": {"endpoints": lab.list_endpoints(), "timeout_ms": 5000, "exit_on_failure": True},
         "listen": {"endpoints": []},
-        "scouting": ALONE,
-        "timestamping": STAMPED,
+        "scouting": NO_SCOUTING,
+        "timestamping": TIMESTAMPS,
         "transport": {
-            "link": _link({**tls_files(identity, folder, "connect"), "enable_mtls": True}),
+            "link": _make_link_settings({**make_tls_paths(identity, folder, "connect"), "enable_mtls": True}),
             "shared_memory": {"enabled": False},
         },
     }
-    if identity.of != ALL:
-        settings["namespace"] = identity.of
+    if identity.subject != ALL_ROBOTS:
+        settings["namespace"] = identity.subject
     return settings
 
 
-def _link(tls: dict[str, Any]) -> dict[str, Any]:
+def _make_link_settings(tls: dict[str, Any]) -> dict[str, Any]:
     # `close_link_on_expiration`: an expired certificate ends its session too.
     return {
         "protocols": ["tls"],
-        "tx": {"lease": LEASE_MS, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}},
-        "rx": {"max_message_size": MAX_IMAGE_BYTES + ENVELOPE_BYTES},
+        "tx": {"lease": LINK_LEASE_MS, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}},
+        "rx": {"max_message_size": MAX_IMAGE_BYTES + MAX_ENVELOPE_BYTES},
         "tls": {**tls, "verify_name_on_connect": True, "close_link_on_expiration": True},
     }
 
 
-def tls_files(identity: Identity, folder: str, side: str) -> dict[str, Any]:
-    """Return the paths of the authority and of an identity's certificate and key. side: `listen` or `connect`."""
+def make_tls_paths(identity: Identity, folder: str, side: str) -> dict[str, Any]:
+    """Return the paths of an identity's certificate files for Zenoh. `side` is `listen` or `connect`."""
     return {
         "root_ca_certificate": f"{folder}/authority.pem",
         f"{side}_certificate": f"{folder}/{identity.label}.pem",

@@ -7,7 +7,7 @@ from snakesim_hal.programs.arguments import add_json, add_out
 from snakesim_hal.programs.commands import Command, Commands
 
 
-def _add_import(parser: argparse.ArgumentParser) -> None:
+def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim robot import`, which converts a URDF into a robot file."""
     parser.add_argument("file", type=Path, metavar="FILE.urdf", help="the URDF")
     add_out(parser, "robot file to write (default: NAME.toml)")
@@ -34,12 +34,12 @@ def _add_import(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def _add_export(parser: argparse.ArgumentParser) -> None:
+def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
     add_out(parser, "URDF to write (default: NAME.urdf)")
 
 
-def _import(arguments: argparse.Namespace) -> int:
+def _run_import(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.robots.command import import_robot
     from snakesim_operator.features.robots.imported import ImportOptions
 
@@ -47,7 +47,7 @@ def _import(arguments: argparse.Namespace) -> int:
     return import_robot(arguments.file, order, arguments.out, as_json=arguments.json)
 
 
-def _export(arguments: argparse.Namespace) -> int:
+def _run_export(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.robots.command import export_robot
 
     return export_robot(arguments.robot, arguments.out)
@@ -57,15 +57,15 @@ COMMANDS: Commands = (
     Command(
         name="robot import",
         help="Make a robot file from a URDF. Reports what cannot be carried over.",
-        add=_add_import,
-        run=_import,
+        add=_add_import_arguments,
+        run=_run_import,
         examples=("robot import snake.urdf", "robot import snake.urdf --out snake.toml --scale 0.001 --json"),
     ),
     Command(
         name="robot export",
         help="Make a URDF from any robot file.",
-        add=_add_export,
-        run=_export,
+        add=_add_export_arguments,
+        run=_run_export,
         examples=("robot export planar13", "robot export ./snake.toml --out snake.urdf"),
     ),
 )

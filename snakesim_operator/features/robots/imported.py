@@ -4,11 +4,18 @@ import re
 from dataclasses import dataclass, field
 
 from snakesim_hal.base.errors import shorten
-from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.files import ConfigTable, decode_table
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.xml_tree import Element
 
-UPS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+VECTOR_BY_UP_AXIS = {
+    "x": (1, 0, 0),
+    "y": (0, 1, 0),
+    "z": (0, 0, 1),
+    "-x": (-1, 0, 0),
+    "-y": (0, -1, 0),
+    "-z": (0, 0, -1),
+}
 
 
 @dataclass(frozen=True)
@@ -21,7 +28,7 @@ class ImportOptions:
     like: str = "planar13"  # the robot file with what URDF has no words for
 
 
-class Notes:
+class ReportNotes:
     """Sentences of a report. The same sentence stands once, with all the places in the file that it holds for."""
 
     def __init__(self) -> None:
@@ -32,7 +39,7 @@ class Notes:
         known = self._places.setdefault(sentence, [])
         known.extend(place for place in places if place not in known)
 
-    def lines(self) -> list[str]:
+    def format_lines(self) -> list[str]:
         """Return every sentence with its places, in the order in which they were added."""
         lines: list[str] = []
         for sentence, places in self._places.items():
@@ -54,33 +61,33 @@ class ImportResult:
     The functions of an import get this object, and add their values and their lines of the report to it.
     """
 
-    table: Table  # the values of the robot file
+    table: ConfigTable  # the values of the robot file
     names: list[str] = field(default_factory=list[str])  # ours, and those of the URDF
-    negated: list[bool] = field(default_factory=list[bool])  # for each joint: our angle is minus the URDF's
-    changes: Notes = field(default_factory=Notes)  # values of the file that became others
-    assumptions: Notes = field(default_factory=Notes)  # values that the file does not give
-    doubts: Notes = field(default_factory=Notes)  # values that are allowed, and unusual for a snake robot
-    omissions: Notes = field(default_factory=Notes)  # what is in the file and not in the robot file
+    is_negated: list[bool] = field(default_factory=list[bool])  # for each joint: our angle is minus the URDF's
+    changes: ReportNotes = field(default_factory=ReportNotes)  # values of the file that became others
+    assumptions: ReportNotes = field(default_factory=ReportNotes)  # values that the file does not give
+    doubts: ReportNotes = field(default_factory=ReportNotes)  # values that are allowed, and unusual for a snake robot
+    omissions: ReportNotes = field(default_factory=ReportNotes)  # what is in the file and not in the robot file
 
     @property
     def changed(self) -> list[str]:
         """Values of the file that became others, as lines."""
-        return self.changes.lines()
+        return self.changes.format_lines()
 
     @property
     def assumed(self) -> list[str]:
         """Values that the file does not give, as lines."""
-        return self.assumptions.lines()
+        return self.assumptions.format_lines()
 
     @property
     def doubtful(self) -> list[str]:
         """Values that a person should check, as lines."""
-        return self.doubts.lines()
+        return self.doubts.format_lines()
 
     @property
     def left_out(self) -> list[str]:
         """What is in the file and not in the robot file, as lines."""
-        return self.omissions.lines()
+        return self.omissions.format_lines()
 
     @property
     def report(self) -> dict[str, list[str]]:
@@ -100,9 +107,9 @@ class ImportResult:
         Raises:
             ConfigError: A value is not allowed in a robot file.
         """
-        return decode(self.table, RobotFile)
+        return decode_table(self.table, RobotFile)
 
-    def plain_name(self, name: str, default: str, element: Element) -> str:
+    def make_plain_name(self, name: str, default: str, element: Element) -> str:
         """Return a name as a robot file may have it. A change is reported.
 
         Args:

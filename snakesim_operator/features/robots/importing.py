@@ -16,29 +16,29 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.files import Table, leaves, list_shipped, read_part
+from snakesim_hal.model.files import ConfigTable, iterate_leaves, list_shipped_names, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_bytes
-from snakesim_operator.features.robots.body import put_body
-from snakesim_operator.features.robots.exporting import GEOMETRY, LOOK
+from snakesim_operator.features.robots.body import convert_body
+from snakesim_operator.features.robots.exporting import GEOMETRY_SECTIONS, MATERIAL_ELEMENT
 from snakesim_operator.features.robots.imported import ImportOptions, ImportResult
-from snakesim_operator.features.robots.joint_limits import put_limits
+from snakesim_operator.features.robots.joint_limits import convert_joint_limits
 from snakesim_operator.features.robots.unused_parts import report_unused
-from snakesim_operator.features.robots.urdf_sensors import gazebo_lines, put_sensors
+from snakesim_operator.features.robots.urdf_sensors import convert_sensors, format_gazebo_elements
 from snakesim_operator.features.robots.urdf_tree import read_body_chain
 from snakesim_operator.features.robots.xml_tree import Element, parse_xml
 
-SECTIONS = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
-OF_ANOTHER_ROBOT = ("links", "joints", "checked")  # of `--like`: they do not describe this one
-FROM_URDF = ("name", "about", "chain", "module")
+SECTION_ORDER = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
+UNSHARED_SECTIONS = ("links", "joints", "checked")  # of `--like`: they do not describe this one
+SECTIONS_FROM_URDF = ("name", "about", "chain", "module")
 
 
-def import_urdf(file: Path, order: ImportOptions) -> ImportResult:
-    """Read a URDF as the values of a robot file.
+def import_urdf(file: Path, options: ImportOptions) -> ImportResult:
+    """Import a URDF as the values of a robot file.
 
     Args:
         file: Path of the URDF.
-        order: How to read it.
+        options: Options of the import: tail, axis that points up, unit of length, and the similar robot.
 
     Returns:
         The values, and a report on what was changed, assumed and left out.
@@ -46,69 +46,69 @@ def import_urdf(file: Path, order: ImportOptions) -> ImportResult:
     Raises:
         ConfigError: The file is not well formed, is no snake, or has numbers that no robot file may have.
     """
-    if not 1e-6 <= order.scale <= 1e3:
+    if not 1e-6 <= options.scale <= 1e3:
         raise ConfigError(
-            f"--scale {order.scale:g}: give meters per unit of length of the file, such as 0.001 for mm",
+            f"--scale {options.scale:g}: give meters per unit of length of the file, such as 0.001 for mm",
             code="urdf/invalid",
         )
     urdf = parse_xml(read_bytes(file), str(file))
     if urdf.tag != "robot":
-        raise urdf.error("is no URDF; its outermost element is <robot>")
+        raise urdf.make_error("is no URDF; its outermost element is <robot>")
     urdf.read = True
-    is_exported = urdf.first("snakesim") is not None  # SnakeSIM exported it, with the values that URDF cannot hold
-    initial_values = _exported_values(urdf) if is_exported else _values_of_other(urdf, order)
-    imported = ImportResult(initial_values)
+    is_exported = urdf.find_child("snakesim") is not None  # SnakeSIM exported it, with the values that URDF cannot hold
+    initial_values = _read_exported_values(urdf) if is_exported else _read_values_of_similar_robot(urdf, options)
+    result = ImportResult(initial_values)
 
     # Each step changes the values that are known so far, and reports what it changed.
-    chain = read_body_chain(imported, urdf, file, tail=order.tail)
-    frames = put_body(imported, chain, order, urdf)
-    _put_name(imported, urdf, file)
-    put_limits(imported, chain.joints, str(file), is_exported=is_exported)
+    chain = read_body_chain(result, urdf, file, tail=options.tail)
+    link_frames = convert_body(result, chain, options, urdf)
+    _set_robot_name(result, urdf, file)
+    convert_joint_limits(result, chain.joints, str(file), is_exported=is_exported)
     if not is_exported:
-        put_sensors(imported, urdf, chain, frames, order.scale)
-        _report_values_of_other(imported, order)
-    _sort_sections(imported.table)
-    robot = imported.robot  # raises for numbers that no robot file may hold
+        convert_sensors(result, urdf, chain, link_frames, options.scale)
+        _report_values_of_similar_robot(result, options)
+    _sort_sections(result.table)
+    robot = result.robot  # raises for numbers that no robot file may hold
 
     # Report what the URDF does not contain, and what it contains and was not read.
     if is_exported:
-        _mark_exported(urdf, robot)
+        _mark_exported_as_read(urdf, robot)
     for absence in urdf.absences:
-        imported.assumptions.add(absence.sentence, f"line {absence.element.line}")
-    report_unused(imported.omissions, urdf)
-    _report_shipped_name(imported)
-    return imported
+        result.assumptions.add(absence.sentence, f"line {absence.element.line}")
+    report_unused(result.omissions, urdf)
+    _report_shipped_name(result)
+    return result
 
 
-def _sort_sections(table: Table) -> None:
+def _sort_sections(table: ConfigTable) -> None:
     """Put the sections into the order of a robot file; unknown ones come last."""
-    names = sorted(table.values, key=lambda name: SECTIONS.get(name, len(SECTIONS)))
+    names = sorted(table.values, key=lambda name: SECTION_ORDER.get(name, len(SECTION_ORDER)))
     table.values = {name: table.values[name] for name in names}
 
 
-def _put_name(imported: ImportResult, urdf: Element, file: Path) -> None:
+def _set_robot_name(result: ImportResult, urdf: Element, file: Path) -> None:
     """Put the name of the robot; without one, that of the file."""
-    name = urdf.optional("name")
+    name = urdf.read_optional_attribute("name")
     if name is None:
-        imported.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
+        result.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
         name = file.stem
-    imported.table.set_value("name", imported.plain_name(name, "robot", urdf), str(file))
+    result.table.set_value("name", result.make_plain_name(name, "robot", urdf), str(file))
 
 
-def _report_shipped_name(imported: ImportResult) -> None:
+def _report_shipped_name(result: ImportResult) -> None:
     """Report a name that a shipped robot has too."""
-    name = imported.table.values["name"]
-    if name in list_shipped("robots"):
-        imported.omissions.add(
+    name = result.table.values["name"]
+    if name in list_shipped_names("robots"):
+        result.omissions.add(
             f"a name of its own: it is {name}, as a shipped robot is; change it, because the network and a latched "
             f"stop tell robots apart by it"
         )
 
 
-def _values_of_other(urdf: Element, order: ImportOptions) -> Table:
+def _read_values_of_similar_robot(urdf: Element, options: ImportOptions) -> ConfigTable:
     """Return the values of the robot file `--like`, without those that describe that robot only."""
-    table = read_part(order.like, "robots")
-    for section in OF_ANOTHER_ROBOT:
+    table = read_table_with_base(options.like, "robots")
+    for section in UNSHARED_SECTIONS:
         table.values.pop(section, None)
     for mounted in ("depth", "range"):  # their places fit another body
         table.values.get("sensors", {}).pop(mounted, None)
@@ -116,60 +116,67 @@ def _values_of_other(urdf: Element, order: ImportOptions) -> Table:
     return table
 
 
-def _exported_values(urdf: Element) -> Table:
+def _read_exported_values(urdf: Element) -> ConfigTable:
     """Return the values in <snakesim> elements, as an export has written them. Raises ConfigError."""
-    table = Table({}, urdf.source)
+    table = ConfigTable({}, urdf.source)
     read_keys: set[str] = set()
-    for element in urdf.all("snakesim"):
-        key = element.get("key")
-        if key.partition(".")[0] in GEOMETRY:
-            raise element.error(f"has `key` = {shorten(key)!r}, which links and joints contain; remove this element")
+    for element in urdf.find_children("snakesim"):
+        key = element.read_attribute("key")
+        if key.partition(".")[0] in GEOMETRY_SECTIONS:
+            raise element.make_error(
+                f"has `key` = {shorten(key)!r}, which links and joints contain; remove this element"
+            )
         if key in read_keys:
-            raise element.error(f"has `key` = {shorten(key)!r}, as another one has; remove one of them")
+            raise element.make_error(f"has `key` = {shorten(key)!r}, as another one has; remove one of them")
         read_keys.add(key)
         try:
-            table.set_value(key, json.loads(element.get("value")), urdf.source)
+            table.set_value(key, json.loads(element.read_attribute("value")), urdf.source)
         except ValueError as error:
-            raise element.error(f"has a `value` that is not JSON: {shorten(str(error))}") from None
+            raise element.make_error(f"has a `value` that is not JSON: {shorten(str(error))}") from None
     return table
 
 
-def _report_values_of_other(imported: ImportResult, order: ImportOptions) -> None:
-    """Report every value that was taken from the robot of `--like`."""
-    for section, values in imported.table.values.items():
-        if section in FROM_URDF:
+def _report_values_of_similar_robot(result: ImportResult, options: ImportOptions) -> None:
+    """Report every value that was taken from the robot file that the user named with `--like`.
+
+    Args:
+        result: Result of the import, whose report is extended.
+        options: Options of the import, with the name of the other robot.
+    """
+    for section, values in result.table.values.items():
+        if section in SECTIONS_FROM_URDF:
             continue
         taken_values: list[str] = []
-        for key, value in leaves(values, section):
-            is_from_urdf = imported.table.origin_of(key) == imported.table.origin_of("name")
+        for key, value in iterate_leaves(values, section):
+            is_from_urdf = result.table.find_origin(key) == result.table.find_origin("name")
             if not is_from_urdf and value not in ({}, []):
                 taken_values.append(f"{key.removeprefix(f'{section}.')} = {value}")
         if taken_values:
-            imported.assumptions.add(f"[{section}] as of robot {order.like!r}: {', '.join(taken_values)}")
+            result.assumptions.add(f"[{section}] as of robot {options.like!r}: {', '.join(taken_values)}")
     absent = [
-        section for section in SECTIONS if section not in imported.table.values and section not in OF_ANOTHER_ROBOT
+        section for section in SECTION_ORDER if section not in result.table.values and section not in UNSHARED_SECTIONS
     ]
     if absent:
-        imported.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")
+        result.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")
 
 
-def _mark_exported(urdf: Element, robot: RobotFile) -> None:
+def _mark_exported_as_read(urdf: Element, robot: RobotFile) -> None:
     """Mark as read what `snakesim robot export` derives from the same values, so that only edits are reported."""
-    text = "".join(["<robot>", LOOK, *gazebo_lines(robot), "</robot>"])
+    text = "".join(["<robot>", MATERIAL_ELEMENT, *format_gazebo_elements(robot), "</robot>"])
     exported = parse_xml(text.encode(), urdf.source)
     for child in urdf.children:
-        if any(child.equals(other) for other in exported.children):
-            child.read_all()
+        if any(child.is_equal_to(other) for other in exported.children):
+            child.mark_all_as_read()
     exported_material = exported.children[0]
     for link in urdf.children:
         if link.tag != "link":
             continue
         for visual_or_collision in link.children:
-            _mark_material(visual_or_collision, exported_material)
+            _mark_material_as_read(visual_or_collision, exported_material)
 
 
-def _mark_material(parent: Element, exported: Element) -> None:
+def _mark_material_as_read(parent: Element, exported: Element) -> None:
     """Mark a reference to the exported material as read."""
     for child in parent.children:
         if child.tag == "material" and child.attributes == exported.attributes and not child.children:
-            child.read_all()
+            child.mark_all_as_read()

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.model.files import decode
+from snakesim_hal.model.files import decode_table
 from snakesim_hal.model.joints import MAX_TURN_RAD
 from snakesim_hal.model.joints import Joint as BuiltJoint
 from snakesim_hal.model.robot import RobotFile
@@ -38,7 +38,7 @@ class JointNumber:
         return self.section == "limits"
 
 
-NUMBERS = (
+JOINT_NUMBERS = (
     JointNumber("limit", "velocity", "limits", "speed_rad_s", "rad/s", 100.0, 20.0, "degrees per second"),
     JointNumber("limit", "effort", "limits", "torque_nm", "N·m", 1000.0, 50.0, "N·mm"),
     JointNumber("dynamics", "damping", "motor", "viscous_nm_s_per_rad", "N·m·s/rad", 100.0, 5.0, "N·mm·s/rad"),
@@ -54,13 +54,13 @@ class AngleRange:
     upper_rad: float
 
 
-def put_limits(imported: ImportResult, joints: list[UrdfJoint], source: str, *, is_exported: bool) -> None:
-    """Put the angle limits, motor limits and friction of the joints into the values of a robot file.
+def convert_joint_limits(result: ImportResult, joints: list[UrdfJoint], source: str, *, is_exported: bool) -> None:
+    """Convert the angle limits, motor limits and friction of a URDF's joints into values of a robot file.
 
     A number that most joints share goes into the section for all joints; the others become exceptions.
 
     Args:
-        imported: The import, whose values and report are extended.
+        result: Result of the import, whose values and report are extended.
         joints: The joints of the URDF, tail to head.
         source: Path of the URDF, for error messages.
         is_exported: Whether SnakeSIM exported this URDF. The values so far are then those of the same robot, and only
@@ -69,27 +69,31 @@ def put_limits(imported: ImportResult, joints: list[UrdfJoint], source: str, *, 
     Raises:
         ConfigError: A number is out of its range.
     """
-    ranges = [_read_range(imported, joint, negated) for joint, negated in zip(joints, imported.negated, strict=True)]
+    ranges = [
+        _read_angle_range(result, joint, negated) for joint, negated in zip(joints, result.is_negated, strict=True)
+    ]
     if not is_exported:
-        _put_common_range(imported, ranges, source)
-    joints_so_far = decode(imported.table, RobotFile).joint_table
+        _set_common_range(result, ranges, source)
+    joints_so_far = decode_table(result.table, RobotFile).joint_table
     columns: dict[str, list[float]] = {}  # by the key of the robot file, one value for each joint
-    for number in NUMBERS:
-        columns[number.key] = _complete_column(imported, number, joints, joints_so_far, is_exported=is_exported)
+    for joint_number in JOINT_NUMBERS:
+        columns[joint_number.key] = _read_number_of_all_joints(
+            result, joint_number, joints, joints_so_far, is_exported=is_exported
+        )
     if not is_exported:
-        for number in NUMBERS:
-            [(most_common, _)] = Counter(columns[number.key]).most_common(1)
-            imported.table.set_value(f"{number.section}.{number.key}", most_common, source)
-    _put_exceptions(imported, joints, ranges, columns, source)
+        for joint_number in JOINT_NUMBERS:
+            [(most_common, _)] = Counter(columns[joint_number.key]).most_common(1)
+            result.table.set_value(f"{joint_number.section}.{joint_number.key}", most_common, source)
+    _set_joint_exceptions(result, joints, ranges, columns, source)
 
 
-def _read_range(imported: ImportResult, joint: UrdfJoint, negated: bool) -> AngleRange:
-    """Return the range of a joint, which is cut to half a revolution to either side.
+def _read_angle_range(result: ImportResult, joint: UrdfJoint, is_negated: bool) -> AngleRange:
+    """Read the angle range of a joint, cut to half a revolution to either side of zero.
 
     Args:
-        imported: The import, whose report is extended.
+        result: Result of the import, whose report is extended.
         joint: The joint of the URDF.
-        negated: Whether the robot file's angle is minus the URDF's.
+        is_negated: Whether the robot file's angle is minus the URDF's.
 
     Returns:
         The range in rad, with the sign of the robot file.
@@ -99,43 +103,43 @@ def _read_range(imported: ImportResult, joint: UrdfJoint, negated: bool) -> Angl
     """
     element = joint.element
     if element.attributes["type"] == "continuous":
-        imported.changes.add(
+        result.changes.add(
             f"continuous joints turn by {MAX_TURN_RAD} rad to either side here; where there are no end stops, give "
             f"`cable_turns`",
-            joint.place(),
+            joint.format_place(),
         )
         return AngleRange(-MAX_TURN_RAD, MAX_TURN_RAD)
-    limit = element.first("limit")
+    limit = element.find_child("limit")
     if limit is None:
-        raise element.error("is revolute and has no <limit>; add lower and upper, in rad")
-    lower_rad = _read_limit_rad(imported, joint, limit, "lower")
-    upper_rad = _read_limit_rad(imported, joint, limit, "upper")
+        raise element.make_error("is revolute and has no <limit>; add lower and upper, in rad")
+    lower_rad = _read_limit_rad(result, joint, limit, "lower")
+    upper_rad = _read_limit_rad(result, joint, limit, "upper")
     if not lower_rad < 0 < upper_rad:
-        raise limit.error(
+        raise limit.make_error(
             f"of joint {joint.name!r} is {lower_rad:g} to {upper_rad:g} rad; a joint must be able to turn to either "
             f"side of zero: `lower` below 0, `upper` above 0"
         )
-    if negated:
+    if is_negated:
         return AngleRange(-upper_rad, -lower_rad)
     return AngleRange(lower_rad, upper_rad)
 
 
-def _read_limit_rad(imported: ImportResult, joint: UrdfJoint, limit: Element, attribute: str) -> float:
-    """Return one end of a joint's range in rad, cut to half a revolution.
+def _read_limit_rad(result: ImportResult, joint: UrdfJoint, limit: Element, attribute: str) -> float:
+    """Read one end of a joint's angle range in rad, cut to half a revolution.
 
     Args:
-        imported: The import, whose report gets a line if the value is cut.
+        result: Result of the import, whose report gets a line if the value is cut.
         joint: The joint of the URDF.
-        limit: Its <limit> element.
+        limit: The <limit> element of the joint.
         attribute: "lower" or "upper".
 
     Raises:
         ConfigError: The value is so large that it is probably in degrees.
     """
-    limit_rad = limit.number(attribute, "0")
+    limit_rad = limit.read_number(attribute, "0")
     if abs(limit_rad) > MAX_LIMIT_RAD:
         if_degrees_rad = math.radians(limit_rad)
-        raise limit.error(
+        raise limit.make_error(
             f"of joint {joint.name!r} has `{attribute}` = {limit_rad:g} rad; a joint turns by {MAX_LIMIT_RAD} rad at "
             f"most. URDF has radians: if this is in degrees, write {if_degrees_rad:.5g}. A joint without end stops has "
             f'type="continuous"'
@@ -143,27 +147,27 @@ def _read_limit_rad(imported: ImportResult, joint: UrdfJoint, limit: Element, at
     if abs(limit_rad) <= MAX_TURN_RAD:
         return limit_rad
     cut_rad = MAX_TURN_RAD if limit_rad > 0 else -MAX_TURN_RAD
-    imported.changes.add(
+    result.changes.add(
         f"`{attribute}` = {limit_rad:g} rad became {cut_rad:g} rad, half a turn, which is the most that a robot file "
         f"has; if these are degrees, write radians",
-        joint.place("limit"),
+        joint.format_place("limit"),
     )
     return cut_rad
 
 
-def _complete_column(
-    imported: ImportResult,
-    number: JointNumber,
+def _read_number_of_all_joints(
+    result: ImportResult,
+    joint_number: JointNumber,
     joints: Sequence[UrdfJoint],
     joints_so_far: Sequence[BuiltJoint],
     *,
     is_exported: bool,
 ) -> list[float]:
-    """Return one number of every joint, tail to head. If the URDF has no value, one is assumed and reported.
+    """Read one number of every joint, tail to head. If the URDF has no value, one is assumed and reported.
 
     Args:
-        imported: The import, whose report is extended.
-        number: Which number, such as the torque limit.
+        result: Result of the import, whose report is extended.
+        joint_number: Kind of the number, such as the torque limit.
         joints: The joints of the URDF.
         joints_so_far: The joints by the values so far: of the same robot if `is_exported`, otherwise of the robot
             that the user named with `--like`.
@@ -172,27 +176,30 @@ def _complete_column(
     Raises:
         ConfigError: A limit is 0, which means that the joint has no motor, while other joints have one.
     """
-    values = [_read_number(imported, number, joint) for joint in joints]
+    values = [_read_number(result, joint_number, joint) for joint in joints]
     positive_values = [value for value in values if value]
-    column: list[float] = []
+    numbers: list[float] = []
     for joint, value, joint_so_far in zip(joints, values, joints_so_far, strict=True):
-        is_usable = value is not None and (value > 0 or not number.is_limit)
+        is_usable = value is not None and (value > 0 or not joint_number.is_limit)
         if value is not None and is_usable:
-            column.append(value)
+            numbers.append(value)
             continue
         if value is not None and positive_values:
-            raise _motorless_error(number, joint, max(positive_values))
-        assumed, origin = _assume(number, joint_so_far, positive_values, is_exported=is_exported)
+            raise _make_motorless_error(joint_number, joint, max(positive_values))
+        assumed, origin = _assume_number(joint_number, joint_so_far, positive_values, is_exported=is_exported)
         value_text = "no value" if value is None else f"{value:g}"
-        imported.assumptions.add(
-            f"<{number.tag} {number.attribute}> has {value_text}: {assumed:g} {number.unit}, {origin}",
-            joint.place(number.tag),
+        result.assumptions.add(
+            f"<{joint_number.tag} {joint_number.attribute}> has {value_text}: {assumed:g} {joint_number.unit}, "
+            f"{origin}",
+            joint.format_place(joint_number.tag),
         )
-        column.append(assumed)
-    return column
+        numbers.append(assumed)
+    return numbers
 
 
-def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, is_exported: bool) -> tuple[float, str]:
+def _assume_number(
+    number: JointNumber, built: BuiltJoint, known: Sequence[float], *, is_exported: bool
+) -> tuple[float, str]:
     """Return the value for a joint for which the file gives none, and the origin of this value."""
     section = built.limits if number.is_limit else built.motor
     default = getattr(section, number.key)
@@ -205,88 +212,100 @@ def _assume(number: JointNumber, built: BuiltJoint, known: Sequence[float], *, i
     return default, "from the robot of --like, because no joint has a value"
 
 
-def _motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exception:
-    limit = joint.element.first("limit") or joint.element
-    return limit.error(
+def _make_motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exception:
+    limit = joint.element.find_child("limit") or joint.element
+    return limit.make_error(
         f"of joint {joint.name!r} has `{number.attribute}` = 0 {number.unit}, and other joints have up to {other:g}: a "
         f"joint without a motor. A robot file has a motor in every joint; give a value above 0 and at most "
         f'{number.maximum:g} {number.unit}, or make the joint type="fixed"'
     )
 
 
-def _read_number(imported: ImportResult, number: JointNumber, joint: UrdfJoint) -> float | None:
-    """Return a number of a joint, such as its torque limit, or None if the file gives none.
+def _read_number(result: ImportResult, joint_number: JointNumber, joint: UrdfJoint) -> float | None:
+    """Read a number of a joint, such as its torque limit, and report a doubt if it is unusually large.
 
     Args:
-        imported: The import, whose report gets a doubt about a number that is unusually large.
-        number: Which number, with its element, unit and range.
+        result: Result of the import, whose report gets a doubt about a number that is unusually large.
+        joint_number: Kind of the number, with its element, unit and range.
         joint: The joint of the URDF.
+
+    Returns:
+        The number; None if the file does not give it.
 
     Raises:
         ConfigError: The number is out of its range.
     """
-    element = joint.element.first(number.tag)
-    if element is None or number.attribute not in element.attributes:
+    element = joint.element.find_child(joint_number.tag)
+    if element is None or joint_number.attribute not in element.attributes:
         return None
-    value = element.number(number.attribute)
-    if not 0 <= value <= number.maximum:
-        bound = "above 0" if number.is_limit else "0 or more"
-        raise element.error(
-            f"of joint {joint.name!r} has `{number.attribute}` = {value:g} {number.unit}; expected {bound} and at most "
-            f"{number.maximum:g} {number.unit}. Is it in {number.other_unit}, or does it stand for no limit?"
+    value = element.read_number(joint_number.attribute)
+    unit = joint_number.unit
+    other_unit = joint_number.other_unit
+    if not 0 <= value <= joint_number.maximum:
+        bound = "above 0" if joint_number.is_limit else "0 or more"
+        raise element.make_error(
+            f"of joint {joint.name!r} has `{joint_number.attribute}` = {value:g} {unit}; expected {bound} and at most "
+            f"{joint_number.maximum:g} {unit}. Is it in {other_unit}, or does it stand for no limit?"
         )
-    if value > number.usual:
-        imported.doubts.add(
-            f"`{number.attribute}` = {value:g} {number.unit} is much for a snake robot; is it in {number.other_unit}?",
-            joint.place(number.tag),
+    if value > joint_number.usual:
+        result.doubts.add(
+            f"`{joint_number.attribute}` = {value:g} {unit} is much for a snake robot; is it in {other_unit}?",
+            joint.format_place(joint_number.tag),
         )
     return value
 
 
-def _put_common_range(imported: ImportResult, ranges: list[AngleRange], source: str) -> None:
+def _set_common_range(result: ImportResult, ranges: list[AngleRange], source: str) -> None:
     """Put the most common range: `angle_rad`, and the other side if the range is not symmetric."""
-    table = imported.table
-    common = Counter(ranges).most_common(1)[0][0]
+    table = result.table
+    common_range = Counter(ranges).most_common(1)[0][0]
     limits = table.values.get("limits", {})
     for side in ("angle_min_rad", "angle_max_rad"):
         limits.pop(side, None)
-    table.set_value("limits.angle_rad", max(-common.lower_rad, common.upper_rad), source)
-    if -common.lower_rad < common.upper_rad:
-        table.set_value("limits.angle_min_rad", common.lower_rad, source)
-    if -common.lower_rad > common.upper_rad:
-        table.set_value("limits.angle_max_rad", common.upper_rad, source)
+    table.set_value("limits.angle_rad", max(-common_range.lower_rad, common_range.upper_rad), source)
+    if -common_range.lower_rad < common_range.upper_rad:
+        table.set_value("limits.angle_min_rad", common_range.lower_rad, source)
+    if -common_range.lower_rad > common_range.upper_rad:
+        table.set_value("limits.angle_max_rad", common_range.upper_rad, source)
 
 
-def _put_exceptions(
-    imported: ImportResult,
+def _set_joint_exceptions(
+    result: ImportResult,
     joints: list[UrdfJoint],
     ranges: list[AngleRange],
     columns: dict[str, list[float]],
     source: str,
 ) -> None:
-    """Put the numbers in which a joint differs from the sections for all joints into a section of its own.
+    """Write the numbers in which a joint differs from the sections for all joints into a section of that joint.
 
     Args:
-        imported: The import, whose values and report are extended.
+        result: Result of the import, whose values and report are extended.
         joints: The joints of the URDF, tail to head.
-        ranges: Their angle ranges.
-        columns: Their other numbers, by the key of the robot file.
+        ranges: Angle ranges of the joints.
+        columns: Other numbers of the joints, by the key of the robot file.
         source: Path of the URDF, for error messages.
     """
-    differences: dict[str, list[str]] = {}  # by key, one text for each joint that differs
-    for i, common in enumerate(decode(imported.table, RobotFile).joint_table):
-        compared = [  # key, value in the URDF, value in the sections, unit
-            ("angle_min_rad", ranges[i].lower_rad, common.limits.lower_rad, "rad"),
-            ("angle_max_rad", ranges[i].upper_rad, common.limits.upper_rad, "rad"),
+    texts_by_key: dict[str, list[str]] = {}  # by key, one text for each joint that differs
+    for joint_index, common_joint in enumerate(decode_table(result.table, RobotFile).joint_table):
+        compared_values = [  # key, value in the URDF, value in the sections, unit
+            ("angle_min_rad", ranges[joint_index].lower_rad, common_joint.limits.lower_rad, "rad"),
+            ("angle_max_rad", ranges[joint_index].upper_rad, common_joint.limits.upper_rad, "rad"),
         ]
-        for number in NUMBERS:
-            section = common.limits if number.is_limit else common.motor
-            compared.append((number.key, columns[number.key][i], getattr(section, number.key), number.unit))
-        for key, in_urdf, in_sections, unit in compared:
-            if in_urdf == in_sections:
+        for joint_number in JOINT_NUMBERS:
+            section = common_joint.limits if joint_number.is_limit else common_joint.motor
+            compared_values.append(
+                (
+                    joint_number.key,
+                    columns[joint_number.key][joint_index],
+                    getattr(section, joint_number.key),
+                    joint_number.unit,
+                )
+            )
+        for key, urdf_value, common_value, unit in compared_values:
+            if urdf_value == common_value:
                 continue
-            imported.table.set_value(f"joints.{common.name}.{key}", in_urdf, source)
-            text = f"{common.name} ({joints[i].name}) {in_urdf:g} {unit}"
-            differences.setdefault(key, []).append(text)
-    for key, texts in differences.items():
-        imported.changes.add(f"{key} differs from that of the others: {', '.join(texts)}")
+            result.table.set_value(f"joints.{common_joint.name}.{key}", urdf_value, source)
+            text = f"{common_joint.name} ({joints[joint_index].name}) {urdf_value:g} {unit}"
+            texts_by_key.setdefault(key, []).append(text)
+    for key, texts in texts_by_key.items():
+        result.changes.add(f"{key} differs from that of the others: {', '.join(texts)}")

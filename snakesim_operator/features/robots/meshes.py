@@ -8,13 +8,13 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 
-MAX_BYTES = 64 * 1024 * 1024
+MAX_FILE_BYTES = 64 * 1024 * 1024
 STL_HEADER_BYTES = 84
 STL_TRIANGLE_BYTES = 50
-STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attributes", "<u2")])
+STL_TRIANGLE_DTYPE = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attributes", "<u2")])
 
 
-def find_mesh(name: str, urdf: Path) -> Path | None:
+def find_mesh_file(name: str, urdf: Path) -> Path | None:
     """Return the path of the mesh that a URDF names, or None if it is not on this computer.
 
     `package://NAME/...` is looked for in the folders above the URDF, in one called NAME or directly.
@@ -33,8 +33,8 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
         return None
 
 
-def read_vertices(path: Path) -> Floats:
-    """Return the corners of all faces, (n, 3), in the file's unit of length.
+def read_mesh_vertices(path: Path) -> Floats:
+    """Read the corners of all faces of an STL or OBJ file, (n, 3), in the file's unit of length.
 
     Raises:
         ConfigError: The file has another format, is damaged, or is too large.
@@ -43,11 +43,11 @@ def read_vertices(path: Path) -> Floats:
         raise ConfigError(f"{path}: only STL and OBJ can be read", code="urdf/invalid")
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", code="urdf/invalid") from None
-    if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path}: is larger than {MAX_BYTES // 1024 // 1024} MB", code="urdf/invalid")
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(f"{path}: is larger than {MAX_FILE_BYTES // 1024 // 1024} MB", code="urdf/invalid")
     points = _parse_binary_stl(data) if path.suffix.lower() == ".stl" else None
     if points is None:
         points = _parse_text(data, path)
@@ -63,7 +63,7 @@ def _parse_binary_stl(data: bytes) -> Floats | None:
     (count,) = struct.unpack_from("<I", data, STL_HEADER_BYTES - 4)
     if len(data) != STL_HEADER_BYTES + count * STL_TRIANGLE_BYTES:
         return None
-    triangles = np.frombuffer(data, dtype=STL_TRIANGLE, offset=STL_HEADER_BYTES)
+    triangles = np.frombuffer(data, dtype=STL_TRIANGLE_DTYPE, offset=STL_HEADER_BYTES)
     return triangles["vertices"].reshape(-1, 3).astype(np.float64)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_operator.features.robots.imported import Notes
-from snakesim_operator.features.robots.meshes import find_mesh, read_vertices
+from snakesim_operator.features.robots.imported import ReportNotes
+from snakesim_operator.features.robots.meshes import find_mesh_file, read_mesh_vertices
 from snakesim_operator.features.robots.xml_tree import Element
 
 RIM_POINTS = 32  # of a cylinder
@@ -25,7 +25,7 @@ class Shape:
 
 
 def read_shape(element: Element) -> Shape:
-    """Read an element of <geometry>: a box, cylinder, capsule, sphere or mesh with its sizes.
+    """Read the shape in a <geometry> element: a box, cylinder, capsule, sphere or mesh with its sizes.
 
     Args:
         element: The element.
@@ -35,30 +35,32 @@ def read_shape(element: Element) -> Shape:
     """
     match element.tag:
         case "box":
-            return Shape("box", _positive(element, "size", element.numbers("size", 3)))
+            return Shape("box", _require_positive(element, "size", element.read_numbers("size", 3)))
         case "cylinder" | "capsule":
-            radius = _positive(element, "radius", [element.number("radius")])
-            length = _positive(element, "length", [element.number("length")])
+            radius = _require_positive(element, "radius", [element.read_number("radius")])
+            length = _require_positive(element, "length", [element.read_number("length")])
             return Shape(element.tag, radius + length)
         case "sphere":
-            return Shape("sphere", _positive(element, "radius", [element.number("radius")]))
+            return Shape("sphere", _require_positive(element, "radius", [element.read_number("radius")]))
         case "mesh":
-            scale = element.numbers("scale", 3, "1 1 1")
+            scale = element.read_numbers("scale", 3, "1 1 1")
             if not all(1e-12 < abs(factor) < 1e12 for factor in scale):
-                raise element.error(f"has `scale` = {element.get('scale')!r}; expected factors that are not 0")
-            return Shape("mesh", scale, element.get("filename"))
+                raise element.make_error(
+                    f"has `scale` = {element.read_attribute('scale')!r}; expected factors that are not 0"
+                )
+            return Shape("mesh", scale, element.read_attribute("filename"))
         case _:
-            raise element.error("is no shape of URDF: box, cylinder, sphere or mesh")
+            raise element.make_error("is no shape of URDF: box, cylinder, sphere or mesh")
 
 
-def sample_outline(shape: Shape, element: Element, file: Path, omissions: Notes) -> Floats | None:
-    """Return points whose convex hull encloses a shape.
+def sample_outline(shape: Shape, element: Element, file: Path, omissions: ReportNotes) -> Floats | None:
+    """Sample points whose convex hull encloses a shape.
 
     Args:
         shape: The shape.
-        element: Its element, for the report.
+        element: Element of the shape, for the report.
         file: The URDF, from which mesh files are looked for.
-        omissions: Gets a note when a mesh file cannot be read.
+        omissions: Report that gets a note if a mesh file cannot be read.
 
     Returns:
         (n, 3) points in the shape's frame, in the file's unit of length; None for a mesh that cannot be read.
@@ -69,29 +71,29 @@ def sample_outline(shape: Shape, element: Element, file: Path, omissions: Notes)
             return corners * np.array(shape.sizes) / 2
         case "cylinder" | "capsule":
             radius, length = shape.sizes
-            return _tube(radius, length / 2, with_caps=shape.kind == "capsule")
+            return _sample_cylinder(radius, length / 2, with_caps=shape.kind == "capsule")
         case "sphere":
-            return _ball(shape.sizes[0])
+            return _sample_sphere(shape.sizes[0])
         case _:
-            return _mesh(shape, element, file, omissions)
+            return _read_mesh_points(shape, element, file, omissions)
 
 
-def _positive(element: Element, attribute: str, sizes: list[float]) -> list[float]:
+def _require_positive(element: Element, attribute: str, sizes: list[float]) -> list[float]:
     """Return the sizes. Raises ConfigError unless all of them are above 0."""
     if not all(0 < size < 1e9 for size in sizes):
-        raise element.error(f"has `{attribute}` = {element.get(attribute)!r}; expected sizes above 0")
+        raise element.make_error(f"has `{attribute}` = {element.read_attribute(attribute)!r}; expected sizes above 0")
     return sizes
 
 
-def _circle() -> tuple[Floats, Floats]:
+def _compute_circle() -> tuple[Floats, Floats]:
     """Return cosines and sines of RIM_POINTS angles around a circle."""
     angles_rad = np.arange(RIM_POINTS) * 2 * math.pi / RIM_POINTS
     return np.cos(angles_rad), np.sin(angles_rad)
 
 
-def _tube(radius: float, half_length: float, *, with_caps: bool) -> Floats:
+def _sample_cylinder(radius: float, half_length: float, *, with_caps: bool) -> Floats:
     """Return both rims of a cylinder along z; with caps also the tips of a capsule."""
-    cosines, sines = _circle()
+    cosines, sines = _compute_circle()
     upper_rim = np.column_stack([radius * cosines, radius * sines, np.full(RIM_POINTS, half_length)])
     lower_rim = upper_rim * [1, 1, -1]
     if not with_caps:
@@ -100,22 +102,22 @@ def _tube(radius: float, half_length: float, *, with_caps: bool) -> Floats:
     return np.vstack([upper_rim, lower_rim, [[0, 0, tip], [0, 0, -tip]]])
 
 
-def _ball(radius: float) -> Floats:
+def _sample_sphere(radius: float) -> Floats:
     """Return three great circles of a sphere."""
-    cosines, sines = _circle()
+    cosines, sines = _compute_circle()
     in_xy = np.column_stack([cosines, sines, np.zeros(RIM_POINTS)])
     in_xz = in_xy[:, [0, 2, 1]]
     in_yz = in_xy[:, [2, 0, 1]]
     return radius * np.vstack([in_xy, in_xz, in_yz])
 
 
-def _mesh(shape: Shape, element: Element, file: Path, omissions: Notes) -> Floats | None:
+def _read_mesh_points(shape: Shape, element: Element, file: Path, omissions: ReportNotes) -> Floats | None:
     """Return the vertices of a mesh file, or None, with a note, if it cannot be read."""
-    path = find_mesh(shape.mesh, file)
+    path = find_mesh_file(shape.mesh, file)
     try:
         if path is None:
             raise ConfigError("not on this computer", code="urdf/invalid")
-        return read_vertices(path) * np.array(shape.sizes)
+        return read_mesh_vertices(path) * np.array(shape.sizes)
     except ConfigError as error:
         omissions.add(f"line {element.line}: mesh {shorten(shape.mesh)!r} left out: {error}")
         return None

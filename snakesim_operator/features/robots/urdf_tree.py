@@ -16,11 +16,11 @@ from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.shapes import read_shape, sample_outline
 from snakesim_operator.features.robots.xml_tree import Element
 
-ROTARY = ("revolute", "continuous")
+ROTARY_JOINT_TYPES = ("revolute", "continuous")
 MAX_COORDINATE = 1e6  # of an origin, in the file's unit of length
 MAX_MASS_KG = 100.0  # of a link; as in snakesim_hal.model.links
 MAX_INERTIA_KG_M2 = 100.0
-MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+MOMENT_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass
@@ -76,7 +76,7 @@ class UrdfJoint:
     origin: Floats  # (3,)
     axis: Floats  # (3,), about which the front body turns against the rear one for a positive angle
 
-    def place(self, tag: str = "") -> str:
+    def format_place(self, tag: str = "") -> str:
         """Return the place of the joint in the file, for a report.
 
         Args:
@@ -104,7 +104,7 @@ class _Connection:
 
 
 @dataclass
-class _Tree:
+class _LinkTree:
     """The links, as the joints place them from the root link on."""
 
     frames: dict[str, Floats]  # root_from_link, (4, 4)
@@ -126,9 +126,9 @@ def read_body_chain(result: ImportResult, urdf: Element, file: Path, *, tail: st
     Raises:
         ConfigError: The links are no chain, or a value in them is wrong.
     """
-    links = _elements_by_name(urdf, "link")
-    joints = _elements_by_name(urdf, "joint")
-    tree = _walk_tree(result, urdf, links, joints)
+    links = _index_elements_by_name(urdf, "link")
+    joints = _index_elements_by_name(urdf, "joint")
+    tree = _build_tree(result, urdf, links, joints)
     bodies: dict[str, Body] = {}  # by the name of their first link
     for name, element in links.items():
         root_from_link = tree.frames[name]
@@ -138,40 +138,42 @@ def read_body_chain(result: ImportResult, urdf: Element, file: Path, *, tail: st
         body.frames[name] = root_from_link
         _add_mass(result, body, element, root_from_link)
         _add_shapes(result, body, element, root_from_link, file)
-    return _order_bodies(bodies, tree, tail, urdf)
+    return _order_bodies_from_tail(bodies, tree, tail, urdf)
 
 
-def _elements_by_name(urdf: Element, tag: str) -> dict[str, Element]:
+def _index_elements_by_name(urdf: Element, tag: str) -> dict[str, Element]:
     """Return the elements of a tag by their names. Raises ConfigError for a name that two of them have."""
     elements: dict[str, Element] = {}
-    for element in urdf.all(tag):
-        name = element.get("name")
+    for element in urdf.find_children(tag):
+        name = element.read_attribute("name")
         if name in elements:
-            raise element.error("is there twice; give each a name of its own")
+            raise element.make_error("is there twice; give each a name of its own")
         elements[name] = element
     return elements
 
 
-def transform(owner: Element) -> Floats:
+def read_origin(owner: Element) -> Floats:
     """Return parent_from_child, (4, 4), of the <origin> of an element; without one it is the identity.
 
     Raises:
         ConfigError: The <origin> has no finite numbers, or is too far away.
     """
     frame = np.eye(4)
-    origin = owner.first("origin")
+    origin = owner.find_child("origin")
     if origin is None:
         owner.note_absent("<origin>", "0 0 0")
         return frame
-    position = origin.numbers("xyz", 3, "0 0 0")
+    position = origin.read_numbers("xyz", 3, "0 0 0")
     if not all(abs(coordinate) < MAX_COORDINATE for coordinate in position):
-        raise origin.error(f"has `xyz` = {origin.get('xyz')!r}; expected lengths below {MAX_COORDINATE:g}")
+        raise origin.make_error(
+            f"has `xyz` = {origin.read_attribute('xyz')!r}; expected lengths below {MAX_COORDINATE:g}"
+        )
     frame[:3, 3] = position
-    frame[:3, :3] = rotation(*origin.numbers("rpy", 3, "0 0 0"))
+    frame[:3, :3] = make_rotation_from_rpy(*origin.read_numbers("rpy", 3, "0 0 0"))
     return frame
 
 
-def rotation(roll: float, pitch: float, yaw: float) -> Floats:
+def make_rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """Return the rotation matrix, (3, 3), of URDF's `rpy`: about the fixed axes x, then y, then z. Angles in rad."""
     cos_roll = math.cos(roll)
     sin_roll = math.sin(roll)
@@ -185,8 +187,10 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return about_z @ about_y @ about_x
 
 
-def _walk_tree(result: ImportResult, urdf: Element, links: dict[str, Element], joints: dict[str, Element]) -> _Tree:
-    """Follow the joints from the root link to every other link, and return the frames and joints on the way.
+def _build_tree(
+    result: ImportResult, urdf: Element, links: dict[str, Element], joints: dict[str, Element]
+) -> _LinkTree:
+    """Build the tree of links: follow the joints from the root link, and compute the frame of every link.
 
     Args:
         result: The result of the import, whose report is extended.
@@ -197,30 +201,30 @@ def _walk_tree(result: ImportResult, urdf: Element, links: dict[str, Element], j
     Raises:
         ConfigError: The links are no tree, or a joint has a type that no snake has.
     """
-    parent_of: dict[str, str] = {}  # child link -> parent link
-    joints_below: dict[str, list[tuple[str, Element]]] = {}  # parent link -> child links with their joints
+    parent_by_child: dict[str, str] = {}  # child link -> parent link
+    joints_by_parent: dict[str, list[tuple[str, Element]]] = {}  # parent link -> child links with their joints
     for joint in joints.values():
-        parent = _read_end(joint, "parent", links)
-        child = _read_end(joint, "child", links)
-        if child in parent_of:
-            raise joint.error(f"and another joint both have the child {child!r}; a link has one parent")
-        parent_of[child] = parent
-        joints_below.setdefault(parent, []).append((child, joint))
+        parent = _read_joint_link(joint, "parent", links)
+        child = _read_joint_link(joint, "child", links)
+        if child in parent_by_child:
+            raise joint.make_error(f"and another joint both have the child {child!r}; a link has one parent")
+        parent_by_child[child] = parent
+        joints_by_parent.setdefault(parent, []).append((child, joint))
 
     # From the root link outwards, so that the frame of a parent is known before those of its children.
-    root = _find_root(urdf, links, parent_of)
-    tree = _Tree(frames={root: np.eye(4)}, body_of={root: root})
+    root = _find_root(urdf, links, parent_by_child)
+    tree = _LinkTree(frames={root: np.eye(4)}, body_of={root: root})
     links_to_visit = [root]
     while links_to_visit:
         parent = links_to_visit.pop()
-        children = joints_below.get(parent, [])
-        alone_at_root = parent == root and len(children) == 1
+        children = joints_by_parent.get(parent, [])
+        is_only_joint_of_root = parent == root and len(children) == 1
         for child, element in children:
-            _add_joint(result, tree, element, parent, child, alone_at_root=alone_at_root)
+            _add_joint(result, tree, element, parent, child, is_only_joint_of_root=is_only_joint_of_root)
             links_to_visit.append(child)
     unreached = sorted(links.keys() - tree.frames.keys())
     if unreached:
-        raise urdf.error(f"has joints in a circle: {', '.join(unreached[:8])}")
+        raise urdf.make_error(f"has joints in a circle: {', '.join(unreached[:8])}")
     return tree
 
 
@@ -230,22 +234,22 @@ def _find_root(urdf: Element, links: dict[str, Element], parent_of: dict[str, st
     if len(roots) == 1:
         return roots[0]
     names = f": {', '.join(map(shorten, roots[:8]))}" if roots else ""
-    raise urdf.error(f"needs one link without a parent, and has {len(roots)}{names}")
+    raise urdf.make_error(f"needs one link without a parent, and has {len(roots)}{names}")
 
 
-def _read_end(joint: Element, tag: str, links: dict[str, Element]) -> str:
+def _read_joint_link(joint: Element, tag: str, links: dict[str, Element]) -> str:
     """Return the link at one end of a joint. Raises ConfigError for a link that does not exist."""
-    end = joint.first(tag)
-    name = "" if end is None else end.get("link")
+    end = joint.find_child(tag)
+    name = "" if end is None else end.read_attribute("link")
     if name not in links:
-        raise joint.error(f"has the {tag} {shorten(name)!r}, which is no link of the file")
+        raise joint.make_error(f"has the {tag} {shorten(name)!r}, which is no link of the file")
     return name
 
 
 def _add_joint(
-    result: ImportResult, tree: _Tree, element: Element, parent: str, child: str, *, alone_at_root: bool
+    result: ImportResult, tree: _LinkTree, element: Element, parent: str, child: str, *, is_only_joint_of_root: bool
 ) -> None:
-    """Place the link behind a joint, and add the joint to the tree if it rotates.
+    """Add the child link of a joint with its frame to the tree, and the joint itself if it rotates.
 
     Links on both sides of a fixed joint become one body.
 
@@ -253,31 +257,35 @@ def _add_joint(
         result: The result of the import, whose report is extended.
         tree: The links and joints so far, which is extended.
         element: The <joint> element.
-        parent: Name of the link ahead of the joint, towards the root.
-        child: Name of the link behind it.
-        alone_at_root: Whether it is the only joint of the root link, which may be free to move.
+        parent: Name of the link on the side of the root.
+        child: Name of the link on the other side.
+        is_only_joint_of_root: Whether no other joint is at the root link, which may then be free to move.
 
     Raises:
         ConfigError: The joint slides, or has another type that no snake has.
     """
-    kind = element.get("type")
-    if kind in ("floating", "planar") and alone_at_root:
+    joint_type = element.read_attribute("type")
+    if joint_type in ("floating", "planar") and is_only_joint_of_root:
+        name = shorten(element.read_attribute("name"))
         result.omissions.add(
-            f"joint {shorten(element.get('name'))!r} ({kind}) left out: the base is always free to move", element.place
+            f"joint {name!r} ({joint_type}) left out: the base is always free to move",
+            element.place,
         )
         tree.frames[child] = np.eye(4)
         tree.body_of[child] = tree.body_of[parent]
         return  # its <origin> has not been read, and so is reported
-    frame = tree.frames[parent] @ transform(element)
-    tree.frames[child] = frame
-    if kind in ROTARY:
+    root_from_joint = tree.frames[parent] @ read_origin(element)
+    tree.frames[child] = root_from_joint
+    if joint_type in ROTARY_JOINT_TYPES:
         tree.body_of[child] = child
-        tree.connections.append(_Connection(parent, child, _read_joint(result, element, frame)))
-    elif kind == "fixed":
+        tree.connections.append(_Connection(parent, child, _read_joint(result, element, root_from_joint)))
+    elif joint_type == "fixed":
         tree.body_of[child] = tree.body_of[parent]
         result.changes.add("fixed joints: the links on both sides became one", element.place)
     else:
-        raise element.error(f"has the type {shorten(kind)!r}; a snake's joints are revolute, continuous or fixed")
+        raise element.make_error(
+            f"has the type {shorten(joint_type)!r}; a snake's joints are revolute, continuous or fixed"
+        )
 
 
 def _read_joint(result: ImportResult, element: Element, frame: Floats) -> UrdfJoint:
@@ -285,14 +293,14 @@ def _read_joint(result: ImportResult, element: Element, frame: Floats) -> UrdfJo
 
     frame: root_from_joint, (4, 4).
     """
-    if element.first("mimic") is not None:
-        raise element.error("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
-    axis = _read_axis(result, element)
-    return UrdfJoint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis)
+    if element.find_child("mimic") is not None:
+        raise element.make_error("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
+    axis = _read_unit_axis(result, element)
+    return UrdfJoint(element, element.read_attribute("name"), frame[:3, 3], frame[:3, :3] @ axis)
 
 
-def _read_axis(result: ImportResult, joint: Element) -> Floats:
-    """Return the axis of a joint in the joint's frame, (3,), as a vector of length 1.
+def _read_unit_axis(result: ImportResult, joint: Element) -> Floats:
+    """Read the axis of a joint in the joint's frame, (3,), and normalize it to length 1.
 
     Args:
         result: The result of the import, whose report gets a change if the file's vector has another length.
@@ -301,53 +309,53 @@ def _read_axis(result: ImportResult, joint: Element) -> Floats:
     Raises:
         ConfigError: The vector has no usable direction.
     """
-    axis_element = joint.first("axis")
+    axis_element = joint.find_child("axis")
     if axis_element is None:
         joint.note_absent("<axis>", "1 0 0")
         return np.array([1.0, 0.0, 0.0])
-    axis = np.array(axis_element.numbers("xyz", 3, "1 0 0"))
+    axis = np.array(axis_element.read_numbers("xyz", 3, "1 0 0"))
     length = float(np.linalg.norm(axis))
     if not 1e-9 < length < 1e9:
-        raise axis_element.error(
-            f"of joint {joint.get('name')!r} has `xyz` = {axis_element.get('xyz')!r} of length {length:g}; give "
-            f"a vector of length 1"
+        raise axis_element.make_error(
+            f"of joint {joint.read_attribute('name')!r} has `xyz` = {axis_element.read_attribute('xyz')!r} of length "
+            f"{length:g}; give a vector of length 1"
         )
     if abs(length - 1.0) > 1e-3:
         result.changes.add(
-            f"<axis xyz> {axis_element.get('xyz')!r} has the length {length:.4g}; only its direction counts",
-            f"{shorten(joint.get('name'))} (line {axis_element.line})",
+            f"<axis xyz> {axis_element.read_attribute('xyz')!r} has the length {length:.4g}; only its direction counts",
+            f"{shorten(joint.read_attribute('name'))} (line {axis_element.line})",
         )
     return axis / length
 
 
-def _add_mass(result: ImportResult, body: Body, link: Element, frame: Floats) -> None:
+def _add_mass(result: ImportResult, body: Body, link: Element, root_from_link: Floats) -> None:
     """Add mass and inertia of a link to its body, which is all links that fixed joints connect.
 
     Args:
         result: The result of the import, whose report gets an assumption for a link without mass.
         body: The body, which is changed.
         link: The <link> element.
-        frame: root_from_link, (4, 4), in the file's unit of length.
+        root_from_link: Transform from the link's frame to the root's, (4, 4), in the file's unit of length.
 
     Raises:
         ConfigError: The mass is negative or too large, or a value is missing.
     """
-    inertial = link.first("inertial")
+    inertial = link.find_child("inertial")
     if inertial is None:
         result.assumptions.add("<link> without <inertial>: 0 kg", link.place)
         return
-    mass = inertial.first("mass")
-    moments = inertial.first("inertia")
+    mass = inertial.find_child("mass")
+    moments = inertial.find_child("inertia")
     if mass is None or moments is None:
-        raise inertial.error("needs <mass> and <inertia>")
+        raise inertial.make_error("needs <mass> and <inertia>")
     body.masses.append(mass)
     body.inertias.append(moments)
-    mass_kg = mass.number("value")
+    mass_kg = mass.read_number("value")
     if not 0 <= mass_kg <= MAX_MASS_KG:
-        raise mass.error(f"is {mass_kg:g} kg; expected 0 or more and at most {MAX_MASS_KG:g} kg. Is it in grams?")
-    xx, xy, xz, yy, yz, zz = (_read_moment(moments, name) for name in MOMENTS)
+        raise mass.make_error(f"is {mass_kg:g} kg; expected 0 or more and at most {MAX_MASS_KG:g} kg. Is it in grams?")
+    xx, xy, xz, yy, yz, zz = (_read_moment(moments, name) for name in MOMENT_ATTRIBUTES)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    root_from_inertial = frame @ transform(inertial)
+    root_from_inertial = root_from_link @ read_origin(inertial)
     rotation_matrix = root_from_inertial[:3, :3]
     center = root_from_inertial[:3, 3]
     body.add_mass(mass_kg, center, rotation_matrix @ inertia @ rotation_matrix.T)
@@ -355,37 +363,37 @@ def _add_mass(result: ImportResult, body: Body, link: Element, frame: Floats) ->
 
 def _read_moment(moments: Element, name: str) -> float:
     """Return a moment of inertia in the file's unit of length. Raises ConfigError for one that is too large."""
-    value = moments.number(name, "0")
+    value = moments.read_number(name, "0")
     if abs(value) > 1e15:
-        raise moments.error(f"has `{name}` = {value:g}; expected at most {MAX_INERTIA_KG_M2:g} kg·m²")
+        raise moments.make_error(f"has `{name}` = {value:g}; expected at most {MAX_INERTIA_KG_M2:g} kg·m²")
     return value
 
 
-def _add_shapes(result: ImportResult, body: Body, link: Element, frame: Floats, file: Path) -> None:
+def _add_shapes(result: ImportResult, body: Body, link: Element, root_from_link: Floats, file: Path) -> None:
     """Add the outline of a link to its body: that of <collision> or, without one, that of <visual>.
 
     Args:
         result: The result of the import, whose report is extended.
         body: The body, whose points and shapes are extended.
         link: The <link> element.
-        frame: root_from_link, (4, 4), in the file's unit of length.
+        root_from_link: Transform from the link's frame to the root's, (4, 4), in the file's unit of length.
         file: Path of the URDF, from which its mesh files are looked for.
     """
-    collisions = link.all("collision")
+    collisions = link.find_children("collision")
     visuals = [child for child in link.children if child.tag == "visual"]
     if collisions:
-        _mark_repeated(visuals, collisions)
+        _mark_repeated_visuals(visuals, collisions)
     elif visuals:
-        link.all("visual")  # marks them as read
+        link.find_children("visual")  # marks them as read
         result.assumptions.add("<link> without <collision>: its outline is that of <visual>", link.place)
     for element in collisions or visuals:
-        geometry = element.first("geometry")
+        geometry = element.find_child("geometry")
         if geometry is None or not geometry.children:
-            raise element.error("has no shape in <geometry>")
+            raise element.make_error("has no shape in <geometry>")
         shape = geometry.children[0]
         shape.read = True
         points = sample_outline(read_shape(shape), shape, file, result.omissions)
-        root_from_shape = frame @ transform(element)
+        root_from_shape = root_from_link @ read_origin(element)
         if points is not None:
             rotation = root_from_shape[:3, :3]
             position = root_from_shape[:3, 3]
@@ -393,14 +401,14 @@ def _add_shapes(result: ImportResult, body: Body, link: Element, frame: Floats, 
             body.shapes.append(shape)
 
 
-def _mark_repeated(visuals: list[Element], collisions: list[Element]) -> None:
+def _mark_repeated_visuals(visuals: list[Element], collisions: list[Element]) -> None:
     """Mark a <visual> as read where a <collision> repeats it, so that only its other values are reported."""
     for visual in visuals:
         if any(_have_same_shape(visual, collision) for collision in collisions):
             visual.read = True
             for child in visual.children:
                 if child.tag in ("origin", "geometry"):
-                    child.read_all()
+                    child.mark_all_as_read()
 
 
 def _have_same_shape(visual: Element, collision: Element) -> bool:
@@ -410,17 +418,17 @@ def _have_same_shape(visual: Element, collision: Element) -> bool:
         of_collision = [child for child in collision.children if child.tag == tag]
         if len(of_visual) != len(of_collision):
             return False
-        if not all(a.equals(b) for a, b in zip(of_visual, of_collision, strict=True)):
+        if not all(a.is_equal_to(b) for a, b in zip(of_visual, of_collision, strict=True)):
             return False
     return True
 
 
-def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: Element) -> BodyChain:
-    """Return bodies and joints in their order from tail to head.
+def _order_bodies_from_tail(bodies: dict[str, Body], tree: _LinkTree, tail: str | None, urdf: Element) -> BodyChain:
+    """Order bodies and joints from tail to head, after a check that they are a chain.
 
     Args:
-        bodies: By the name of their first link. A body is all links that fixed joints connect.
-        tree: Which joints connect which bodies.
+        bodies: Bodies by the name of their first link. A body is all links that fixed joints connect.
+        tree: The links with the joints that connect them.
         tail: A link of the body at the tail; None takes the body of the root link.
         urdf: The root element of the URDF, for error messages.
 
@@ -433,42 +441,44 @@ def _order_bodies(bodies: dict[str, Body], tree: _Tree, tail: str | None, urdf: 
             code="urdf/invalid",
         )
     neighbors = _find_neighbors(bodies, tree)
-    forks = [name for name, joints in neighbors.items() if len(joints) > 2]
-    if forks:
-        raise urdf.error(f"is no chain: more than two joints meet at link {shorten(forks[0])!r}")
+    bodies_at_forks = [name for name, joints in neighbors.items() if len(joints) > 2]
+    if bodies_at_forks:
+        raise urdf.make_error(f"is no chain: more than two joints meet at link {shorten(bodies_at_forks[0])!r}")
     if len(tree.connections) < 2:
-        raise urdf.error(f"has {len(tree.connections)} joints that turn; a snake has 2 or more")
-    first = tree.body_of[tail] if tail is not None else next(iter(tree.body_of))
-    ends = [name for name, joints in neighbors.items() if len(joints) == 1]
-    if first not in ends:
-        choices = " or ".join(f"--tail {shorten(end)}" for end in ends)
-        raise urdf.error(
-            f"has the link {shorten(tail or first)!r} amid the chain; choose which end is the tail: {choices}"
+        raise urdf.make_error(f"has {len(tree.connections)} joints that turn; a snake has 2 or more")
+    tail_body = tree.body_of[tail] if tail is not None else next(iter(tree.body_of))
+    end_bodies = [name for name, joints in neighbors.items() if len(joints) == 1]
+    if tail_body not in end_bodies:
+        choices = " or ".join(f"--tail {shorten(end)}" for end in end_bodies)
+        raise urdf.make_error(
+            f"has the link {shorten(tail or tail_body)!r} amid the chain; choose which end is the tail: {choices}"
         )
-    return _follow_chain(bodies, neighbors, first)
+    return _follow_chain(bodies, neighbors, tail_body)
 
 
-def _follow_chain(bodies: dict[str, Body], neighbors: dict[str, list[tuple[str, UrdfJoint]]], first: str) -> BodyChain:
-    """Return bodies and joints in their order from one end of a chain.
+def _follow_chain(
+    bodies: dict[str, Body], neighbors: dict[str, list[tuple[str, UrdfJoint]]], first_body: str
+) -> BodyChain:
+    """Follow a chain from one of its ends, and return its bodies and joints in this order.
 
     Args:
-        bodies: By name.
+        bodies: Bodies by name.
         neighbors: For each body, the names of its one or two neighbors with the joints between them.
-        first: Name of the body at the end to begin with.
+        first_body: Name of the body at the end to begin with.
     """
-    names = [first]
+    names = [first_body]
     joints: list[UrdfJoint] = []
     while True:
         visited = names[-2:]
-        ahead = [(name, joint) for name, joint in neighbors[names[-1]] if name not in visited]
-        if not ahead:
+        next_bodies = [(name, joint) for name, joint in neighbors[names[-1]] if name not in visited]
+        if not next_bodies:
             return BodyChain([bodies[name] for name in names], joints)
-        name, joint = ahead[0]
+        name, joint = next_bodies[0]
         names.append(name)
         joints.append(joint)
 
 
-def _find_neighbors(bodies: dict[str, Body], tree: _Tree) -> dict[str, list[tuple[str, UrdfJoint]]]:
+def _find_neighbors(bodies: dict[str, Body], tree: _LinkTree) -> dict[str, list[tuple[str, UrdfJoint]]]:
     """Return the neighbors of each body, and the joints to them, as if the neighbor were in front of the body.
 
     A joint whose parent is in front turns the other way round, so its axis is negated.

@@ -16,7 +16,7 @@ MAX_DEPTH = 32
 
 
 @dataclass(frozen=True)
-class Absent:
+class AbsentPart:
     """Something that an element leaves out, and the value that was taken in its place."""
 
     sentence: str
@@ -24,7 +24,7 @@ class Absent:
 
 
 @dataclass(frozen=True)
-class Unused:
+class UnusedPart:
     """A value of the file that no part of the program has read."""
 
     outermost: str  # path of tags of the outermost element that is unused as a whole; empty: the element was read
@@ -42,7 +42,7 @@ class Element:
     attributes: dict[str, str]
     line: int
     source: str
-    absences: list[Absent]  # of the whole file, in the order in which they were noticed
+    absences: list[AbsentPart]  # of the whole file, in the order in which they were noticed
     children: list["Element"] = field(default_factory=list["Element"])
     text: str = ""
     read: bool = False
@@ -55,26 +55,26 @@ class Element:
         name = self.attributes.get("name")
         return f"{shorten(name)} (line {self.line})" if name else f"line {self.line}"
 
-    def all(self, tag: str) -> list["Element"]:
+    def find_children(self, tag: str) -> list["Element"]:
         """Return the children of a tag, and mark them as read."""
         children = [child for child in self.children if child.tag == tag]
         for child in children:
             child.read = True
         return children
 
-    def first(self, tag: str) -> "Element | None":
+    def find_child(self, tag: str) -> "Element | None":
         """Return the first child of a tag and mark it as read, or None. Other children of the tag are reported."""
         child = next((child for child in self.children if child.tag == tag), None)
         if child is not None:
             child.read = True
         return child
 
-    def optional(self, name: str) -> str | None:
+    def read_optional_attribute(self, name: str) -> str | None:
         """Return an attribute, or None. The caller reports what a missing one means."""
         self.read_attributes.add(name)
         return self.attributes.get(name)
 
-    def get(self, name: str, default: str | None = None) -> str:
+    def read_attribute(self, name: str, default: str | None = None) -> str:
         """Return an attribute.
 
         Args:
@@ -84,38 +84,38 @@ class Element:
         Raises:
             ConfigError: The attribute is missing and has no default.
         """
-        value = self.optional(name)
+        value = self.read_optional_attribute(name)
         if value is not None:
             return value
         if default is None:
-            raise self.error(f"has no attribute `{name}`; add it")
+            raise self.make_error(f"has no attribute `{name}`; add it")
         self.note_absent(f"`{name}`", default)
         return default
 
-    def numbers(self, name: str, count: int, default: str | None = None) -> list[float]:
-        """Return the `count` finite numbers of an attribute; `default` as for `get`. Raises ConfigError."""
-        return self._parse_numbers(self.get(name, default), count, f"`{name}`")
+    def read_numbers(self, name: str, count: int, default: str | None = None) -> list[float]:
+        """Return the `count` finite numbers of an attribute; `default` as for `read_attribute`. Raises ConfigError."""
+        return self._parse_numbers(self.read_attribute(name, default), count, f"`{name}`")
 
-    def number(self, name: str, default: str | None = None) -> float:
-        """Return the number of an attribute; `default` as for `get`. Raises ConfigError."""
-        return self.numbers(name, 1, default)[0]
+    def read_number(self, name: str, default: str | None = None) -> float:
+        """Return the number of an attribute; `default` as for `read_attribute`. Raises ConfigError."""
+        return self.read_numbers(name, 1, default)[0]
 
-    def text_number(self, tag: str, default: float) -> float:
+    def read_child_number(self, tag: str, default: float) -> float:
         """Return the number in the text of a child, as Gazebo writes them, or the default. Raises ConfigError."""
-        child = self.first(tag)
+        child = self.find_child(tag)
         if child is None:
             self.note_absent(f"<{tag}>", f"{default:g}")
             return default
-        return child.text_numbers(1)[0]
+        return child.read_text_numbers(1)[0]
 
-    def text_numbers(self, count: int) -> list[float]:
+    def read_text_numbers(self, count: int) -> list[float]:
         """Return the `count` finite numbers in the text of the element. Raises ConfigError."""
         self.read_text = True
         return self._parse_numbers(self.text, count, "the text")
 
     def note_absent(self, what: str, value: str) -> None:
         """Record that the element leaves something out, and which value is assumed."""
-        self.absences.append(Absent(f"<{self.tag}> without {what}: {value}", self))
+        self.absences.append(AbsentPart(f"<{self.tag}> without {what}: {value}", self))
 
     def _parse_numbers(self, text: str, count: int, what: str) -> list[float]:
         try:
@@ -123,61 +123,63 @@ class Element:
         except ValueError:
             numbers = []
         if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
-            raise self.error(f"{what} = {shorten(text)!r}; expected {count} finite number{'s' * (count > 1)}")
+            raise self.make_error(f"{what} = {shorten(text)!r}; expected {count} finite number{'s' * (count > 1)}")
         return numbers
 
-    def error(self, why: str) -> ConfigError:
-        """Return an error about this element. why: the rest of a sentence that begins with its tag."""
+    def make_error(self, why: str) -> ConfigError:
+        """Make an error about this element. `why` is the rest of a sentence that begins with the element's tag."""
         name = ""
         if "name" in self.attributes:
             name = f" name={shorten(self.attributes['name'])!r}"
         return ConfigError(f"{self.source}, line {self.line}: <{self.tag}{name}> {why}", code="urdf/invalid")
 
-    def read_all(self) -> None:
+    def mark_all_as_read(self) -> None:
         """Mark the element and everything in it as read."""
         self.read = True
         self.read_text = True
         self.read_attributes.update(self.attributes)
         for child in self.children:
-            child.read_all()
+            child.mark_all_as_read()
 
-    def equals(self, other: "Element") -> bool:
+    def is_equal_to(self, other: "Element") -> bool:
         """Return whether tag, attributes, text and children of both are equal, whatever their lines."""
         if self.tag != other.tag or self.attributes != other.attributes:
             return False
         if self.text.strip() != other.text.strip() or len(self.children) != len(other.children):
             return False
-        return all(mine.equals(theirs) for mine, theirs in zip(self.children, other.children, strict=True))
+        return all(mine.is_equal_to(theirs) for mine, theirs in zip(self.children, other.children, strict=True))
 
-    def unused(self, path: str = "") -> Iterator[Unused]:
+    def iterate_unused(self, path: str = "") -> Iterator[UnusedPart]:
         """Yield every value in the element and below it that was not read.
 
         path: the tags of the elements above this one and of itself, such as `<link><visual>`.
         """
-        yield from self._unused_here(path, "", 0, everything=False)
+        yield from self._iterate_unused_here(path, "", 0, everything=False)
         for child in self.children:
             inner = f"{path}<{child.tag}>"
             if child.read:
-                yield from child.unused(inner)
+                yield from child.iterate_unused(inner)
             else:
-                yield from child._everything(inner, inner, child.line)
+                yield from child._iterate_all_values(inner, inner, child.line)
 
-    def _unused_here(self, path: str, outermost: str, outermost_line: int, *, everything: bool) -> Iterator[Unused]:
+    def _iterate_unused_here(
+        self, path: str, outermost: str, outermost_line: int, *, everything: bool
+    ) -> Iterator[UnusedPart]:
         own_tag = path or f"<{self.tag}>"
         for name, value in self.attributes.items():
             if everything or name not in self.read_attributes:
-                yield Unused(outermost, outermost_line, f"{own_tag[:-1]} {name}>", value, self.line)
+                yield UnusedPart(outermost, outermost_line, f"{own_tag[:-1]} {name}>", value, self.line)
         text = self.text.strip()
         if text and (everything or not self.read_text):
-            yield Unused(outermost, outermost_line, own_tag, text, self.line)
+            yield UnusedPart(outermost, outermost_line, own_tag, text, self.line)
 
-    def _everything(self, path: str, outermost: str, outermost_line: int) -> Iterator[Unused]:
+    def _iterate_all_values(self, path: str, outermost: str, outermost_line: int) -> Iterator[UnusedPart]:
         """Yield all values of an element that was not read."""
         if not (self.attributes or self.text.strip() or self.children):
-            yield Unused(outermost, outermost_line, path, None, self.line)
-        yield from self._unused_here(path, outermost, outermost_line, everything=True)
+            yield UnusedPart(outermost, outermost_line, path, None, self.line)
+        yield from self._iterate_unused_here(path, outermost, outermost_line, everything=True)
         for child in self.children:
-            yield from child._everything(f"{path}<{child.tag}>", outermost, outermost_line)
+            yield from child._iterate_all_values(f"{path}<{child.tag}>", outermost, outermost_line)
 
 
 def parse_xml(data: bytes, source: str) -> Element:
@@ -194,7 +196,7 @@ def parse_xml(data: bytes, source: str) -> Element:
         ConfigError: The file is not XML, has a document type, or is too large.
     """
     parser = expat.ParserCreate()
-    absences: list[Absent] = []
+    absences: list[AbsentPart] = []
     top = Element("", {}, 0, source, absences)
     open_elements = [top]
     count = 0

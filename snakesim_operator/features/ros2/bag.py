@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.base.terminal import PrintLine
-from snakesim_hal.model.textfiles import exported
+from snakesim_hal.model.textfiles import export_atomically
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
@@ -22,21 +22,21 @@ from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.urdf import make_urdf
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.missing_data import exit_code
-from snakesim_operator.results.run_reader import find_recording
+from snakesim_operator.results.missing_data import report_missing_data
+from snakesim_operator.results.run_reader import find_recording_path
 
 BAG_VERSION = 9  # of metadata.yaml, as of ROS 2 Jazzy
 LATCHED_TOPICS = ("/robot_description", "/tf_static")
-UNLIMITED = QosTime(0, 0)
-LATCHED = Qos(  # so that a node that subscribes while the bag is played gets the newest message
+UNLIMITED_TIME = QosTime(0, 0)
+LATCHED_QOS = Qos(  # so that a node that subscribes while the bag is played gets the newest message
     history=QosHistory.KEEP_LAST,
     depth=1,
     reliability=QosReliability.RELIABLE,
     durability=QosDurability.TRANSIENT_LOCAL,
-    deadline=UNLIMITED,
-    lifespan=UNLIMITED,
+    deadline=UNLIMITED_TIME,
+    lifespan=UNLIMITED_TIME,
     liveliness=QosLiveliness.AUTOMATIC,
-    liveliness_lease_duration=UNLIMITED,
+    liveliness_lease_duration=UNLIMITED_TIME,
     avoid_ros_namespace_conventions=False,
 )
 MESSAGE_TYPES: dict[str, type[Any]] = {
@@ -48,17 +48,17 @@ MESSAGE_TYPES: dict[str, type[Any]] = {
     keys.CLOCK: m.Clock,
     keys.DESCRIPTION: m.Description,
 }
-Output = tuple[str, RosType, bytes]  # topic, type and message in CDR
+BagMessage = tuple[str, RosType, bytes]  # topic, type and message in CDR
 
 
-def convert_recording(run: Path, out: Path | None, print_text: PrintLine, *, wall_time: bool) -> int:
+def convert_recording_to_rosbag(run: Path, output_path: Path | None, print_text: PrintLine, *, wall_time: bool) -> int:
     """Write a recording as a ROS 2 bag with MCAP storage.
 
     Args:
-        run: Folder of a run, or a recording.
-        out: Folder of the bag; None: beside the recording.
+        run: Path of a run folder, or of a recording.
+        output_path: Folder of the bag to write; None for a folder next to the recording.
         print_text: Prints a line.
-        wall_time: Whether times and stamps are wall-clock time; else they are robot time.
+        wall_time: Whether times and stamps are wall-clock time instead of robot time.
 
     Returns:
         The exit code: 3 if the recording is incomplete, otherwise 0.
@@ -66,27 +66,27 @@ def convert_recording(run: Path, out: Path | None, print_text: PrintLine, *, wal
     Raises:
         ConfigError: The recording cannot be read, has no description of its robot, or the folder exists.
     """
-    recording = find_recording(run)
-    path = out or recording.with_name(f"{recording.stem}-rosbag")
-    if path.exists():
+    recording = find_recording_path(run)
+    rosbag_path = output_path or recording.with_name(f"{recording.stem}-rosbag")
+    if rosbag_path.exists():
         raise ConfigError(
-            f"{path}: there is such a folder already; choose another one with --out", code="file/already-exists"
+            f"{rosbag_path}: there is such a folder already; choose another one with --out", code="file/already-exists"
         )
     reader = RecordingReader(recording)
-    with exported(path) as partial:
-        named = partial / path.name  # the library names the file in the bag after this folder
-        partial.mkdir()
-        count = _write_bag(reader, named, wall_time=wall_time)
-        for file in list(named.iterdir()):
-            file.rename(partial / file.name)
-        named.rmdir()
-        if not count:
+    with export_atomically(rosbag_path) as temporary_folder:
+        bag_folder = temporary_folder / rosbag_path.name  # the library names the file in the bag after this folder
+        temporary_folder.mkdir()
+        message_count = _write_bag(reader, bag_folder, wall_time=wall_time)
+        for file in list(bag_folder.iterdir()):
+            file.rename(temporary_folder / file.name)
+        bag_folder.rmdir()
+        if not message_count:
             raise ConfigError(
                 f"{recording}: it has no hal/description, so the joints have no names; record a robot with its host",
                 code="recording/missing-data",
             )
-    print_text(f"{count} messages: {path}")
-    return exit_code(run, reader.missing)
+    print_text(f"{message_count} messages: {rosbag_path}")
+    return report_missing_data(run, reader.missing)
 
 
 def _write_bag(reader: RecordingReader, path: Path, *, wall_time: bool) -> int:
@@ -96,9 +96,9 @@ def _write_bag(reader: RecordingReader, path: Path, *, wall_time: bool) -> int:
         bag = _Bag(writer)
         converter = MessageConverter(wall_time=wall_time)
         for recorded in reader.read_messages(MESSAGE_TYPES):
-            time_ns = recorded.wall_ns if wall_time else recorded.time_ns
+            time_ns = recorded.wall_time_ns if wall_time else recorded.robot_time_ns
             for output in converter.convert(recorded):
-                bag.write(output, time_ns)
+                bag.write_message(output, time_ns)
                 count += 1
     return count
 
@@ -110,13 +110,13 @@ class _Bag:
         self._writer = writer
         self._connections: dict[str, Any] = {}  # by topic
 
-    def write(self, output: Output, time_ns: int) -> None:
+    def write_message(self, output: BagMessage, time_ns: int) -> None:
         """Write one message, and open its topic when it is the first one."""
         topic, ros_type, data = output
         if topic not in self._connections:
-            quality = [LATCHED] if topic in LATCHED_TOPICS else []
+            quality = [LATCHED_QOS] if topic in LATCHED_TOPICS else []
             self._connections[topic] = self._writer.add_connection(
-                topic, ros_type.name, typestore=ros.STORE, offered_qos_profiles=quality
+                topic, ros_type.name, typestore=ros.TYPE_STORE, offered_qos_profiles=quality
             )
         self._writer.write(self._connections[topic], time_ns, data)
 
@@ -125,20 +125,29 @@ class MessageConverter:
     """Converts the robot's messages into those of ROS, with the topics and frames of the bridge."""
 
     def __init__(self, *, wall_time: bool) -> None:
-        """Start without a robot. wall_time: whether stamps are wall-clock time."""
+        """Start without a robot. `wall_time` is whether stamps are wall-clock time instead of robot time."""
         self._wall_time = wall_time
         self._decoders = {key: Decoder(message_type) for key, message_type in MESSAGE_TYPES.items()}
         self._robot: m.Description | None = None
         self._frames: Frames | None = None
-        self._imu_links: set[int] = set()  # whose frames are known
+        self._known_imu_links: set[int] = set()  # whose frames are known
 
-    def convert(self, recorded: RecordedMessage) -> Iterable[Output]:
-        """Return the ROS messages that are made of one message; none of one that does not fit the robot."""
+    def convert(self, recorded: RecordedMessage) -> Iterable[BagMessage]:
+        """Convert a recorded message of the robot into ROS messages.
+
+        Args:
+            recorded: The message, with its key and its times.
+
+        Returns:
+            Topic, type and CDR data of each ROS message; empty if the message is invalid or does not fit the robot.
+        """
         try:
             message = self._decoders[recorded.key].decode(recorded.payload, recorded.encoding)
         except WireError:
             return []
-        stamp_ns = recorded.wall_ns if self._wall_time else getattr(message, "timestamp_ns", recorded.time_ns)
+        stamp_ns = (
+            recorded.wall_time_ns if self._wall_time else getattr(message, "timestamp_ns", recorded.robot_time_ns)
+        )
         if isinstance(message, m.Description):
             return self._use_robot(message, stamp_ns)
         robot = self._robot
@@ -162,7 +171,7 @@ class MessageConverter:
             case _:
                 return []
 
-    def _use_robot(self, robot: m.Description, stamp_ns: int) -> list[Output]:
+    def _use_robot(self, robot: m.Description, stamp_ns: int) -> list[BagMessage]:
         """Use this description from now on, and return it as URDF with the fixed frames."""
         if len(robot.links) != len(robot.joints) + 1:
             return []
@@ -175,7 +184,7 @@ class MessageConverter:
 
     def _convert_joints(
         self, joints: m.JointState, robot: m.Description, frames: Frames, stamp_ns: int
-    ) -> list[Output]:
+    ) -> list[BagMessage]:
         names = [joint.name for joint in robot.joints]
         transforms = frames.make_joint_transforms(joints)
         return [
@@ -183,12 +192,12 @@ class MessageConverter:
             ("/tf", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms)),
         ]
 
-    def _convert_imus(self, imus: m.Imu, frames: Frames, stamp_ns: int) -> list[Output]:
+    def _convert_imus(self, imus: m.Imu, frames: Frames, stamp_ns: int) -> list[BagMessage]:
         """Return a message for each IMU, and its frame with the first one."""
-        outputs: list[Output] = []
+        outputs: list[BagMessage] = []
         for entry, link in enumerate(imus.link):
-            if link not in self._imu_links:
-                self._imu_links.add(link)
+            if link not in self._known_imu_links:
+                self._known_imu_links.add(link)
                 transforms = [frames.make_imu_transform(link)]
                 outputs.append(("/tf_static", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms)))
             topic = f"/{make_ros_name(frames.get_link_frame(link))}/imu"
@@ -197,7 +206,7 @@ class MessageConverter:
         return outputs
 
 
-def _convert_contacts(contacts: m.Contacts, robot: m.Description, frames: Frames, stamp_ns: int) -> list[Output]:
+def _convert_contacts(contacts: m.Contacts, robot: m.Description, frames: Frames, stamp_ns: int) -> list[BagMessage]:
     """Return a wrench for each link."""
     link_frames = [frames.get_link_frame(link) for link in range(len(robot.links))]
     wrenches = encode_wrenches(stamp_ns, link_frames, contacts)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.model.kinematics import find_nodes_w
+from snakesim_hal.model.kinematics import compute_body_points_w
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
@@ -30,9 +30,9 @@ from snakesim_operator.features.ros2.sensor_topics import SensorTopics, StaticFr
 from snakesim_operator.features.ros2.steering import CmdVelInput
 from snakesim_operator.features.ros2.urdf import make_urdf
 
-MARKERS_HZ = 5.0
-STATUS_HZ = 1.0
-SILENT_S = 2.0  # without a sample: its publisher is taken to be gone
+MARKER_RATE_HZ = 5.0
+STATUS_RATE_HZ = 1.0
+SILENCE_TIMEOUT_S = 2.0  # without a sample: its publisher is taken to be gone
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def is_consistent(robot: m.Description) -> bool:
     return len(robot.links) == len(robot.joints) + 1
 
 
-def _any_clock(_clock: m.Clock) -> bool:
+def _accept_any_clock(_clock: m.Clock) -> bool:
     return True
 
 
@@ -59,7 +59,7 @@ class Bridge:
     """One robot as one ROS node."""
 
     def __init__(self, session: Session, node: Node, robot: m.Description, options: BridgeOptions) -> None:
-        """Declare the topics, and publish the description of the robot.
+        """Declare the ROS topics, and publish the description of the robot.
 
         Args:
             session: Session on the robot's network.
@@ -70,23 +70,23 @@ class Bridge:
         self._session = session
         self._node = node
         self._options = options
-        self._cycle = 0
+        self._cycle_number = 0
         self.prefix = ""  # before the names of topics and frames
         if options.namespace:
             self.prefix = f"{options.namespace.strip('/')}/"
 
         # Robot time.
-        self._clocks = session.reader(keys.CLOCK, m.Clock)
+        self._clock_reader = session.declare_reader(keys.CLOCK, m.Clock)
         self._clock: m.Clock | None = None
         self._clock_arrival_s: float | None = time.monotonic()  # None: the user knows that the robot is silent
         self._ros_time = RosTime(wall_time=options.wall_time)
 
         # The newest messages of the robot.
-        self._descriptions = session.latched_reader(keys.DESCRIPTION, m.Description)
-        self._joints: m.JointState | None = None
+        self._description_reader = session.declare_latched_reader(keys.DESCRIPTION, m.Description)
+        self._joint_state: m.JointState | None = None
         self._world: m.World | None = None
         self._world_arrival_s = 0.0
-        self._undrawn_world: m.World | None = None  # its markers are not published
+        self._unpublished_world: m.World | None = None  # its markers are not published
 
         # ROS topics.
         self._declare_topics()
@@ -98,38 +98,38 @@ class Bridge:
         self._relays = self._make_relays(robot)
 
     def run_cycle(self) -> None:
-        """Forward what is due, in both directions."""
+        """Run one cycle of the bridge: forward new samples from the robot to ROS, and from ROS to the robot."""
         self._read_clock(time.monotonic())
         self._read_description()
         for relay in self._relays:
-            relay.poll(self._cycle, self._fits_robot)
+            relay.poll(self._cycle_number, self._matches_robot)
         if self._cmd_vel is not None:
             self._poll_cmd_vel(self._cmd_vel)
-        markers_are_due = self._cycle % self._cycles_between(MARKERS_HZ) == 0
-        if self._undrawn_world is not None and markers_are_due:
-            self._publish_markers(self._undrawn_world)
-            self._undrawn_world = None
-        self._cycle += 1
+        markers_are_due = self._cycle_number % self._count_cycles_between(MARKER_RATE_HZ) == 0
+        if self._unpublished_world is not None and markers_are_due:
+            self._publish_markers(self._unpublished_world)
+            self._unpublished_world = None
+        self._cycle_number += 1
 
     # --- setup
 
     def _declare_topics(self) -> None:
         """Declare the publishers of the topics that every robot has. /tf, /diagnostics and /clock have no namespace."""
-        self._joint_states = self._declare_publisher("joint_states", ros.JOINT_STATE)
+        self._joint_state_publisher = self._declare_publisher("joint_states", ros.JOINT_STATE)
         tf_topic = Topic("/tf", ros.TRANSFORMS, depth=100)
-        self._tf = self._node.declare_publisher(tf_topic)
+        self._transform_publisher = self._node.declare_publisher(tf_topic)
         static_topic = Topic("/tf_static", ros.TRANSFORMS, depth=1, latched=True)
         static_publisher = self._node.declare_publisher(static_topic)
         self._static_frames = StaticFrames(static_publisher, self._ros_time)
-        self._robot_description = self._declare_publisher("robot_description", ros.STRING, depth=1, latched=True)
-        self._contact_markers = self._declare_publisher("contacts", ros.MARKERS)
-        self._obstacle_markers = self._declare_publisher("obstacles", ros.MARKERS)
+        self._description_publisher = self._declare_publisher("robot_description", ros.STRING, depth=1, latched=True)
+        self._contact_marker_publisher = self._declare_publisher("contacts", ros.MARKERS)
+        self._obstacle_marker_publisher = self._declare_publisher("obstacles", ros.MARKERS)
         diagnostics_topic = Topic("/diagnostics", ros.DIAGNOSTICS)
-        self._diagnostics = self._node.declare_publisher(diagnostics_topic)
-        self._ros_clock: RosPublisher | None = None
+        self._diagnostics_publisher = self._node.declare_publisher(diagnostics_topic)
+        self._clock_publisher: RosPublisher | None = None
         if not self._options.wall_time:
             clock_topic = Topic("/clock", ros.CLOCK, depth=1, best_effort=True)
-            self._ros_clock = self._node.declare_publisher(clock_topic)
+            self._clock_publisher = self._node.declare_publisher(clock_topic)
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
         return self._node.declare_publisher(Topic(f"/{self.prefix}{name}", ros_type, **quality))
@@ -145,15 +145,15 @@ class Bridge:
         self._joint_names = [joint.name for joint in robot.joints]
         self._sensor_topics.set_robot(robot, self._frames)
         urdf = make_urdf(robot, self.prefix)
-        self._robot_description.publish(ros.encode_string(urdf))
+        self._description_publisher.publish(ros.encode_string(urdf))
         self._static_frames.reset(self._frames)
 
     def _make_relays(self, robot: m.Description) -> list[Relay[Any]]:
         """Return the relays of all keys that this robot has."""
         session = self._session
         every_cycle = 1
-        status_cycles = self._cycles_between(STATUS_HZ)
-        image_cycles = self._cycles_between(self._options.images_hz)
+        status_cycles = self._count_cycles_between(STATUS_RATE_HZ)
+        image_cycles = self._count_cycles_between(self._options.images_hz)
         relays: list[Relay[Any]] = [
             NewestRelay(session, keys.JOINTS, m.JointState, every_cycle, self._forward_joints),
             NewestRelay(session, keys.WORLD, m.World, every_cycle, self._forward_world),
@@ -165,22 +165,22 @@ class Bridge:
         relays += self._sensor_topics.make_relays(image_cycles)
         return relays
 
-    def _cycles_between(self, hz: float) -> int:
+    def _count_cycles_between(self, hz: float) -> int:
         """Return the number of bridge cycles between two messages that come at most at this rate."""
         return max(1, math.ceil(self._options.hz / hz))
 
-    def _fits_robot(self, message: m.Message) -> bool:
+    def _matches_robot(self, message: m.Message) -> bool:
         return find_mismatch(message, self._robot) is None
 
     # --- from the robot to ROS
 
     def _read_clock(self, now_s: float) -> None:
         """Read the robot's time, and report a restart of its host, its silence and its return to the user, once."""
-        clock = self._clocks.newest(_any_clock)
+        clock = self._clock_reader.pop_newest(_accept_any_clock)
         if clock is not None:
             self._update_clock(clock, now_s)
-        elif self._clock_arrival_s is not None and now_s - self._clock_arrival_s > SILENT_S:
-            print_line(f"no clock from the robot for {SILENT_S:g} s; waiting for it")
+        elif self._clock_arrival_s is not None and now_s - self._clock_arrival_s > SILENCE_TIMEOUT_S:
+            print_line(f"no clock from the robot for {SILENCE_TIMEOUT_S:g} s; waiting for it")
             self._clock_arrival_s = None
 
     def _update_clock(self, clock: m.Clock, now_s: float) -> None:
@@ -189,42 +189,42 @@ class Bridge:
             print_line("the robot's host has restarted: its time starts over")
         self._ros_time.add_clock(clock.timestamp_ns)
         self._clock = clock
-        if self._ros_clock is not None:
-            self._ros_clock.publish(ros.encode_clock(clock.timestamp_ns))
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(ros.encode_clock(clock.timestamp_ns))
         if self._clock_arrival_s is None:
             print_line("the robot is back")
         self._clock_arrival_s = now_s
 
     def _read_description(self) -> None:
-        robot = self._descriptions.newest(is_consistent)
+        robot = self._description_reader.pop_newest(is_consistent)
         if robot is not None and robot != self._robot:
             self._set_robot(robot)
 
     def _forward_joints(self, joints: m.JointState) -> None:
-        self._joints = joints
+        self._joint_state = joints
         timestamp_ns = self._ros_time.convert(joints.timestamp_ns)
         message = robot_in_ros.encode_joint_state(timestamp_ns, self._joint_names, joints)
-        self._joint_states.publish(message)
+        self._joint_state_publisher.publish(message)
         self._publish_transforms(joints.timestamp_ns, self._frames.make_joint_transforms(joints))
 
     def _forward_world(self, world: m.World) -> None:
         self._world = world
-        self._undrawn_world = world
+        self._unpublished_world = world
         self._world_arrival_s = time.monotonic()
         self._publish_transforms(_find_pose_time_ns(world), [self._frames.make_base_transform(world)])
 
     def _forward_pose(self, pose: m.Pose) -> None:
         """Publish the measured pose of the base, while no world model gives an estimate of it."""
-        if self._world_is_silent():
+        if self._is_world_model_silent():
             self._publish_transforms(pose.timestamp_ns, [self._frames.make_base_transform(pose)])
 
     def _publish_transforms(self, robot_ns: int, transforms: list[Transform]) -> None:
         timestamp_ns = self._ros_time.convert(robot_ns)
-        self._tf.publish(ros.encode_transforms(timestamp_ns, transforms))
+        self._transform_publisher.publish(ros.encode_transforms(timestamp_ns, transforms))
 
     def _forward_status(self, status: m.Status) -> None:
         timestamp_ns = self._ros_time.convert(status.timestamp_ns)
-        self._diagnostics.publish(robot_in_ros.encode_diagnostics(timestamp_ns, status))
+        self._diagnostics_publisher.publish(robot_in_ros.encode_diagnostics(timestamp_ns, status))
 
     def _publish_markers(self, world: m.World) -> None:
         """Publish the contacts and obstacles of a world model."""
@@ -234,13 +234,13 @@ class Bridge:
             contacts_ns = world.contacts_timestamp_ns
         contacts = robot_in_ros.make_contact_markers(world.contacts)
         timestamp_ns = self._ros_time.convert(contacts_ns)
-        self._contact_markers.publish(ros.encode_markers(timestamp_ns, frame, contacts))
+        self._contact_marker_publisher.publish(ros.encode_markers(timestamp_ns, frame, contacts))
         obstacles = robot_in_ros.make_obstacle_markers(world)
         timestamp_ns = self._ros_time.convert(world.timestamp_ns)
-        self._obstacle_markers.publish(ros.encode_markers(timestamp_ns, frame, obstacles))
+        self._obstacle_marker_publisher.publish(ros.encode_markers(timestamp_ns, frame, obstacles))
 
-    def _world_is_silent(self) -> bool:
-        return time.monotonic() - self._world_arrival_s > SILENT_S
+    def _is_world_model_silent(self) -> bool:
+        return time.monotonic() - self._world_arrival_s > SILENCE_TIMEOUT_S
 
     # --- from ROS to the robot
 
@@ -248,16 +248,19 @@ class Bridge:
         robot_ns: int | None = None
         if self._clock is not None and self._clock_arrival_s is not None:
             robot_ns = self._clock.timestamp_ns
-        cmd_vel.poll(robot_ns, self._find_heading)
+        cmd_vel.publish_newest_intent(robot_ns, self._find_heading)
 
     def _find_heading(self) -> float | None:
         """Return the direction from the tail to the head joint in the world in rad, or None if it is unknown."""
         world = self._world
-        joints = self._joints
-        if world is None or joints is None or self._world_is_silent():
+        joints = self._joint_state
+        if world is None or joints is None or self._is_world_model_silent():
             return None
-        nodes = find_nodes_w(self._robot, world.base_position_w, world.base_orientation_wxyz, joints.angle_rad)
-        tail_to_head = nodes[-2] - nodes[0]
+        body_points_w = compute_body_points_w(
+            self._robot, world.base_position_w, world.base_orientation_wxyz, joints.angle_rad
+        )
+        # From the tail end to the head joint: the last point is the head end, which swings with the head.
+        tail_to_head = body_points_w[-2] - body_points_w[0]
         return float(np.arctan2(tail_to_head[1], tail_to_head[0]))
 
 

@@ -10,7 +10,7 @@ from snakesim_operator.features.ros2 import messages as ros
 
 
 def sum_wrenches(contacts: Iterable[Contact], link_count: int) -> Floats:
-    """Return the sum of the contacts of each link, (links, 6): force in N and torque in N·m, in the link's frame.
+    """Sum the contact forces on each link, (links, 6): force in N and torque in N·m, in the link's frame.
 
     Obstacles exert these on the link. The torque is about the origin of the frame:
 
@@ -30,7 +30,7 @@ def sum_wrenches(contacts: Iterable[Contact], link_count: int) -> Floats:
 
 
 def encode_wrenches(timestamp_ns: int, frames: list[str], sample: Contacts) -> list[bytes]:
-    """Return a geometry_msgs/WrenchStamped in CDR for each link, also for links without contact.
+    """Encode the contacts as one geometry_msgs/WrenchStamped in CDR for each link, also for links without contact.
 
     Args:
         timestamp_ns: Time of the sample.

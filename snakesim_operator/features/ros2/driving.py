@@ -10,7 +10,7 @@ import time
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimError
 from snakesim_hal.base.terminal import PrintLine
-from snakesim_hal.base.workers import start_worker
+from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.network.commanding import CommandingClient
 from snakesim_hal.network.foreign_network import RawReader
@@ -21,8 +21,8 @@ from snakesim_operator.features.ros2.joint_commands import RosJointTargets
 from snakesim_operator.features.ros2.message_age import SenderClocks
 
 RETRY_S = 2.0  # after a lost connection
-PRESENT_S = 5.0  # within which a robot that is running describes itself
-END_TIMEOUT_S = 5.0  # for the thread
+DESCRIPTION_TIMEOUT_S = 5.0  # within which a robot that is running describes itself
+THREAD_END_TIMEOUT_S = 5.0  # for the thread
 
 
 class JointCommander:
@@ -35,78 +35,89 @@ class JointCommander:
             session: Session on the robot's network.
             messages: Messages of the ROS topic.
             print_text: Reports changes to the user.
-            wall_time: Whether timestamps in ROS are wall-clock time; else they are robot time.
+            wall_time: Whether timestamps in ROS are wall-clock time instead of robot time.
 
         Raises:
             RefusedError: The robot has a controller.
         """
-        if session.present(keys.alive_key(CONTROL)):
+        if session.list_tokens(keys.alive_key(CONTROL)):
             raise RefusedError(
                 "--joint-commands: the robot has a controller already, which holds the lease; run it without one: "
                 "--set services.control.external=true",
                 code="robot/has-controller",
             )
         self._session = session
-        self._messages = messages
+        self._message_reader = messages
         self._print_text = print_text
         self._wall_time = wall_time
-        self._senders = SenderClocks()
+        self._sender_clocks = SenderClocks()
         self._last_report = ""
-        self._ended = threading.Event()
-        self._thread = start_worker("driving", self._run, is_over=self._ended.is_set)
+        self._stop_event = threading.Event()
+        self._thread = start_restarting_thread(
+            "driving", self._command_until_closed, should_stop=self._stop_event.is_set
+        )
 
     def close(self) -> None:
         """End the thread, and with it the lease."""
-        self._ended.set()
-        self._thread.join(END_TIMEOUT_S)
+        self._stop_event.set()
+        self._thread.join(THREAD_END_TIMEOUT_S)
 
-    def _run(self) -> None:
+    def _command_until_closed(self) -> None:
         """Command the robot until `close`; after an error, wait and connect again."""
-        while not self._ended.is_set():
+        while not self._stop_event.is_set():
             try:
-                with contextlib.closing(self._session.part()) as part:
+                with contextlib.closing(self._session.create_subsession()) as part:
                     self._command_robot(part)
             except SnakesimError as error:
-                self._report(f"nothing is commanded from ROS: {error}")
-                self._ended.wait(RETRY_S)
+                self._report_change(f"nothing is commanded from ROS: {error}")
+                self._stop_event.wait(RETRY_S)
 
     def _command_robot(self, session: Session) -> None:
-        """Send setpoints in every tick. Raises NotConnectedError if the robot is lost or restarted."""
-        robot = session.latest(keys.DESCRIPTION, Description, PRESENT_S)
-        status = session.latest(keys.STATUS, Status, PRESENT_S)
+        """Send setpoints from ROS in every tick in which this process holds the lease, until `close`.
+
+        Args:
+            session: Session on the robot's network, for this connection alone.
+
+        Raises:
+            NotConnectedError: The robot is lost, or its host has restarted.
+        """
+        robot = session.wait_for_latched(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
+        status = session.wait_for_latched(keys.STATUS, Status, DESCRIPTION_TIMEOUT_S)
         if robot is None or status is None:
             raise NotConnectedError(
                 "the robot does not describe itself; is its HAL host running?", code="network/no-robot"
             )
-        commanding = CommandingClient(session, robot, status.clock_mode)
+        command_client = CommandingClient(session, robot, status.clock_mode)
         targets = RosJointTargets(robot)
-        self._report(f"joint commands from ROS move {robot.robot} once it is armed")
-        while not self._ended.is_set():
-            clock = commanding.wait()
-            if commanding.host_changed():
+        self._report_change(f"joint commands from ROS move {robot.robot} once it is armed")
+        while not self._stop_event.is_set():
+            clock = command_client.wait_for_tick()
+            if command_client.has_host_changed():
                 raise NotConnectedError("the robot's host has restarted", code="network/no-robot")
             self._read_messages(targets, clock)
-            joints = commanding.read(keys.JOINTS)
-            if not isinstance(joints, JointState):
+            joint_state = command_client.read(keys.JOINTS)
+            if not isinstance(joint_state, JointState):
                 continue
-            if commanding.mine or clock.lifecycle != "armed":
+            if command_client.holds_lease or clock.lifecycle != "armed":
                 # Without the lease too: a robot that is not armed makes the targets forget the last arm session.
-                setpoints = targets.make_setpoints(clock, joints)
-                if commanding.mine:
-                    commanding.send(setpoints)
+                setpoints = targets.make_setpoints(clock, joint_state)
+                if command_client.holds_lease:
+                    command_client.send_setpoints(setpoints)
 
     def _read_messages(self, targets: RosJointTargets, clock: Clock) -> None:
-        """Take over the targets of all messages that have arrived since the last tick."""
-        for message in self._messages.drain():
+        """Accept the joint targets of all messages that have arrived since the last tick, and report refused ones."""
+        for message in self._message_reader.drain():
             wall_ns = time.time_ns()
-            age_ns = self._senders.measure_age(message, wall_ns, time.monotonic_ns())
+            age_ns = self._sender_clocks.measure_age(message, wall_ns, time.monotonic_ns())
             ros_now_ns = clock.timestamp_ns
             if self._wall_time:
                 ros_now_ns = wall_ns
-            if not targets.accept(message.payload, clock.timestamp_ns, ros_now_ns, age_ns):
-                self._report(f"a message on joint_commands {targets.reason}; it is dropped, with all that are alike")
+            if not targets.accept_message(message.payload, clock.timestamp_ns, ros_now_ns, age_ns):
+                self._report_change(
+                    f"a message on joint_commands {targets.reason}; it is dropped, with all that are alike"
+                )
 
-    def _report(self, text: str) -> None:
+    def _report_change(self, text: str) -> None:
         """Show a text to the user, unless it is the same as the last one."""
         if text != self._last_report:
             self._last_report = text

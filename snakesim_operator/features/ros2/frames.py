@@ -13,7 +13,7 @@ import re
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, JointState, MountedSample, Pose, World
 from snakesim_operator.features.ros2.messages import Transform, Triple, Wxyz
 
-MAP = "map"
+MAP_FRAME = "map"
 ORIGIN: Triple = (0.0, 0.0, 0.0)
 NO_ROTATION: Wxyz = (1.0, 0.0, 0.0, 0.0)
 OPTICAL_IN_CAMERA: Wxyz = (0.5, -0.5, 0.5, -0.5)
@@ -42,7 +42,7 @@ class Frames:
         self.odom = f"{prefix}odom"
         self.base = f"{prefix}base_link"
         self.fixed = [
-            Transform(MAP, self.odom, ORIGIN, NO_ROTATION),
+            Transform(MAP_FRAME, self.odom, ORIGIN, NO_ROTATION),
             Transform(self.base, self.get_link_frame(0), ORIGIN, NO_ROTATION),
         ]
 
@@ -51,7 +51,7 @@ class Frames:
         return self._prefix + self._robot.links[link].name
 
     def get_optical_frame(self, kind: str, camera: str) -> str:
-        """Return the frame name of a camera's images. kind: depth or color."""
+        """Return the frame name of a camera's images. `kind` is `depth` or `color`."""
         return f"{self._prefix}{make_ros_name(camera)}_{kind}_optical_frame"
 
     def get_mount_frame(self, sensor: str) -> str:
@@ -80,7 +80,7 @@ class Frames:
             if not joints.valid[i]:
                 continue
             position = (self._robot.links[i].length_m, 0.0, 0.0)
-            orientation = _rotate_about(joint.axis, joints.angle_rad[i])
+            orientation = _make_joint_rotation(joint.axis, joints.angle_rad[i])
             transforms.append(Transform(self.get_link_frame(i), self.get_link_frame(i + 1), position, orientation))
         return transforms
 
@@ -97,7 +97,7 @@ class Frames:
         return [Transform(link_frame, self.get_mount_frame(sensor), sample.position_l, sample.orientation_l_wxyz)]
 
 
-def _rotate_about(axis: str, angle_rad: float) -> Wxyz:
+def _make_joint_rotation(axis: str, angle_rad: float) -> Wxyz:
     """Return the rotation of a joint as a quaternion: yaw turns about z, pitch about y."""
     cos_half = math.cos(angle_rad / 2)
     sin_half = math.sin(angle_rad / 2)

@@ -154,7 +154,7 @@ class Node:
     def declare_publisher(self, topic: Topic) -> RosPublisher:
         """Declare a publisher, which `ros2 topic info` then shows."""
         key = make_topic_key(self._domain, topic)
-        publisher = self._network.publisher(key, latched=topic.latched, background=topic.images)
+        publisher = self._network.declare_publisher(key, latched=topic.latched, background=topic.images)
         token = self._make_next_token(PUBLISHER, topic)
         self._network.declare_token(token)
         return RosPublisher(publisher, token)
@@ -165,13 +165,13 @@ class Node:
         Returns:
             A reader that keeps the newest messages in CDR with their attachments, as many as the topic's depth.
         """
-        reader = self._network.reader(make_topic_key(self._domain, topic), topic.depth)
+        reader = self._network.declare_reader(make_topic_key(self._domain, topic), topic.depth)
         self._network.declare_token(self._make_next_token(SUBSCRIPTION, topic))
         return reader
 
     def declare_service(self, service: Topic) -> RawQueryable:
         """Offer a service, which `ros2 service list` then shows, and return the queue of its requests in CDR."""
-        queryable = self._network.queryable(make_topic_key(self._domain, service))
+        queryable = self._network.declare_queryable(make_topic_key(self._domain, service))
         self._network.declare_token(self._make_next_token(SERVER, service))
         return queryable
 

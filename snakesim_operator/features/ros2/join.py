@@ -14,7 +14,7 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Description
-from snakesim_operator.base.targets import RobotSelection, only_robot
+from snakesim_operator.base.targets import RobotSelection, find_single_robot
 from snakesim_operator.features.ros2.bridge import Bridge, BridgeOptions, is_consistent
 from snakesim_operator.features.ros2.driving import JointCommander
 from snakesim_operator.features.ros2.graph import Node, NodeName, Topic
@@ -41,40 +41,40 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
         ConfigError: The robot itself is on the endpoint of the ROS router.
         NotConnectedError: There is no such robot, or no router of ROS nodes.
     """
-    link = _wait_for_robot(selection)
-    if link.endpoint == arguments.ros_router:
+    connection = _wait_for_robot(selection)
+    if connection.endpoint == arguments.ros_router:
         raise ConfigError(
-            f"--ros-router {arguments.ros_router}: {link.namespace} itself is on this endpoint, and ROS nodes are not "
-            f"let into its network. On one computer give the robot another port: --endpoint tcp/127.0.0.1:7448 behind "
-            "`snakesim run`; this command finds it there",
+            f"--ros-router {arguments.ros_router}: {connection.namespace} itself is on this endpoint, and ROS nodes "
+            f"are not let into its network. On one computer give the robot another port: --endpoint "
+            "tcp/127.0.0.1:7448 behind `snakesim run`; this command finds it there",
             code="network/invalid-address",
         )
-    with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.latest(keys.DESCRIPTION, Description, START_TIMEOUT_S, is_consistent)
+    with open_session(replace(connection, max_bytes=MAX_IMAGE_BYTES)) as session:
+        robot = session.wait_for_latched(keys.DESCRIPTION, Description, START_TIMEOUT_S, is_consistent)
         if robot is None:
             raise NotConnectedError(
-                f"{link.namespace} does not describe itself within {START_TIMEOUT_S:g} s", code="network/no-robot"
+                f"{connection.namespace} does not describe itself within {START_TIMEOUT_S:g} s", code="network/no-robot"
             )
         options = _make_options(arguments, robot)
-        with contextlib.ExitStack() as cleanup:
-            network = _connect_to_ros(arguments.ros_router, cleanup)
+        with contextlib.ExitStack() as exit_stack:
+            network = _connect_to_ros(arguments.ros_router, exit_stack)
             name = NodeName(NODE_NAME, f"/{options.namespace}")
             node = Node(network, arguments.domain, name)
             bridge = Bridge(session, node, robot, options)
-            servers = _make_servers(session, node, link, bridge.prefix, operate=arguments.operate)
+            servers = _make_servers(session, node, connection, bridge.prefix, operate=arguments.operate)
             for server in servers:
-                cleanup.callback(server.close)
+                exit_stack.callback(server.close)
             if arguments.joint_commands:
                 topic = Topic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=MAX_JOINT_COMMANDS)
                 messages = node.declare_subscription(topic)
                 commander = JointCommander(session, messages, print_line, wall_time=options.wall_time)
-                cleanup.callback(commander.close)
+                exit_stack.callback(commander.close)
             time_name = "robot"
             if options.wall_time:
                 time_name = "wall-clock"
             print_line(
-                f"{link.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; stamps are "
-                f"{time_name} time; Ctrl-C ends it"
+                f"{connection.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; "
+                f"stamps are {time_name} time; Ctrl-C ends it"
             )
             _run_cycles(bridge, servers, arguments.hz)
 
@@ -116,20 +116,20 @@ def _run_cycles(bridge: Bridge, servers: Sequence[ServiceServer], hz: float) -> 
     while True:
         bridge.run_cycle()
         for server in servers:
-            server.poll(print_line)
+            server.start_next_request(print_line)
         due_s = max(due_s + 1.0 / hz, time.monotonic())
         time.sleep(max(0.0, due_s - time.monotonic()))
 
 
 def _wait_for_robot(selection: RobotSelection) -> Link:
     """Return how to reach the selected robot; wait for a robot that is starting. Raises NotConnectedError."""
-    give_up_s = time.monotonic() + START_TIMEOUT_S
+    deadline_s = time.monotonic() + START_TIMEOUT_S
     is_reported = False
     while True:
         try:
-            return only_robot(selection, "start ros2")
+            return find_single_robot(selection, "start ros2")
         except NotConnectedError as error:
-            if time.monotonic() > give_up_s:
+            if time.monotonic() > deadline_s:
                 raise
             if not is_reported:
                 print_line(f"{error}. Waiting for it up to {START_TIMEOUT_S:g} s")

@@ -1,6 +1,6 @@
 """Turns sensor_msgs/JointState on joint_commands into setpoints for every joint of the robot.
 
-A message names any of the joints. Each named joint follows its target for VALID_NS of robot time from when the
+A message names any of the joints. Each named joint follows its target for TARGET_LIFETIME_NS of robot time after the
 message was sent; then it holds the angle that it has. A joint without a target since the robot was armed holds its
 angle as well. Targets that arrive while the robot is not armed are dropped.
 """
@@ -13,10 +13,10 @@ from rosbags.serde import SerdeError
 
 from snakesim_hal.wire.messages import Clock, Description, JointState, Mode
 from snakesim_hal.wire.setpoints import RequestedSetpoints
-from snakesim_operator.features.ros2.message_age import explain_age_refusal
-from snakesim_operator.features.ros2.messages import JOINT_STATE, STORE
+from snakesim_operator.features.ros2.message_age import find_age_problem
+from snakesim_operator.features.ros2.messages import JOINT_STATE, TYPE_STORE
 
-VALID_NS = 500_000_000  # of a joint's target in robot time
+TARGET_LIFETIME_NS = 500_000_000  # of a joint's target in robot time
 MODE_FIELDS = ((Mode.POSITION, "position"), (Mode.VELOCITY, "velocity"), (Mode.TORQUE, "effort"))
 MAX_NAME_SHOWN = 40  # characters of an unknown joint name in a message to the user
 
@@ -40,7 +40,7 @@ class _JointTarget:
 
     mode: Mode
     target: float
-    until_ns: int  # robot time
+    valid_until_ns: int  # robot time
 
 
 class RosJointTargets:
@@ -52,17 +52,17 @@ class RosJointTargets:
         self._torque_limits_nm = [joint.torque_limit_nm for joint in robot.joints]
         self._targets: list[_JointTarget | None] = [None] * len(robot.joints)
         self._held_angles_rad: list[float | None] = [None] * len(robot.joints)  # None: not holding yet
-        self.rejected = 0  # messages
+        self.rejected_count = 0  # messages
         self.reason = ""  # for the newest rejection
 
-    def accept(self, payload: bytes, now_ns: int, ros_now_ns: int | None = None, age_ns: int = 0) -> bool:
-        """Take over the targets of a message: either all of them or none.
+    def accept_message(self, payload: bytes, now_ns: int, ros_now_ns: int | None = None, age_ns: int = 0) -> bool:
+        """Accept the targets of a message as the newest ones of their joints: either all of them or none.
 
         Args:
             payload: The message in CDR.
-            now_ns: Robot time.
-            ros_now_ns: Present time in ROS, to compare with a header's timestamp; None: robot time.
-            age_ns: How long ago the message was sent, for a message without a timestamp.
+            now_ns: Current robot time.
+            ros_now_ns: Current time in ROS, to compare with the timestamp of a header; None for robot time.
+            age_ns: Age of the message since it was sent, for a message without a timestamp.
 
         Returns:
             Whether the message was accepted. If not, `reason` explains it.
@@ -70,13 +70,13 @@ class RosJointTargets:
         if ros_now_ns is None:
             ros_now_ns = now_ns
         try:
-            command = self._decode(payload)
-            age_ns = _check_age(command, age_ns, ros_now_ns)
+            command = self._decode_command(payload)
+            age_ns = _determine_age_ns(command, age_ns, ros_now_ns)
         except _RefusedMessageError as error:
-            self.rejected += 1
+            self.rejected_count += 1
             self.reason = str(error)
             return False
-        until_ns = now_ns - max(age_ns, 0) + VALID_NS
+        until_ns = now_ns - max(age_ns, 0) + TARGET_LIFETIME_NS
         for i, target in command.targets.items():
             self._targets[i] = _JointTarget(command.mode, target, until_ns)
             self._held_angles_rad[i] = None
@@ -92,15 +92,15 @@ class RosJointTargets:
         targets = [0.0] * joint_count
         for i in range(joint_count):
             target = self._targets[i]
-            if target is not None and clock.timestamp_ns <= target.until_ns:
+            if target is not None and clock.timestamp_ns <= target.valid_until_ns:
                 modes[i] = target.mode
                 targets[i] = target.target
                 continue
             self._targets[i] = None
-            targets[i] = self._hold(i, joints)
+            targets[i] = self._hold_angle_rad(i, joints)
         return RequestedSetpoints(modes, targets, self._torque_limits_nm)
 
-    def _hold(self, joint: int, joints: JointState) -> float:
+    def _hold_angle_rad(self, joint: int, joints: JointState) -> float:
         """Return the angle in rad that a joint had when it began to hold.
 
         The angle stays, because a joint that held its present angle in each cycle would sink under its load.
@@ -111,8 +111,8 @@ class RosJointTargets:
             self._held_angles_rad[joint] = held_rad
         return held_rad
 
-    def _decode(self, payload: bytes) -> _JointCommand:
-        """Return mode, targets and timestamp of a sensor_msgs/JointState that commands joints.
+    def _decode_command(self, payload: bytes) -> _JointCommand:
+        """Decode mode, targets and timestamp of a sensor_msgs/JointState that commands joints.
 
         Args:
             payload: The message in CDR.
@@ -121,10 +121,10 @@ class RosJointTargets:
             _RefusedMessageError: The message is malformed, or a target is not allowed.
         """
         try:
-            message: Any = STORE.deserialize_cdr(payload, JOINT_STATE.name)
+            message: Any = TYPE_STORE.deserialize_cdr(payload, JOINT_STATE.name)
         except SerdeError as error:
             raise _RefusedMessageError(f"is no sensor_msgs/JointState: {error}") from None
-        mode, field = _find_mode(message)
+        mode, field = _find_commanded_mode(message)
         values = [float(value) for value in getattr(message, field)]
         has_duplicates = len(set(message.name)) != len(message.name)
         if len(values) != len(message.name) or has_duplicates:
@@ -133,13 +133,13 @@ class RosJointTargets:
             )
         targets: dict[int, float] = {}
         for name, value in zip(message.name, values, strict=True):
-            self._check_target(name, mode, field, value)
+            self._validate_target(name, mode, field, value)
             targets[self._joint_indices[name]] = value
-        stamp = message.header.stamp
-        timestamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        ros_time = message.header.stamp
+        timestamp_ns = ros_time.sec * 1_000_000_000 + ros_time.nanosec
         return _JointCommand(mode, targets, timestamp_ns)
 
-    def _check_target(self, name: str, mode: Mode, field: str, value: float) -> None:
+    def _validate_target(self, name: str, mode: Mode, field: str, value: float) -> None:
         """Raise _RefusedMessageError for a target that this robot's joint cannot follow."""
         if name not in self._joint_indices:
             known_names = ", ".join(self._joint_indices)
@@ -152,13 +152,13 @@ class RosJointTargets:
             raise _RefusedMessageError(f"has {field} for {name}, whose drive takes {supported}")
 
 
-def _check_age(command: _JointCommand, age_ns: int, ros_now_ns: int) -> int:
-    """Return the age of a command in ns.
+def _determine_age_ns(command: _JointCommand, age_ns: int, ros_now_ns: int) -> int:
+    """Determine the age of a command in ns, and refuse a command that is too old.
 
     Args:
-        command: The command; the timestamp of its header counts, if it has one.
-        age_ns: Its age by the times of its sender's messages.
-        ros_now_ns: Present time in ROS.
+        command: The command; its age follows from the timestamp of its header, if it has one.
+        age_ns: Age of the command by the times of its sender's messages, for a command without a timestamp.
+        ros_now_ns: Current time in ROS.
 
     Raises:
         _RefusedMessageError: The command is too old, or comes from the future.
@@ -167,13 +167,13 @@ def _check_age(command: _JointCommand, age_ns: int, ros_now_ns: int) -> int:
     if command.timestamp_ns:
         age_ns = ros_now_ns - command.timestamp_ns
         source = "the stamp of its header"
-    refusal = explain_age_refusal(age_ns, source)
+    refusal = find_age_problem(age_ns, source)
     if refusal:
         raise _RefusedMessageError(refusal)
     return age_ns
 
 
-def _find_mode(message: Any) -> tuple[Mode, str]:
+def _find_commanded_mode(message: Any) -> tuple[Mode, str]:
     """Return the mode that a message commands, and the name of its field: the first field that is not empty counts.
 
     Raises _RefusedMessageError.

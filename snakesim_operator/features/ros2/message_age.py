@@ -14,14 +14,14 @@ from snakesim_hal.network.foreign_network import RawSample
 from snakesim_operator.features.ros2.graph import ATTACHMENT, GID_BYTES
 
 MAX_AGE_NS = 500_000_000  # of a message that moves a robot
-MAX_AHEAD_NS = 100_000_000  # of a header's timestamp: two clocks are not read at the same time
+MAX_FUTURE_NS = 100_000_000  # of a header's timestamp: two clocks are not read at the same time
 MAX_REQUEST_AGE_NS = 5_000_000_000  # of a service request that allows a robot to move
 MAX_SENDERS = 64  # bounds the memory that a flood of senders can take
 WINDOW_PART_NS = 10_000_000_000
 WINDOW_PARTS = 12  # times WINDOW_PART_NS: the two minutes in which the fastest message is searched
 
 
-class _FastestMessage:
+class _MinimumOffset:
     """The smallest difference between our wall clock and a sender's, for each part of the last two minutes.
 
     Each difference is clock offset plus latency, so the smallest one belongs to the fastest message.
@@ -48,28 +48,30 @@ class SenderClocks:
     """Measures the delay of each message by comparison with the fastest message of its sender."""
 
     def __init__(self) -> None:
-        self._fastest: OrderedDict[bytes, _FastestMessage] = OrderedDict()  # by sender, longest silent first
+        self._min_offset_by_sender: OrderedDict[bytes, _MinimumOffset] = (
+            OrderedDict()
+        )  # by sender, longest silent first
 
     def measure_age(self, sample: RawSample, wall_ns: int, monotonic_ns: int) -> int:
-        """Return the age of a message in ns, since it was sent as far as that is known.
+        """Measure the age of a message in ns, by comparison with the fastest message of its sender.
 
         The age is never below the time that the message has waited in this process.
 
         Args:
             sample: The message with its attachment and its arrival time.
-            wall_ns: Present time of our wall clock.
-            monotonic_ns: Present monotonic time.
+            wall_ns: Current time of this computer's wall clock.
+            monotonic_ns: Current monotonic time.
         """
         waiting_ns = monotonic_ns - sample.arrived_ns
-        origin = read_sender(sample.attachment)
-        if origin is None:
+        sender_and_time = read_sender(sample.attachment)
+        if sender_and_time is None:
             return waiting_ns
-        sender, sent_ns = origin
-        fastest = self._fastest.setdefault(sender, _FastestMessage())
-        self._fastest.move_to_end(sender)
-        while len(self._fastest) > MAX_SENDERS:
-            self._fastest.popitem(last=False)
-        delay_ns = fastest.add_offset(wall_ns - sent_ns, monotonic_ns)
+        sender, sent_ns = sender_and_time
+        min_offset = self._min_offset_by_sender.setdefault(sender, _MinimumOffset())
+        self._min_offset_by_sender.move_to_end(sender)
+        while len(self._min_offset_by_sender) > MAX_SENDERS:
+            self._min_offset_by_sender.popitem(last=False)
+        delay_ns = min_offset.add_offset(wall_ns - sent_ns, monotonic_ns)
         return max(delay_ns, waiting_ns)
 
 
@@ -83,16 +85,19 @@ def read_sender(attachment: bytes) -> tuple[bytes, int] | None:
     return sender, sent_ns
 
 
-def explain_age_refusal(age_ns: float, source: str) -> str:
-    """Return why a message may not move the robot; empty if it may.
+def find_age_problem(age_ns: float, source: str) -> str:
+    """Find out whether a message is too old, or too far in the future, to move the robot.
 
     Args:
         age_ns: Age of the message; negative for a timestamp in the future.
-        source: What the age was measured by, in words.
+        source: How the age was measured, as a text for the reason.
+
+    Returns:
+        The reason to refuse the message; empty if the message may move the robot.
     """
     if age_ns > MAX_AGE_NS:
         return f"is older than {MAX_AGE_NS * 1e-9:g} s by {source}"
-    if age_ns < -MAX_AHEAD_NS:
+    if age_ns < -MAX_FUTURE_NS:
         return (
             f"is ahead of the time in ROS by {source}; give robot time (use_sim_time) when the bridge publishes "
             "/clock, synchronised wall-clock time otherwise, or no stamp"
@@ -100,20 +105,23 @@ def explain_age_refusal(age_ns: float, source: str) -> str:
     return ""
 
 
-def explain_request_age_refusal(attachment: bytes, wall_ns: int) -> str:
-    """Return why a service request is too old to let the robot move; empty if it is recent.
+def find_request_age_problem(attachment: bytes, wall_ns: int) -> str:
+    """Find out whether a service request is too old to let the robot move.
 
     A client sends a single request, so there is no faster message to compare with: its clock must agree with ours to
     within MAX_REQUEST_AGE_NS.
 
     Args:
         attachment: Attachment of the request, with the time at which it was sent.
-        wall_ns: Present time of this computer's wall clock.
+        wall_ns: Current time of this computer's wall clock.
+
+    Returns:
+        The reason to refuse the request; empty if the request is recent.
     """
-    origin = read_sender(attachment)
-    if origin is None:
+    sender_and_time = read_sender(attachment)
+    if sender_and_time is None:
         return "the request has no time attached"
-    _, sent_ns = origin
+    _, sent_ns = sender_and_time
     age_ns = wall_ns - sent_ns
     if abs(age_ns) <= MAX_REQUEST_AGE_NS:
         return ""

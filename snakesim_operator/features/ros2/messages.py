@@ -14,11 +14,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from snakesim_operator.features.ros2.graph import RosType
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPE_STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 def _define_type(name: str) -> RosType:
-    return RosType(name, STORE.hash_rihs01(name))
+    return RosType(name, TYPE_STORE.hash_rihs01(name))
 
 
 JOINT_STATE = _define_type("sensor_msgs/msg/JointState")
@@ -29,7 +29,7 @@ COMPRESSED_IMAGE = _define_type("sensor_msgs/msg/CompressedImage")
 IMU = _define_type("sensor_msgs/msg/Imu")
 CAMERA_INFO = _define_type("sensor_msgs/msg/CameraInfo")
 LASER_SCAN = _define_type("sensor_msgs/msg/LaserScan")
-NUMBERS = _define_type("std_msgs/msg/Float64MultiArray")
+FLOAT64_ARRAY = _define_type("std_msgs/msg/Float64MultiArray")
 STRING = _define_type("std_msgs/msg/String")
 CLOCK = _define_type("rosgraph_msgs/msg/Clock")
 TWIST = _define_type("geometry_msgs/msg/Twist")
@@ -78,14 +78,14 @@ class Marker:
 
 def make_message(type_name: str, *fields: Any) -> Any:
     """Return a ROS message object with these fields, in the order of their definition."""
-    message_types: Any = STORE.types
+    message_types: Any = TYPE_STORE.types
     return message_types[type_name](*fields)
 
 
 def encode_message(ros_type: RosType, *fields: Any) -> bytes:
     """Return a message in CDR with these fields, in the order of their definition."""
     message = make_message(ros_type.name, *fields)
-    return bytes(STORE.serialize_cdr(message, ros_type.name))
+    return bytes(TYPE_STORE.serialize_cdr(message, ros_type.name))
 
 
 def _make_time(timestamp_ns: int) -> Any:
@@ -95,7 +95,7 @@ def _make_time(timestamp_ns: int) -> Any:
 
 
 def make_header(timestamp_ns: int, frame: str) -> Any:
-    """Return the header of a message. frame: empty for a message that belongs to no frame."""
+    """Make the header of a message. `frame` is empty for a message that belongs to no frame."""
     return make_message("std_msgs/msg/Header", _make_time(timestamp_ns), frame)
 
 
@@ -152,13 +152,13 @@ def encode_markers(timestamp_ns: int, frame: str, shapes: Sequence[Marker]) -> b
     return encode_message(MARKERS, markers)
 
 
-def _make_marker(header: Any, number: int, action: int, shape: Marker) -> Any:
-    """Return a visualization_msgs/Marker; its fields are in the order of their definition.
+def _make_marker(header: Any, marker_id: int, action: int, shape: Marker) -> Any:
+    """Make a visualization_msgs/Marker; its fields are in the order of their definition.
 
     Args:
         header: Header of the message, with time and frame.
-        number: Number of the marker in its group.
-        action: ADD or DELETE, as the message defines them.
+        marker_id: Number of the marker in its group.
+        action: ADD or DELETE_ALL, as the message defines them.
         shape: Shape, size in m, pose and color.
     """
     position = _make_point(shape.position_m)
@@ -170,7 +170,7 @@ def _make_marker(header: Any, number: int, action: int, shape: Marker) -> Any:
         "visualization_msgs/msg/Marker",
         header,
         shape.group,  # ns
-        number,  # id
+        marker_id,  # id
         shape.shape,  # type
         action,
         make_message("geometry_msgs/msg/Pose", position, orientation),
@@ -216,7 +216,7 @@ def encode_image(timestamp_ns: int, frame: str, width: int, height: int, encodin
 
 
 def encode_compressed_image(timestamp_ns: int, frame: str, format_: str, data: bytes) -> bytes:
-    """Return a sensor_msgs/CompressedImage in CDR. format_: as the plug-ins of image_transport read it."""
+    """Encode a sensor_msgs/CompressedImage in CDR. `format_` is the text that plug-ins of image_transport read."""
     return encode_message(COMPRESSED_IMAGE, make_header(timestamp_ns, frame), format_, _make_octets(data))
 
 
@@ -227,7 +227,7 @@ def decode_twist(payload: bytes) -> tuple[float, ...] | None:
         Six numbers, or None if the payload is no Twist.
     """
     try:
-        twist: Any = STORE.deserialize_cdr(payload, TWIST.name)
+        twist: Any = TYPE_STORE.deserialize_cdr(payload, TWIST.name)
     except SerdeError:
         return None
     linear = twist.linear

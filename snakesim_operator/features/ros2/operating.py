@@ -11,11 +11,11 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, LifecycleRequest, Status, make_arm_request
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.features.ros2.graph import Node
-from snakesim_operator.features.ros2.message_age import explain_request_age_refusal
+from snakesim_operator.features.ros2.message_age import find_request_age_problem
 from snakesim_operator.features.ros2.server import ServiceServer, run_action
 from snakesim_operator.features.ros2.service_types import TRIGGER
 from snakesim_operator.robot_commands.command import request_from_host
-from snakesim_operator.robot_commands.stop import estop
+from snakesim_operator.robot_commands.stop import stop_robots
 
 DESCRIPTION_TIMEOUT_S = 3.0
 READY_TIMEOUT_S = 5.0  # a controller may be starting
@@ -23,25 +23,25 @@ REQUESTER = f"{get_user_name()[:40]}, ros2"
 
 
 def make_operating_servers(
-    session: Session, node: Node, link: Link, prefix: str, *, operate: bool
+    session: Session, node: Node, connection: Link, prefix: str, *, operate: bool
 ) -> list[ServiceServer]:
     """Declare the ROS services that stop the robot and, if ROS may operate it, arm, disarm and reset it.
 
     Args:
         session: Session on the robot's network.
         node: The ROS node that offers them.
-        link: How to reach the robot.
+        connection: Addresses and certificates with which the robot is reached.
         prefix: Namespace of the services, with a slash behind it, or empty.
         operate: Whether ROS may arm, disarm and reset; stop is always offered.
     """
-    operator = _Operator(session, link)
+    operator = _Operator(session, connection)
     servers = [_make_trigger_server(node, f"/{prefix}stop", operator.stop)]
     if operate:
         arm = ServiceServer(
             node,
             f"/{prefix}arm",
             TRIGGER,
-            _make_trigger_answer(operator.arm),
+            _make_trigger_handler(operator.arm),
             make_refusal=_make_trigger_refusal,
             explain_refusal=_explain_late_arm_request,
         )
@@ -52,10 +52,10 @@ def make_operating_servers(
 
 
 def _make_trigger_server(node: Node, name: str, action: Callable[[], str]) -> ServiceServer:
-    return ServiceServer(node, name, TRIGGER, _make_trigger_answer(action), make_refusal=_make_trigger_refusal)
+    return ServiceServer(node, name, TRIGGER, _make_trigger_handler(action), make_refusal=_make_trigger_refusal)
 
 
-def _make_trigger_answer(action: Callable[[], str]) -> Callable[[Any], bytes]:
+def _make_trigger_handler(action: Callable[[], str]) -> Callable[[Any], bytes]:
     def answer(_request: Any) -> bytes:
         succeeded, text = run_action(action)
         return TRIGGER.encode_response(succeeded, text)
@@ -72,7 +72,7 @@ def _explain_late_arm_request(attachment: bytes) -> str:
 
     A network that stalls may deliver a request long after the client has stopped waiting.
     """
-    return explain_request_age_refusal(attachment, time.time_ns())
+    return find_request_age_problem(attachment, time.time_ns())
 
 
 class _Operator:
@@ -86,31 +86,31 @@ class _Operator:
         """Stop the robot by `snakesim estop`. Raises RefusedError if the robot does not confirm it."""
         lines: list[str] = []
         robot = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
-        exit_code = estop(robot, lines.append)
+        exit_code = stop_robots(robot, lines.append)
         if exit_code != 0:
             raise RefusedError(*lines)
         return "; ".join(lines)
 
     def arm(self) -> str:
         """Arm the robot that the host describes at present."""
-        robot = self._session.latest(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
+        robot = self._session.wait_for_latched(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
         if robot is None:
             raise NotConnectedError(
                 f"{self._link.namespace} publishes no description; is its HAL host running?", code="network/no-robot"
             )
         # If it does not become ready, the host's answer to the request gives the reason.
-        self._session.latest(keys.STATUS, Status, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
-        return self._request(make_arm_request(robot, REQUESTER), "armed")
+        self._session.wait_for_latched(keys.STATUS, Status, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
+        return self._send_lifecycle_request(make_arm_request(robot, REQUESTER), "armed")
 
     def disarm(self) -> str:
         """Disarm the robot."""
-        return self._request(LifecycleRequest(action="disarm", requester=REQUESTER), "disarmed")
+        return self._send_lifecycle_request(LifecycleRequest(action="disarm", requester=REQUESTER), "disarmed")
 
     def reset(self) -> str:
         """Reset the robot's fault."""
-        return self._request(LifecycleRequest(action="reset", requester=REQUESTER), "reset")
+        return self._send_lifecycle_request(LifecycleRequest(action="reset", requester=REQUESTER), "reset")
 
-    def _request(self, request: LifecycleRequest, done: str) -> str:
+    def _send_lifecycle_request(self, request: LifecycleRequest, done: str) -> str:
         lines: list[str] = []
         request_from_host(self._session, keys.LIFECYCLE, request, done, self._link, lines.append)
         return "; ".join(lines)

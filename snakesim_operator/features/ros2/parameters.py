@@ -22,7 +22,7 @@ from snakesim_operator.robot_commands.parameters import (
     Parameter,
     change_parameters,
     format_value,
-    read_parameters,
+    parse_parameters,
     read_parameters_in_force,
 )
 
@@ -46,16 +46,16 @@ NOT_ALLOWED = "this bridge only watches: start it with --operate to let ROS set 
 
 
 def make_parameter_servers(session: Session, node: Node, node_name: str, *, operate: bool) -> list[ServiceServer]:
-    """Declare the six parameter services of a node.
+    """Declare the six parameter services of a ROS node, and return their servers.
 
     Args:
         session: Session on the robot's network.
         node: The ROS node.
-        node_name: Its name with its namespace.
+        node_name: Name of the node with its namespace.
         operate: Whether ROS may set parameters.
     """
     services = ParameterServices(session, operate=operate)
-    answers = (
+    handlers = (
         ("list_parameters", types.LIST_PARAMETERS, services.list_parameters),
         ("get_parameters", types.GET_PARAMETERS, services.get_parameters),
         ("get_parameter_types", types.GET_PARAMETER_TYPES, services.get_parameter_types),
@@ -64,7 +64,8 @@ def make_parameter_servers(session: Session, node: Node, node_name: str, *, oper
         ("set_parameters_atomically", types.SET_PARAMETERS_ATOMICALLY, services.set_parameters_atomically),
     )
     return [
-        ServiceServer(node, f"{node_name}/{name}", service, answer, QUEUE_DEPTH) for name, service, answer in answers
+        ServiceServer(node, f"{node_name}/{name}", service, handle_request, QUEUE_DEPTH)
+        for name, service, handle_request in handlers
     ]
 
 
@@ -79,7 +80,7 @@ class ParameterServices:
         """List the names below one of the requested prefixes; without a prefix, list all."""
         names: list[str] = []
         for name in self._read_parameters():
-            if not request.prefixes or any(_is_below(name, prefix) for prefix in request.prefixes):
+            if not request.prefixes or any(_has_prefix(name, prefix) for prefix in request.prefixes):
                 names.append(name)
         prefixes: list[str] = []
         if names:
@@ -94,7 +95,7 @@ class ParameterServices:
 
     def get_parameter_types(self, request: Any) -> bytes:
         """Return the types of the requested values."""
-        kinds = [_find_type(value) for value in self._read_values(request.names)]
+        kinds = [_find_parameter_type(value) for value in self._read_values(request.names)]
         return types.GET_PARAMETER_TYPES.encode_response(np.array(kinds, dtype=np.uint8))
 
     def describe_parameters(self, request: Any) -> bytes:
@@ -105,12 +106,12 @@ class ParameterServices:
 
     def set_parameters(self, request: Any) -> bytes:
         """Set the parameters one after the other; each one succeeds or fails for itself."""
-        results = [self._set([parameter]) for parameter in request.parameters]
+        results = [self._set_and_make_result([parameter]) for parameter in request.parameters]
         return types.SET_PARAMETERS.encode_response(results)
 
     def set_parameters_atomically(self, request: Any) -> bytes:
         """Set all of the parameters or none of them."""
-        return types.SET_PARAMETERS_ATOMICALLY.encode_response(self._set(request.parameters))
+        return types.SET_PARAMETERS_ATOMICALLY.encode_response(self._set_and_make_result(request.parameters))
 
     def _read_parameters(self) -> dict[str, Parameter]:
         """Return the controller's parameters by name; none if no controller publishes any."""
@@ -118,7 +119,7 @@ class ParameterServices:
             in_force = read_parameters_in_force(self._session)
         except NotConnectedError:
             return {}
-        return {PREFIX + parameter.name: parameter for parameter in read_parameters(in_force)}
+        return {PREFIX + parameter.name: parameter for parameter in parse_parameters(in_force)}
 
     def _read_values(self, names: Sequence[str]) -> list[Any]:
         """Return the value of each name; None for an unknown one."""
@@ -131,25 +132,25 @@ class ParameterServices:
                 values.append(None)
         return values
 
-    def _set(self, parameters: Sequence[Any]) -> Any:
+    def _set_and_make_result(self, parameters: Sequence[Any]) -> Any:
         """Set parameters in one request to the controller, and return an rcl_interfaces/SetParametersResult."""
         succeeded = False
         reason = NOT_ALLOWED
         if self._operate:
-            succeeded, reason = run_action(lambda: self._change(parameters))
+            succeeded, reason = run_action(lambda: self._change_parameters(parameters))
         return make_message("rcl_interfaces/msg/SetParametersResult", succeeded, reason)
 
-    def _change(self, parameters: Sequence[Any]) -> str:
+    def _change_parameters(self, parameters: Sequence[Any]) -> str:
         values = {parameter.name: _decode_value(parameter.value) for parameter in parameters}
         change_parameters(self._session, values, REQUESTER)
         return ""
 
 
-def _is_below(name: str, prefix: str) -> bool:
+def _has_prefix(name: str, prefix: str) -> bool:
     return name == prefix or name.startswith(f"{prefix}.")
 
 
-def _find_type(value: Any) -> int:
+def _find_parameter_type(value: Any) -> int:
     """Return the rcl_interfaces/ParameterType of a value."""
     if value is None:
         return NOT_SET
@@ -162,34 +163,34 @@ def _find_type(value: Any) -> int:
 
 
 def _encode_value(value: Any) -> Any:
-    """Return the value of a controller parameter as an rcl_interfaces/ParameterValue.
+    """Encode the value of a controller parameter as an rcl_interfaces/ParameterValue.
 
     The message has one field for each type, and the number of the type whose field is valid. A value whose type ROS
     does not have becomes a text of JSON.
     """
-    kind = _find_type(value)
-    fields: dict[int, Any] = {BOOL: False, INTEGER: 0, DOUBLE: 0.0, STRING: "", DOUBLES: [], STRINGS: []}
-    if kind == STRING:
-        fields[STRING] = format_value(value)
-    elif kind == STRINGS:
-        fields[STRINGS] = [format_value(element) for element in value]
-    elif kind != NOT_SET:
-        fields[kind] = value
+    type_number = _find_parameter_type(value)
+    value_by_type: dict[int, Any] = {BOOL: False, INTEGER: 0, DOUBLE: 0.0, STRING: "", DOUBLES: [], STRINGS: []}
+    if type_number == STRING:
+        value_by_type[STRING] = format_value(value)
+    elif type_number == STRINGS:
+        value_by_type[STRINGS] = [format_value(element) for element in value]
+    elif type_number != NOT_SET:
+        value_by_type[type_number] = value
     no_bytes = np.array([], dtype=np.uint8)
     no_booleans = np.array([], dtype=np.bool_)
     no_integers = np.array([], dtype=np.int64)
     return make_message(
         "rcl_interfaces/msg/ParameterValue",
-        kind,
-        fields[BOOL],
-        fields[INTEGER],
-        fields[DOUBLE],
-        fields[STRING],
+        type_number,
+        value_by_type[BOOL],
+        value_by_type[INTEGER],
+        value_by_type[DOUBLE],
+        value_by_type[STRING],
         no_bytes,
         no_booleans,
         no_integers,
-        np.array(fields[DOUBLES], dtype=np.float64),
-        fields[STRINGS],
+        np.array(value_by_type[DOUBLES], dtype=np.float64),
+        value_by_type[STRINGS],
     )
 
 
@@ -205,28 +206,28 @@ def _decode_value(value: Any) -> Any:
 
 
 def _make_descriptor(name: str, parameter: Parameter | None) -> Any:
-    """Return an rcl_interfaces/ParameterDescriptor; an empty one for an unknown parameter.
+    """Make an rcl_interfaces/ParameterDescriptor of a parameter; it is empty for an unknown parameter.
 
     Args:
-        name: Name that was asked for.
-        parameter: The parameter of the controller; None if there is none of this name.
+        name: Name that the client requested.
+        parameter: The parameter of the controller; None if the controller has none of this name.
     """
     if parameter is None:
         return make_message("rcl_interfaces/msg/ParameterDescriptor", name, NOT_SET, "", "", False, False, [], [])
-    kind = _find_type(parameter.value)
+    type_number = _find_parameter_type(parameter.value)
     description = parameter.description
     if parameter.unit not in ("", "1"):
         description = f"{parameter.description} [{parameter.unit}]"
     floating_point_ranges: list[Any] = []
     has_limits = parameter.minimum is not None or parameter.maximum is not None
-    if kind == DOUBLE and has_limits:
+    if type_number == DOUBLE and has_limits:
         floating_point_ranges.append(_make_range(parameter))
     return make_message(
         "rcl_interfaces/msg/ParameterDescriptor",
         name,
-        kind,
+        type_number,
         description,
-        parameter.range,  # additional_constraints
+        parameter.range_text,  # additional_constraints
         False,  # read_only
         False,  # dynamic_typing
         floating_point_ranges,

@@ -23,7 +23,7 @@ class ImuMeasurement(NamedTuple):
     entry: int  # of the IMU in the lists of the sample
 
 
-def _always() -> bool:
+def _has_always_subscriber() -> bool:
     return True
 
 
@@ -34,7 +34,7 @@ class Relay(ABC, Generic[MessageT]):
     travel through the robot's network.
     """
 
-    depth: int | None = MAX_SAMPLES  # samples that are kept until the next poll; None: all
+    depth: int | None = MAX_SAMPLES  # samples that are kept until the next poll; None for all
 
     def __init__(
         self,
@@ -42,16 +42,16 @@ class Relay(ABC, Generic[MessageT]):
         key: str,
         message_type: type[MessageT],
         every_cycles: int = 1,
-        has_subscriber: Callable[[], bool] = _always,
+        has_subscriber: Callable[[], bool] = _has_always_subscriber,
     ) -> None:
         """Prepare the relay. It subscribes in its first poll.
 
         Args:
             session: Session on the robot's network.
             key: Key of the samples.
-            message_type: Their message type.
+            message_type: Message type of the samples.
             every_cycles: Number of bridge cycles from one forwarded sample to the next.
-            has_subscriber: Returns whether a ROS node reads the result at present.
+            has_subscriber: Returns whether a ROS node subscribes to the result now.
         """
         self._session = session
         self._key = key
@@ -65,7 +65,7 @@ class Relay(ABC, Generic[MessageT]):
         """Forward what has arrived since the last poll, at most once for each topic.
 
         Args:
-            reader: Has the samples.
+            reader: Reader of the samples that have arrived.
             is_valid: Returns whether a sample fits the robot; other samples are skipped.
         """
 
@@ -82,12 +82,12 @@ class Relay(ABC, Generic[MessageT]):
             self._unsubscribe()
             return
         if self._reader is None:
-            self._reader = self._session.reader(self._key, self._message_type, depth=self.depth)
+            self._reader = self._session.declare_reader(self._key, self._message_type, depth=self.depth)
         self.forward_new_samples(self._reader, is_valid)
 
     def _unsubscribe(self) -> None:
         if self._reader is not None:
-            self._session.stop_reading(self._reader)
+            self._session.close_reader(self._reader)
             self._reader = None
 
 
@@ -101,14 +101,14 @@ class NewestRelay(Relay[MessageT]):
         message_type: type[MessageT],
         every_cycles: int,
         forward: Callable[[MessageT], None],
-        has_subscriber: Callable[[], bool] = _always,
+        has_subscriber: Callable[[], bool] = _has_always_subscriber,
     ) -> None:
-        """Prepare the relay, as `Relay` does. forward: receives each forwarded sample."""
+        """Prepare the relay, as `Relay` does; `forward` is called with each forwarded sample."""
         super().__init__(session, key, message_type, every_cycles, has_subscriber)
         self._forward = forward
 
     def forward_new_samples(self, reader: Reader[MessageT], is_valid: Callable[[Message], bool]) -> None:
-        newest = reader.newest(is_valid)
+        newest = reader.pop_newest(is_valid)
         if newest is not None:
             self._forward(newest)
 
@@ -122,7 +122,7 @@ class ImuRelay(Relay[Imu]):
     depth = None
 
     def __init__(self, session: Session, forward: Callable[[dict[int, ImuMeasurement]], None]) -> None:
-        """Prepare the relay. forward: receives the newest measurement of each IMU by the number of its link."""
+        """Prepare the relay; `forward` is called with the newest measurement of each IMU by the index of its link."""
         super().__init__(session, keys.IMU, Imu)
         self._forward = forward
 
@@ -139,7 +139,7 @@ class RosTime:
     """Converts robot time to the time that ROS nodes use: robot time itself, or wall-clock time.
 
     With wall-clock time, each arriving robot clock gives one offset: clock offset plus network latency. The smallest
-    of the last CLOCK_OFFSETS_KEPT offsets belongs to the fastest message and is used for all timestamps.
+    of the last MAX_CLOCK_OFFSETS offsets belongs to the fastest message and is used for all timestamps.
     """
 
     def __init__(self, *, wall_time: bool) -> None:

@@ -89,7 +89,7 @@ def make_obstacle_markers(world: World) -> list[Marker]:
 
 
 def _make_obstacle_marker(obstacle: Obstacle) -> Marker:
-    """Return a marker with the shape of an obstacle. Its color shows contact, and its opacity the confidence."""
+    """Make a marker with the shape of an obstacle; its color shows contact, and its opacity the confidence."""
     diameter_m = 2 * obstacle.radius_m
     match obstacle.shape:
         case "cylinder":
@@ -151,14 +151,14 @@ def encode_compressed_color(timestamp_ns: int, frame: str, image: ColorImage) ->
     return ros.encode_compressed_image(timestamp_ns, frame, "rgb8; png compressed bgr8", picture)
 
 
-def encode_imu(timestamp_ns: int, frame: str, sample: Imu, entry: int) -> bytes:
-    """Return a sensor_msgs/Imu of one link; its acceleration is the specific force (REP 145).
+def encode_imu(timestamp_ns: int, frame: str, imus: Imu, imu_index: int) -> bytes:
+    """Encode the IMU of one link as a sensor_msgs/Imu in CDR; its acceleration is the specific force (REP 145).
 
     Args:
         timestamp_ns: Time of the sample.
         frame: Frame of the IMU.
-        sample: Measurements of all IMUs of the robot.
-        entry: Index of this IMU within the sample.
+        imus: Measurements of all IMUs of the robot.
+        imu_index: Index of this IMU within the measurements.
     """
     unknown_covariance = np.zeros(9)
     no_orientation = np.array([-1.0, *[0.0] * 8])  # a covariance of -1: this IMU measures no orientation
@@ -167,9 +167,9 @@ def encode_imu(timestamp_ns: int, frame: str, sample: Imu, entry: int) -> bytes:
         ros.make_header(timestamp_ns, frame),
         ros.make_quaternion((1.0, 0.0, 0.0, 0.0)),
         no_orientation,
-        ros.make_vector(sample.angular_velocity_rad_s[entry]),
+        ros.make_vector(imus.angular_velocity_rad_s[imu_index]),
         unknown_covariance,
-        ros.make_vector(sample.acceleration_m_s2[entry]),
+        ros.make_vector(imus.acceleration_m_s2[imu_index]),
         unknown_covariance,
     )
 
@@ -233,7 +233,7 @@ def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: 
     The array has one dimension, labeled with the field's name and unit. This type has neither timestamp nor frame.
     """
     values: list[float] = []
-    for name, value in kind.numbers(sample).items():
+    for name, value in kind.extract_numeric_values(sample).items():
         field_name, _, _ = name.partition(".")
         if field_name == field:
             values.append(value)
@@ -242,7 +242,7 @@ def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: 
     stride = len(values)
     dimension = ros.make_message("std_msgs/msg/MultiArrayDimension", label, size, stride)
     layout = ros.make_message("std_msgs/msg/MultiArrayLayout", [dimension], 0)
-    return ros.encode_message(ros.NUMBERS, layout, np.array(values, dtype=np.float64))
+    return ros.encode_message(ros.FLOAT64_ARRAY, layout, np.array(values, dtype=np.float64))
 
 
 def encode_diagnostics(timestamp_ns: int, status: Status) -> bytes:

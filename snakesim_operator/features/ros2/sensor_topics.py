@@ -41,15 +41,15 @@ class StaticFrames:
         """Start over with the frames of a robot whose sensors have not sent samples."""
         self._fixed = frames.fixed
         self._sensors.clear()
-        self._publish()
+        self._publish_all_transforms()
 
     def place_sensor(self, key: str, transforms: list[Transform]) -> None:
         """Publish where a sensor is mounted, if that is not published."""
         if self._sensors.get(key) != transforms:
             self._sensors[key] = transforms
-            self._publish()
+            self._publish_all_transforms()
 
-    def _publish(self) -> None:
+    def _publish_all_transforms(self) -> None:
         transforms = list(self._fixed)
         for sensor_transforms in self._sensors.values():
             transforms += sensor_transforms
@@ -93,28 +93,28 @@ class SensorTopics:
         relays: list[Relay[Any]] = []
         sensor_keys = {sensor.key for sensor in self._robot.sensors}
         if keys.CONTACTS in sensor_keys:
-            relays.append(self._relay_contacts())
+            relays.append(self._make_contact_relay())
         if keys.IMU in sensor_keys:
             relays.append(ImuRelay(self._session, self._forward_imus))
         for key in sorted(sensor_keys):
             name = _get_sensor_name(key)
             if key == keys.depth_key(name):
-                relays.append(self._relay_depth_camera(key, image_every_cycles))
+                relays.append(self._make_depth_camera_relay(key, image_every_cycles))
             elif key == keys.color_key(name):
-                relays.append(self._relay_color_camera(key, image_every_cycles))
+                relays.append(self._make_color_camera_relay(key, image_every_cycles))
             elif key == keys.ranges_key(name):
                 encode = robot_in_ros.encode_laser_scan
-                relays.append(self._relay_mounted_sensor(key, "scan", ros.LASER_SCAN, encode))
+                relays.append(self._make_mounted_sensor_relay(key, "scan", ros.LASER_SCAN, encode))
         for key, custom_type in find_custom_messages(self._robot).items():
             for field in custom_type.units:
                 encode_field = partial(robot_in_ros.encode_numbers, custom_type, field)
-                relays.append(self._relay_mounted_sensor(key, field, ros.NUMBERS, encode_field))
+                relays.append(self._make_mounted_sensor_relay(key, field, ros.FLOAT64_ARRAY, encode_field))
         return relays
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
         return self._node.declare_publisher(Topic(f"/{self._prefix}{name}", ros_type, **quality))
 
-    def _relay_contacts(self) -> Relay[Any]:
+    def _make_contact_relay(self) -> Relay[Any]:
         """Return the relay of the contact forces, with a topic for each link."""
         names = [make_ros_name(link.name) for link in self._robot.links]
         publishers = [self._declare_publisher(f"{name}/contact", ros.WRENCH) for name in names]
@@ -128,48 +128,48 @@ class SensorTopics:
         every_cycle = 1
         return NewestRelay(self._session, keys.CONTACTS, m.Contacts, every_cycle, forward)
 
-    def _relay_depth_camera(self, key: str, every_cycles: int) -> Relay[Any]:
+    def _make_depth_camera_relay(self, key: str, every_cycles: int) -> Relay[Any]:
         """Return the relay of a depth camera; its topics are named as image_transport names them."""
         topic = f"{make_ros_name(_get_sensor_name(key))}/depth/image_raw"
-        raw = self._declare_images(topic, ros.IMAGE)
-        compressed = self._declare_images(f"{topic}/compressedDepth", ros.COMPRESSED_IMAGE)
+        raw = self._declare_image_publisher(topic, ros.IMAGE)
+        compressed = self._declare_image_publisher(f"{topic}/compressedDepth", ros.COMPRESSED_IMAGE)
         outputs = (
             (raw, robot_in_ros.encode_depth_image),
             (compressed, robot_in_ros.encode_compressed_depth),
         )
-        return self._relay_camera(key, "depth", m.DepthImage, outputs, every_cycles)
+        return self._make_camera_relay(key, "depth", m.DepthImage, outputs, every_cycles)
 
-    def _relay_color_camera(self, key: str, every_cycles: int) -> Relay[Any]:
+    def _make_color_camera_relay(self, key: str, every_cycles: int) -> Relay[Any]:
         """Return the relay of a color camera; its topics are named as image_transport names them."""
         topic = f"{make_ros_name(_get_sensor_name(key))}/color/image_raw"
-        raw = self._declare_images(topic, ros.IMAGE)
-        compressed = self._declare_images(f"{topic}/compressed", ros.COMPRESSED_IMAGE)
+        raw = self._declare_image_publisher(topic, ros.IMAGE)
+        compressed = self._declare_image_publisher(f"{topic}/compressed", ros.COMPRESSED_IMAGE)
         outputs = (
             (raw, robot_in_ros.encode_color_image),
             (compressed, robot_in_ros.encode_compressed_color),
         )
-        return self._relay_camera(key, "color", m.ColorImage, outputs, every_cycles)
+        return self._make_camera_relay(key, "color", m.ColorImage, outputs, every_cycles)
 
-    def _declare_images(self, topic: str, ros_type: RosType) -> RosPublisher:
+    def _declare_image_publisher(self, topic: str, ros_type: RosType) -> RosPublisher:
         return self._declare_publisher(topic, ros_type, depth=1, images=True)
 
-    def _relay_camera(
+    def _make_camera_relay(
         self,
         key: str,
         kind: str,
         message_type: type[Any],
-        outputs: tuple[tuple[RosPublisher, ImageEncoder], ...],
+        publishers_and_encoders: tuple[tuple[RosPublisher, ImageEncoder], ...],
         every_cycles: int,
     ) -> Relay[Any]:
-        """Return the relay of one camera, whose samples become images and intrinsics.
+        """Make the relay of one camera, which publishes its samples as images and intrinsics.
 
         Images are read and encoded only while a ROS node subscribes to them.
 
         Args:
             key: Key of the camera.
             kind: depth or color.
-            message_type: Type of its samples.
-            outputs: Publishers of images, and how each encodes a sample.
+            message_type: Message type of the samples.
+            publishers_and_encoders: Publishers of images, each with its encoder.
             every_cycles: Number of bridge cycles from one image to the next.
         """
         name = _get_sensor_name(key)
@@ -180,18 +180,18 @@ class SensorTopics:
             timestamp_ns = self._ros_time.convert(image.timestamp_ns)
             self._static_frames.place_sensor(key, self._frames.make_camera_transforms(kind, name, image))
             camera_info.publish(robot_in_ros.encode_camera_info(timestamp_ns, frame, image))
-            for publisher, encode in outputs:
+            for publisher, encode in publishers_and_encoders:
                 if publisher.has_subscribers():
                     publisher.publish(encode(timestamp_ns, frame, image))
 
         def is_wanted() -> bool:
             if camera_info.has_subscribers():
                 return True
-            return any(publisher.has_subscribers() for publisher, _ in outputs)
+            return any(publisher.has_subscribers() for publisher, _ in publishers_and_encoders)
 
         return NewestRelay(self._session, key, message_type, every_cycles, forward, is_wanted)
 
-    def _relay_mounted_sensor(self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder) -> Relay[Any]:
+    def _make_mounted_sensor_relay(self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder) -> Relay[Any]:
         """Return the relay of one topic of a sensor that is mounted on a link."""
         name = _get_sensor_name(key)
         publisher = self._declare_publisher(f"{make_ros_name(name)}/{topic}", ros_type)
@@ -206,7 +206,7 @@ class SensorTopics:
         return NewestRelay(self._session, key, message_type, 1, forward, publisher.has_subscribers)
 
     def _forward_imus(self, measurements: dict[int, ImuMeasurement]) -> None:
-        """Publish each IMU on the topic of its link. measurements: by the number of the link."""
+        """Publish each IMU on the topic of its link. `measurements` are by the index of the link."""
         for link, measurement in measurements.items():
             if link not in self._imu_publishers:
                 link_name = make_ros_name(self._robot.links[link].name)

@@ -11,14 +11,14 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import get_types_from_msg
 
 from snakesim_operator.features.ros2.graph import RosType
-from snakesim_operator.features.ros2.messages import STORE, make_message
+from snakesim_operator.features.ros2.messages import TYPE_STORE, make_message
 
 # ROS turns char into uint8 before it hashes a definition, and rosbags does not. So the definition uses uint8.
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _EVENT_INFO_FIELDS = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
-STORE.fielddefs[_EVENT_INFO] = get_types_from_msg(_EVENT_INFO_FIELDS, _EVENT_INFO)[_EVENT_INFO]
+TYPE_STORE.fielddefs[_EVENT_INFO] = get_types_from_msg(_EVENT_INFO_FIELDS, _EVENT_INFO)[_EVENT_INFO]
 
-EMPTY = "uint8 structure_needs_at_least_one_member"  # what ROS puts into a message without fields
+EMPTY_DEFINITION = "uint8 structure_needs_at_least_one_member"  # what ROS puts into a message without fields
 _PARAMETER_VALUES = "rcl_interfaces/msg/ParameterValue[] values"
 
 
@@ -31,7 +31,7 @@ class RosService:
     def decode_request(self, payload: bytes) -> Any | None:
         """Return a request, or None if the payload is none of this type."""
         try:
-            return STORE.deserialize_cdr(payload, f"{self.type.name}_Request")
+            return TYPE_STORE.deserialize_cdr(payload, f"{self.type.name}_Request")
         except SerdeError:
             return None
 
@@ -39,7 +39,7 @@ class RosService:
         """Return a response in CDR with these fields, in the order of their definition."""
         name = f"{self.type.name}_Response"
         response = make_message(name, *fields)
-        return bytes(STORE.serialize_cdr(response, name))
+        return bytes(TYPE_STORE.serialize_cdr(response, name))
 
 
 def define_service(name: str, request: str, response: str) -> RosService:
@@ -61,8 +61,8 @@ def define_service(name: str, request: str, response: str) -> RosService:
     types: dict[str, Any] = {}
     for type_name, fields in definitions.items():
         types |= _restore_service_names(get_types_from_msg(fields, type_name))
-    STORE.register(types)
-    return RosService(RosType(name, STORE.hash_rihs01(name)))
+    TYPE_STORE.register(types)
+    return RosService(RosType(name, TYPE_STORE.hash_rihs01(name)))
 
 
 def _restore_service_names(definition: Any) -> Any:
@@ -83,7 +83,7 @@ def _define_parameter_service(name: str, request: str, response: str) -> RosServ
     return define_service(f"rcl_interfaces/srv/{name}", request, response)
 
 
-TRIGGER = define_service("std_srvs/srv/Trigger", EMPTY, "bool success\nstring message")
+TRIGGER = define_service("std_srvs/srv/Trigger", EMPTY_DEFINITION, "bool success\nstring message")
 LIST_PARAMETERS = _define_parameter_service(
     "ListParameters",
     "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth",

@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 from snakesim_hal.wire.messages import Description, JointDescription, LinkDescription
 
-AXES = {"yaw": "0 0 1", "pitch": "0 1 0"}
-LOSSES = (
+AXIS_XYZ = {"yaw": "0 0 1", "pitch": "0 1 0"}
+MISSING_DATA_COMMENT = (
     " The description on the network has neither inertia nor friction: each link has the inertia of a solid cylinder, "
     "and no joint has dynamics. `snakesim robot export` writes both, from the robot file. "
 )
@@ -24,10 +24,10 @@ def make_urdf(robot: Description, prefix: str = "") -> str:
         prefix: Text before the names of links, the same as in the frames.
     """
     root = ElementTree.Element("robot", name=robot.robot)
-    root.append(ElementTree.Comment(LOSSES))
-    base = f"{prefix}base_link"
-    ElementTree.SubElement(root, "link", name=base)
-    _add_joint(root, "base", "fixed", base, prefix + robot.links[0].name, 0.0)
+    root.append(ElementTree.Comment(MISSING_DATA_COMMENT))
+    base_link = f"{prefix}base_link"
+    ElementTree.SubElement(root, "link", name=base_link)
+    _add_joint(root, "base", "fixed", base_link, prefix + robot.links[0].name, 0.0)
     for link in robot.links:
         _add_link(root, link, prefix)
     rear_links = robot.links[:-1]
@@ -43,16 +43,16 @@ def _add_link(root: ElementTree.Element, link: LinkDescription, prefix: str) -> 
     """Add a link with the inertia of a solid cylinder; a capsule is its shape for drawing and collisions."""
     element = ElementTree.SubElement(root, "link", name=prefix + link.name)
     _add_inertia(element, link)
-    middle = f"{link.length_m / 2:.9g} 0 0"
-    front_end = f"{link.length_m:.9g} 0 0"
-    z_to_x_axis = f"0 {math.pi / 2:.9g} 0"  # a cylinder of URDF stands along z
-    unrotated = "0 0 0"
+    middle_xyz = f"{link.length_m / 2:.9g} 0 0"
+    front_end_xyz = f"{link.length_m:.9g} 0 0"
+    z_to_x_rpy = f"0 {math.pi / 2:.9g} 0"  # a cylinder of URDF stands along z
+    unrotated_rpy = "0 0 0"
     length = f"{link.length_m:.9g}"
     radius = f"{link.radius_m:.9g}"
-    for use in ("visual", "collision"):
-        _add_shape(element, use, middle, z_to_x_axis, "cylinder", {"radius": radius, "length": length})
-        _add_shape(element, use, "0 0 0", unrotated, "sphere", {"radius": radius})
-        _add_shape(element, use, front_end, unrotated, "sphere", {"radius": radius})
+    for element_name in ("visual", "collision"):
+        _add_shape(element, element_name, middle_xyz, z_to_x_rpy, "cylinder", {"radius": radius, "length": length})
+        _add_shape(element, element_name, "0 0 0", unrotated_rpy, "sphere", {"radius": radius})
+        _add_shape(element, element_name, front_end_xyz, unrotated_rpy, "sphere", {"radius": radius})
 
 
 def _add_inertia(element: ElementTree.Element, link: LinkDescription) -> None:
@@ -71,7 +71,7 @@ def _add_inertia(element: ElementTree.Element, link: LinkDescription) -> None:
 def _add_shape(
     element: ElementTree.Element, use: str, xyz: str, rpy: str, shape: str, attributes: dict[str, str]
 ) -> None:
-    """Add one shape to a link. use: visual or collision."""
+    """Add one shape to a link. `use` is `visual` or `collision`."""
     part = ElementTree.SubElement(element, use)
     ElementTree.SubElement(part, "origin", xyz=xyz, rpy=rpy)
     geometry = ElementTree.SubElement(part, "geometry")
@@ -91,7 +91,7 @@ def _add_joint(
 
 def _add_limits(element: ElementTree.Element, joint: JointDescription) -> None:
     """Add a joint's axis, and its limits of angle, speed and torque."""
-    ElementTree.SubElement(element, "axis", xyz=AXES[joint.axis])
+    ElementTree.SubElement(element, "axis", xyz=AXIS_XYZ[joint.axis])
     ElementTree.SubElement(
         element,
         "limit",

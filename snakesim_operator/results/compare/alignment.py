@@ -1,4 +1,4 @@
-"""Two records on one time axis: the robot's time since its first arming, over the time that both have."""
+"""Samples two records on a common time axis: robot time since the first arming, over the time that both have."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.time_axis import zero_s
+from snakesim_operator.results.time_axis import get_time_origin_s
 
-SAME_INSTANT_S = 1e-6
+TIME_TOLERANCE_S = 1e-6
 
 
 @dataclass(frozen=True)
-class Joints:
-    """What the joints of one run did on the common time axis; every array is (n, joints), tail to head."""
+class JointSeries:
+    """Time series of the joints of one run on the common time axis. Every array is (n, joints), tail to head."""
 
     angle_rad: Floats
     velocity_rad_s: Floats
@@ -24,16 +24,16 @@ class Joints:
 
 
 @dataclass(frozen=True)
-class Aligned:
-    """Both runs at the same times."""
+class AlignedRuns:
+    """The joints of both runs at common times."""
 
     time_s: Floats  # (n,) since the first arming
-    a: Joints
-    b: Joints
-    how: str  # in words, for people who judge the numbers
+    a: JointSeries
+    b: JointSeries
+    sampling_description: str  # how the runs were sampled, as text
 
 
-def align(a: RunRecord, b: RunRecord) -> Aligned:
+def align_runs(a: RunRecord, b: RunRecord) -> AlignedRuns:
     """Sample two runs at common times, over the time that both have.
 
     If both have the same ticks, these are the common times. Otherwise they are the ticks of the run that has fewer, and
@@ -46,24 +46,24 @@ def align(a: RunRecord, b: RunRecord) -> Aligned:
     Returns:
         The joints of both runs at the common times, and a description of how they were sampled.
     """
-    time_a = a.time_s - zero_s(a)
-    time_b = b.time_s - zero_s(b)
-    common_end_s = min(float(time_a[-1]), float(time_b[-1])) + SAME_INSTANT_S
-    common_time_a = time_a[time_a <= common_end_s]
-    common_time_b = time_b[time_b <= common_end_s]
-    has_same_ticks = len(common_time_a) == len(common_time_b) and np.allclose(
-        common_time_a, common_time_b, rtol=0, atol=SAME_INSTANT_S
+    time_a_s = a.time_s - get_time_origin_s(a)
+    time_b_s = b.time_s - get_time_origin_s(b)
+    common_end_s = min(float(time_a_s[-1]), float(time_b_s[-1])) + TIME_TOLERANCE_S
+    common_time_a_s = time_a_s[time_a_s <= common_end_s]
+    common_time_b_s = time_b_s[time_b_s <= common_end_s]
+    has_same_ticks = len(common_time_a_s) == len(common_time_b_s) and np.allclose(
+        common_time_a_s, common_time_b_s, rtol=0, atol=TIME_TOLERANCE_S
     )
     if has_same_ticks:
-        grid = common_time_a
+        grid_s = common_time_a_s
         how = "tick by tick"
-    elif len(common_time_a) <= len(common_time_b):
-        grid = common_time_a
+    elif len(common_time_a_s) <= len(common_time_b_s):
+        grid_s = common_time_a_s
         how = f"{_describe_rates(a, b)}: B is interpolated at the ticks of A"
     else:
-        grid = common_time_b
+        grid_s = common_time_b_s
         how = f"{_describe_rates(a, b)}: A is interpolated at the ticks of B"
-    return Aligned(grid, _sample_joints(a, time_a, grid), _sample_joints(b, time_b, grid), how)
+    return AlignedRuns(grid_s, _sample_joints(a, time_a_s, grid_s), _sample_joints(b, time_b_s, grid_s), how)
 
 
 def _describe_rates(a: RunRecord, b: RunRecord) -> str:
@@ -72,17 +72,20 @@ def _describe_rates(a: RunRecord, b: RunRecord) -> str:
     return f"A at {a.config.rate_hz:g} Hz, B at {b.config.rate_hz:g} Hz"
 
 
-def _sample_joints(record: RunRecord, time_s: Floats, grid: Floats) -> Joints:
-    """Return what the joints of a run did at the times of a grid, (n,)."""
-    newest_rows = np.searchsorted(time_s, grid + SAME_INSTANT_S, side="right") - 1
-    on_grid = np.allclose(time_s[newest_rows], grid, rtol=0, atol=SAME_INSTANT_S)
+def _sample_joints(record: RunRecord, time_s: Floats, grid_s: Floats) -> JointSeries:
+    """Sample the joints of a run at the times of a grid, (n,) in s.
+
+    Measured values are interpolated unless the grid consists of ticks of the run. A setpoint holds until the next one.
+    """
+    newest_rows = np.searchsorted(time_s, grid_s + TIME_TOLERANCE_S, side="right") - 1
+    is_on_ticks = np.allclose(time_s[newest_rows], grid_s, rtol=0, atol=TIME_TOLERANCE_S)
 
     def sample(series: Floats) -> Floats:
-        if on_grid:
+        if is_on_ticks:
             return series[newest_rows]
-        return np.column_stack([np.interp(grid, time_s, column) for column in series.T])
+        return np.column_stack([np.interp(grid_s, time_s, column) for column in series.T])
 
-    return Joints(
+    return JointSeries(
         angle_rad=sample(record.angle_rad),
         velocity_rad_s=sample(record.velocity_rad_s),
         torque_nm=sample(record.torque_nm),

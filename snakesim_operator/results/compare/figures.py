@@ -1,73 +1,94 @@
-"""The charts of a comparison: A thick, B thin above it."""
+"""Draws the charts of a comparison of two runs: a thick line for A, and a thin line for B above it."""
 
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.results.compare.difference import Advance, Difference, Gap
+from snakesim_operator.results.compare.difference import AdvanceComparison, QuantityDifference, RunDifference
 from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
-from snakesim_operator.results.page.charts import Bar, Figure, Line, Mark, bars, joint_map, lines
+from snakesim_operator.results.page.charts import (
+    Bar,
+    Line,
+    PlotlyDict,
+    TimeMarker,
+    make_bar_chart,
+    make_joint_heatmap,
+    make_line_chart,
+)
 
-A, B = "--measured", "--reference"
+COLOR_A, COLOR_B = "--measured", "--reference"
 
 
-def advance(difference: Difference, moved: Advance) -> list[Figure]:
-    """Draw how far both runs moved, and by how much B was ahead."""
+def draw_advance(difference: RunDifference, moved: AdvanceComparison) -> list[PlotlyDict]:
+    """Draw the advance of both runs over time, and the advance of B relative to A."""
     time_s = difference.aligned.time_s
     end_s = max(float(moved.a.time_s[-1]), float(moved.b.time_s[-1]))
-    advance_a_m = np.interp(time_s, moved.a.time_s, moved.a.value)
-    advance_b_m = np.interp(time_s, moved.b.time_s, moved.b.value)
+    advance_a_m = np.interp(time_s, moved.a.time_s, moved.a.values)
+    advance_b_m = np.interp(time_s, moved.b.time_s, moved.b.values)
     ahead_mm = 1000 * (advance_b_m - advance_a_m)
-    drawn = [Line("A", moved.a.time_s, moved.a.value, A, width=3.5), Line("B", moved.b.time_s, moved.b.value, B)]
+    drawn = [
+        Line("A", moved.a.time_s, moved.a.values, COLOR_A, width=3.5),
+        Line("B", moved.b.time_s, moved.b.values, COLOR_B),
+    ]
     gap = Line("B − A", time_s, ahead_mm)
     marks = mark_divergence(difference)
     return [
-        lines("Advance of both runs over time", "advance, m", drawn, end_s, marks=marks),
-        lines("Difference of the advance over time", "B − A, mm", [gap], end_s, marks=marks, height=170),
+        make_line_chart("Advance of both runs over time", "advance, m", drawn, end_s, markers=marks),
+        make_line_chart("Difference of the advance over time", "B − A, mm", [gap], end_s, markers=marks, height=170),
     ]
 
 
-def gap_map(difference: Difference, gap: Gap) -> Figure:
-    """Draw the difference of every joint over time."""
+def draw_difference_map(difference: RunDifference, gap: QuantityDifference) -> PlotlyDict:
+    """Draw the difference of one quantity of all joints over time as a heatmap."""
     full = 1.0  # drawn in full color
-    if gap.worst is not None:
-        full = max(abs(gap.worst.difference), 1e-9)
-    label = f"Difference of every joint's {gap.what} over time"
+    if gap.max_difference is not None:
+        full = max(abs(gap.max_difference.difference), 1e-9)
+    label = f"Difference of every joint's {gap.quantity} over time"
     until_s = float(difference.aligned.time_s[-1])
-    return joint_map(
-        label, difference.joints, gap.difference, gap.unit, full, until_s, marks=mark_divergence(difference)
+    return make_joint_heatmap(
+        label, difference.joints, gap.difference, gap.unit, full, until_s, markers=mark_divergence(difference)
     )
 
 
-def overlay(difference: Difference, gap: Gap, a: Floats, b: Floats, joint: int) -> Figure:
-    """Draw one joint in both runs, with a mark where they differ most."""
+def draw_joint_in_both_runs(
+    difference: RunDifference, gap: QuantityDifference, a: Floats, b: Floats, joint: int
+) -> PlotlyDict:
+    """Draw one quantity of one joint in both runs over time, with a marker at the largest difference.
+
+    Args:
+        difference: The comparison.
+        gap: Differences of the quantity.
+        a: (n, joints) values of the quantity in A.
+        b: (n, joints) values of the quantity in B.
+        joint: Index of the joint.
+    """
     time_s = difference.aligned.time_s
-    worst = gap.joint_worst[joint]
-    drawn = [Line("A", time_s, a[:, joint], A, width=3.5), Line("B", time_s, b[:, joint], B)]
-    marks: list[Mark] = []
+    worst = gap.max_difference_by_joint[joint]
+    drawn = [Line("A", time_s, a[:, joint], COLOR_A, width=3.5), Line("B", time_s, b[:, joint], COLOR_B)]
+    marks: list[TimeMarker] = []
     if worst is not None and worst.difference:
-        marks.append(Mark(worst.time_s, "worst"))
-    label = f"{gap.what.capitalize()} of {difference.joints[joint]} in both runs"
-    return lines(label, f"{gap.what}, {gap.unit}", drawn, float(time_s[-1]), marks=marks)
+        marks.append(TimeMarker(worst.time_s, "worst"))
+    label = f"{gap.quantity.capitalize()} of {difference.joints[joint]} in both runs"
+    return make_line_chart(label, f"{gap.quantity}, {gap.unit}", drawn, float(time_s[-1]), markers=marks)
 
 
-def hand_overs(difference: Difference) -> Figure:
-    """Draw which joint propelled when: for each joint a row of A and one of B."""
+def draw_hand_overs(difference: RunDifference) -> PlotlyDict:
+    """Draw when each joint propelled, with one row for A and one for B."""
     drawn: list[Bar] = []
     propelled: set[int] = set()
-    for run, record, color in (("A", difference.a, A), ("B", difference.b, B)):
+    for run, record, color in (("A", difference.a, COLOR_A), ("B", difference.b, COLOR_B)):
         for interval in find_propulsion_intervals(record):
-            row = f"{difference.joints[interval.joint]} {run}"
+            row = f"{difference.joints[interval.joint_index]} {run}"
             drawn.append(Bar(row, interval.start_s, interval.end_s, f"{run} {interval.duration_s:.1f} s", color))
-            propelled.add(interval.joint)
+            propelled.add(interval.joint_index)
     rows: list[str] = []
     for joint in sorted(propelled, reverse=True):
         rows += [f"{difference.joints[joint]} A", f"{difference.joints[joint]} B"]
     end_s = max([float(difference.aligned.time_s[-1]), *(bar.end_s for bar in drawn)])
-    return bars("Propulsion joints of both runs over time", rows, drawn, end_s, mark_divergence(difference))
+    return make_bar_chart("Propulsion joints of both runs over time", rows, drawn, end_s, mark_divergence(difference))
 
 
-def mark_divergence(difference: Difference) -> list[Mark]:
-    """Return a mark where the runs diverge."""
+def mark_divergence(difference: RunDifference) -> list[TimeMarker]:
+    """Return a marker at the time at which the runs diverge; none if they do not diverge."""
     if difference.divergence is None:
         return []
-    return [Mark(difference.divergence.time_s, "diverge")]
+    return [TimeMarker(difference.divergence.time_s, "diverge")]

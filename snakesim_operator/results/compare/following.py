@@ -1,4 +1,4 @@
-"""How one joint's motion in B follows that in A: how much later, and how much larger. Pure."""
+"""Fits how the motion of a joint in run B follows that in run A: the lag and the gain."""
 
 from dataclasses import dataclass
 
@@ -8,39 +8,39 @@ from snakesim_hal.base.arrays import Floats
 
 MAX_LAG_S = 0.25
 MIN_DEVIATION = 1e-6  # a joint of A with a smaller standard deviation did not move
-MIN_INSTANTS = 20
+MIN_SAMPLES = 20
 LAG_RESOLUTION_S = 1e-5
 
 
 @dataclass(frozen=True)
-class Following:
-    """B(t) is about gain * A(t - lag), but for a constant."""
+class LagAndGain:
+    """Fit of B(t) = gain * A(t - lag) + constant."""
 
-    lag_s: float  # above 0: B is later
+    lag_s: float  # positive if B is later
     gain: float
-    left: float  # RMS of B less that, in the unit of both
+    residual_rms: float  # RMS of B minus the fit, in the unit of the data
 
 
-def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
+def fit_lag_and_gain(time_s: Floats, a: Floats, b: Floats) -> LagAndGain | None:
     """Fit lag and gain of one joint by least squares: b(t) = gain * a(t - lag) + constant.
 
     A grid search with the time step of the data finds the best lag. Its neighbors are then tried with a step that is
     halved until it is below LAG_RESOLUTION_S.
 
     Args:
-        time_s: (n,) the common times.
+        time_s: (n,) common times, in s.
         a: (n,) values in A.
         b: (n,) values in B.
 
     Returns:
         The fit, or None if the joint did not move, or some of its values are unknown.
     """
-    if len(time_s) < MIN_INSTANTS or not (np.isfinite(a).all() and np.isfinite(b).all()):
+    if len(time_s) < MIN_SAMPLES or not (np.isfinite(a).all() and np.isfinite(b).all()):
         return None
     # Leave out both ends, so that A is known at each time shifted by the largest lag.
     max_lag_s = min(MAX_LAG_S, float(time_s[-1] - time_s[0]) / 4)
     is_inside = (time_s >= time_s[0] + max_lag_s) & (time_s <= time_s[-1] - max_lag_s)
-    if is_inside.sum() < MIN_INSTANTS or np.std(a[is_inside]) < MIN_DEVIATION:
+    if is_inside.sum() < MIN_SAMPLES or np.std(a[is_inside]) < MIN_DEVIATION:
         return None
     fit_time_s = time_s[is_inside]
     centered_b = b[is_inside] - b[is_inside].mean()
@@ -49,8 +49,8 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
         """Return the RMS of the residual, the lag, and the gain that minimizes the residual at this lag."""
         shifted_a = np.interp(fit_time_s - lag_s, time_s, a)
         shifted_a -= shifted_a.mean()
-        power = float(shifted_a @ shifted_a)
-        gain = float(shifted_a @ centered_b) / power if power > 0 else 0.0
+        sum_of_squares = float(shifted_a @ shifted_a)
+        gain = float(shifted_a @ centered_b) / sum_of_squares if sum_of_squares > 0 else 0.0
         residual = centered_b - gain * shifted_a
         residual_rms = float(np.sqrt(residual @ residual / len(residual)))
         return residual_rms, lag_s, gain
@@ -64,4 +64,4 @@ def following(time_s: Floats, a: Floats, b: Floats) -> Following | None:
         best_lag_s = best[1]
         best = min(best, fit_gain(best_lag_s - step_s), fit_gain(best_lag_s + step_s))
     residual_rms, lag_s, gain = best
-    return Following(lag_s, gain, residual_rms)
+    return LagAndGain(lag_s, gain, residual_rms)

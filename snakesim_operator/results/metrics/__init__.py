@@ -1,4 +1,4 @@
-"""Numbers that are computed from the record of a run.
+"""Metrics that are computed from the record of a run.
 
 `advance`         progress towards the goal, energy     `motion`       when the body moved, as measured
 `effort`          what the advance cost                 `propulsion`   which joint propelled when

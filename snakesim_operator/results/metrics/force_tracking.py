@@ -1,9 +1,9 @@
-"""Whether contact forces followed the ones that a controller requested: desired against measured, by contact.
+"""Compares the contact forces that a controller desired with the forces that were measured, contact by contact.
 
 The controller measures a force some time after it requested it: the command and the sensor have latencies, and the
 measured force is a mean over 50 ms. So each measured force is compared with the one that was requested at the same
-obstacle a moment before. While the body does not move, the friction of the ground takes any difference, so only
-locomotion counts; a request of less than ASKED_N does not count either.
+obstacle a moment before. While the body does not move, ground friction balances any difference, so only locomotion
+counts. A request of less than MIN_DESIRED_FORCE_N does not count either.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,15 +14,15 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, WorldContact
 
-DELAY_S = 0.06  # from the setpoint to the mean in which it appears
-ASKED_N = 1.0  # about a quarter of the drag of the shipped robots: less is not judged
-EMPTY_N = 0.1  # less than this is no contact
-MIN_PAIRS = 20  # a correlation of fewer means nothing
+MEASUREMENT_DELAY_S = 0.06  # from the setpoint to the averaged measurement that contains it
+MIN_DESIRED_FORCE_N = 1.0  # about a quarter of the drag of the bundled robots; a smaller desired force is ignored
+MIN_CONTACT_FORCE_N = 0.1  # a smaller measured force counts as no contact
+MIN_PAIRS = 20  # a correlation of fewer pairs is meaningless
 
 
 @dataclass(frozen=True)
-class Pair:
-    """One push-point at one moment of locomotion."""
+class ForcePair:
+    """Desired and measured force of one push-point at one time."""
 
     timestamp_ns: int
     obstacle: str
@@ -32,26 +32,28 @@ class Pair:
 
 @dataclass(frozen=True)
 class ForceTracking:
-    """How well the measured forces follow the solved ones, at the push-points of a body that locomotes."""
+    """How well measured forces follow desired forces, over all push-points while the body locomotes."""
 
-    correlation: float | None  # of measured with solved; None: too few, or all the same
-    median_error: float  # |measured - solved| over solved
-    empty: float  # share of those that carry nothing
+    correlation: float | None  # Pearson; None if there are too few pairs, or all forces are equal
+    median_error: float  # |measured - desired| / desired
+    no_contact_fraction: float  # fraction of push-points without a measured contact force
 
 
-def is_measured(push_point: WorldContact, contacts: Iterable[WorldContact]) -> bool:
-    """Return whether one of the measured contacts is on the push-point's obstacle.
+def is_contact_measured(push_point: WorldContact, contacts: Iterable[WorldContact]) -> bool:
+    """Return whether one of the measured contacts is on the obstacle of a push-point.
 
-    Otherwise the force that the controller solved for is only requested.
+    Args:
+        push_point: A contact for which the controller desired a force.
+        contacts: The measured contacts.
     """
     return any(contact.obstacle == push_point.obstacle for contact in contacts)
 
 
-def pairs(states: Sequence[ControlState]) -> list[Pair]:
-    """Pair each measured push-point force with the force that the controller requested there DELAY_S earlier.
+def pair_forces(states: Sequence[ControlState]) -> list[ForcePair]:
+    """Pair each measured push-point force with the force desired there MEASUREMENT_DELAY_S earlier.
 
-    The request is the newest message that is at least DELAY_S and at most twice DELAY_S older than the measurement.
-    Push-points match by their obstacle. Desired forces below ASKED_N are left out.
+    The request is the newest message that is at least MEASUREMENT_DELAY_S and at most twice MEASUREMENT_DELAY_S older
+    than the measurement. Push-points match by their obstacle. Desired forces below MIN_DESIRED_FORCE_N are left out.
 
     Args:
         states: The controller's messages, in order of time.
@@ -59,8 +61,8 @@ def pairs(states: Sequence[ControlState]) -> list[Pair]:
     Returns:
         The pairs of all push-points while the body locomotes, in order of time.
     """
-    delay_ns = round(DELAY_S * 1e9)
-    matched: list[Pair] = []
+    delay_ns = round(MEASUREMENT_DELAY_S * 1e9)
+    force_pairs: list[ForcePair] = []
     request_index = 0
     for state in states:
         has_all_forces = len(state.measured_force_n) == len(state.push_points)
@@ -79,28 +81,33 @@ def pairs(states: Sequence[ControlState]) -> list[Pair]:
             if point.obstacle is None or measured_n is None:
                 continue
             desired_n = desired_n_by_obstacle.get(point.obstacle, 0.0)
-            if desired_n >= ASKED_N:
-                matched.append(Pair(state.timestamp_ns, point.obstacle, desired_n, measured_n))
-    return matched
+            if desired_n >= MIN_DESIRED_FORCE_N:
+                force_pairs.append(ForcePair(state.timestamp_ns, point.obstacle, desired_n, measured_n))
+    return force_pairs
 
 
-def force_tracking(states: Sequence[ControlState]) -> ForceTracking | None:
-    """Return how well the measured forces follow the desired ones.
+def measure_force_tracking(states: Sequence[ControlState]) -> ForceTracking | None:
+    """Measure how well the contact forces follow the forces that the controller desired.
 
-    None if the controller requested no force during locomotion, or no sensor measured any.
+    Args:
+        states: The controller's messages, in order of time.
+
+    Returns:
+        The measures, or None if the controller desired no force during locomotion, or no sensor measured any.
     """
-    compared = pairs(states)
-    if not compared:
+    force_pairs = pair_forces(states)
+    if not force_pairs:
         return None
-    solved, measured = np.array([(pair.desired_force_n, pair.measured_force_n) for pair in compared]).T
+    desired_n, measured_n = np.array([(pair.desired_force_n, pair.measured_force_n) for pair in force_pairs]).T
     return ForceTracking(
-        correlation=_correlation(solved, measured),
-        median_error=float(np.median(np.abs(measured - solved) / solved)),
-        empty=float(np.mean(measured < EMPTY_N)),
+        correlation=_compute_correlation(desired_n, measured_n),
+        median_error=float(np.median(np.abs(measured_n - desired_n) / desired_n)),
+        no_contact_fraction=float(np.mean(measured_n < MIN_CONTACT_FORCE_N)),
     )
 
 
-def _correlation(solved: Floats, measured: Floats) -> float | None:
-    if len(solved) < MIN_PAIRS or solved.std() < 1e-9 or measured.std() < 1e-9:
+def _compute_correlation(desired_n: Floats, measured_n: Floats) -> float | None:
+    """Return Pearson's correlation; None if there are too few pairs, or if all forces are equal."""
+    if len(desired_n) < MIN_PAIRS or desired_n.std() < 1e-9 or measured_n.std() < 1e-9:
         return None
-    return float(np.corrcoef(solved, measured)[0, 1])
+    return float(np.corrcoef(desired_n, measured_n)[0, 1])

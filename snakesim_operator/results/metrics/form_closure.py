@@ -1,4 +1,4 @@
-"""Whether obstacles hold a body whose joints are stiff: first-order form closure in the plane, without friction.
+"""Tests whether obstacles hold a stiff body: first-order form closure in the plane, without friction.
 
 A contact at o with normal n allows the twists x for which w . x >= 0, where w = [n ; o x n / l] is its wrench. Contacts
 close the form if they allow no twist at all. If they allow some, they also allow one with w . x = 0 at two contacts: a
@@ -12,29 +12,33 @@ from itertools import combinations
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines, nearest_on_chain
+from snakesim_hal.model.outlines import Outlines, find_nearest_points_on_chain
 
-MAX_GAP_M = 0.02  # an obstacle this near to the body counts as a contact
-SINGULAR = 1e-6  # |x| of two contacts whose normals are on one line
+MAX_GAP_M = 0.02  # an obstacle at most this far from the body counts as a contact
+SINGULARITY_TOLERANCE = 1e-6  # norm of the twist of two contacts whose normals are on one line
 
 
-def contacts_beside(nodes_w: Floats, radius_m: float, outlines: Outlines) -> tuple[Floats, Floats]:
-    """Return the places and normals, both (k, 2), of the obstacles beside a body, each where it is nearest.
+def find_body_contacts(body_points_w: Floats, radius_m: float, outlines: Outlines) -> tuple[Floats, Floats]:
+    """Find the contacts of a body with the obstacles beside it: for each obstacle the point nearest to the body.
 
     Args:
-        nodes_w: (n, 2) nodes of the chain.
-        radius_m: Radius of its links.
-        outlines: The obstacles.
+        body_points_w: (n, 2) tail end, joints and head end, in m.
+        radius_m: Radius of the links.
+        outlines: Outlines of the obstacles.
+
+    Returns:
+        contact_points_w: (k, 2) contact points on the obstacles, in m.
+        normals_w: (k, 2) outward unit normals of the obstacles there.
     """
-    _, nearest, distances = nearest_on_chain(nodes_w, outlines)
-    which = np.flatnonzero(distances - radius_m < MAX_GAP_M)
-    at = nearest[which]
-    _, normals = outlines.distance_and_normal(at, which)
-    return at - radius_m * normals, normals
+    _, nearest, distances = find_nearest_points_on_chain(body_points_w, outlines)
+    touched_indices = np.flatnonzero(distances - radius_m < MAX_GAP_M)
+    axis_points_w = nearest[touched_indices]
+    _, normals = outlines.compute_distances_and_normals(axis_points_w, touched_indices)
+    return axis_points_w - radius_m * normals, normals
 
 
-def form_closure_margin(places_w: Floats, normals_w: Floats, length_m: float) -> float:
-    """Return how well frictionless contacts hold a planar body in form closure.
+def compute_form_closure_margin(contact_points_w: Floats, normals_w: Floats, length_m: float) -> float:
+    """Compute how well frictionless contacts hold a planar body in form closure.
 
     Each contact blocks the planar twists x with w_k . x < 0, where w_k = (normal, moment / length) is its wrench. A
     twist that is perpendicular to two wrenches is a candidate for an escape. The contacts close the form if, for every
@@ -42,30 +46,30 @@ def form_closure_margin(places_w: Floats, normals_w: Floats, length_m: float) ->
     these twists, scaled to length 1, of -(max_k w_k . x) * (min_k w_k . x).
 
     Args:
-        places_w: (k, 2) places of the contacts, in m.
+        contact_points_w: (k, 2) positions of the contacts, in m.
         normals_w: (k, 2) unit normals at the contacts.
         length_m: Length by which moments are divided, so that all components of a wrench have one unit.
 
     Returns:
-        The margin, without unit and at most 1; the form is closed if it is positive. It is 0 for fewer than four
+        The margin, dimensionless and at most 1. The body is held if it is positive. It is 0 for fewer than four
         contacts, which cannot close the form.
     """
-    if len(places_w) < 4:
+    if len(contact_points_w) < 4:
         return 0.0
-    arms = (places_w - places_w.mean(axis=0)) / length_m
+    arms = (contact_points_w - contact_points_w.mean(axis=0)) / length_m
     moments = arms[:, 0] * normals_w[:, 1] - arms[:, 1] * normals_w[:, 0]
     wrenches = np.column_stack([normals_w, moments])  # (k, 3)
 
     contact_pairs = np.array(list(combinations(range(len(wrenches)), 2)))
     first, second = contact_pairs.T
     twists = np.cross(wrenches[first], wrenches[second])  # (pairs, 3)
-    sizes = np.linalg.norm(twists, axis=1)
-    is_regular = sizes > SINGULAR
-    unit_twists = twists[is_regular] / sizes[is_regular, None]
+    norms = np.linalg.norm(twists, axis=1)
+    is_regular = norms > SINGULARITY_TOLERANCE
+    unit_twists = twists[is_regular] / norms[is_regular, None]
 
     products = unit_twists @ wrenches.T  # w_k . x, (pairs, k)
     # The twist of a pair is perpendicular to both of its wrenches: remove the rounding error.
-    products[np.abs(products) < SINGULAR] = 0.0
+    products[np.abs(products) < SINGULARITY_TOLERANCE] = 0.0
     if not len(products):
         return 0.0
     margins = -products.max(axis=1) * products.min(axis=1)

@@ -8,10 +8,19 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 
 Z95 = 1.959964  # two-sided 95 % quantile of the normal distribution
-T95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306)  # of Student's t, for 1 to 8 degrees of freedom
+STUDENT_T_QUANTILES_95 = (
+    12.706,
+    4.303,
+    3.182,
+    2.776,
+    2.571,
+    2.447,
+    2.365,
+    2.306,
+)  # of Student's t, for 1 to 8 degrees of freedom
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float]:
+def compute_mean_interval(values: Sequence[float]) -> tuple[float, float]:
     """Return the 95 % confidence interval of the mean of two or more values: mean -+ t s / sqrt(n), by Student's t."""
     mean, half_width = find_mean_and_half_width(np.asarray(values, dtype=float))
     return float(mean - half_width), float(mean + half_width)
@@ -30,10 +39,10 @@ def find_mean_and_half_width(values: Floats) -> tuple[Floats, Floats]:
     """
     count = len(values)
     standard_error = np.std(values, axis=0, ddof=1) / math.sqrt(count)
-    return np.mean(values, axis=0), student_t95(count - 1) * standard_error
+    return np.mean(values, axis=0), find_student_t_quantile_95(count - 1) * standard_error
 
 
-def student_t95(degrees_of_freedom: int) -> float:
+def find_student_t_quantile_95(degrees_of_freedom: int) -> float:
     """Return the two-sided 95 % quantile of Student's t: from a table, or by its expansion in 1 / n.
 
         t = z + (z^3 + z) / (4 n) + (5 z^5 + 16 z^3 + 3 z) / (96 n^2)
@@ -41,8 +50,8 @@ def student_t95(degrees_of_freedom: int) -> float:
     Source: Abramowitz and Stegun, table 26.10 and equation 26.7.5.
     """
     n = degrees_of_freedom
-    if n <= len(T95):
-        return T95[n - 1]
+    if n <= len(STUDENT_T_QUANTILES_95):
+        return STUDENT_T_QUANTILES_95[n - 1]
     z = Z95
     first = (z**3 + z) / 4
     second = (5 * z**5 + 16 * z**3 + 3 * z) / 96

@@ -1,8 +1,8 @@
-"""The quality of a map: the obstacles that guidance published, compared with the true ones. Pure.
+"""Scores a map: compares the obstacles that guidance published with the true obstacles.
 
     score(world.obstacles, truth, head_w, heading_rad).position_m
 
-Only what is near the head counts, and of misses only what a camera there could see: not behind it, nor hidden.
+Only obstacles near the head count. An obstacle is missed only if a camera at the head could see it.
 """
 
 import math
@@ -16,109 +16,119 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
-NEAR_M = 1.0
+MAX_RANGE_M = 1.0
 FOV_RAD = math.pi / 2  # of the camera
-VISIBLE_FRACTION = 0.45  # of the field of view on each side; at its edge half of an obstacle is outside
-MIN_RANGE_M = 0.15  # a camera sees nothing nearer
-MATCH_M = 0.05  # between a reported outline and the true one
+HALF_FOV_FRACTION = 0.45  # of the full field of view, on each side; at 0.5 half of an obstacle would be outside
+MIN_RANGE_M = 0.15  # minimum range of the camera
+MAX_MATCH_DISTANCE_M = 0.05  # mean distance between the outlines of a match
 OUTLINE_POINTS = 48
-SIGHT = np.linspace(0.0, 1.0, 24)[1:-1]  # fractions of a line of sight at which an obstacle may hide what is behind
+LINE_OF_SIGHT_FRACTIONS = np.linspace(0.0, 1.0, 24)[1:-1]  # where occlusion is tested
 
 
 @dataclass
 class MapScore:
-    """Of one map, or of several added up. Lists have an entry for each matched obstacle near the head."""
+    """Errors of one map, or of several added up. Each list has an entry for each matched obstacle near the head."""
 
-    position_m: list[float] = field(default_factory=list[float])  # of centers, from where they are
-    surface_m: list[float] = field(default_factory=list[float])  # of the side that faces the head, mean
-    size_m: list[float] = field(default_factory=list[float])  # reported radius, or longer half, less the true one
-    in_sd: list[float] = field(default_factory=list[float])  # error of the position in reported standard deviations
-    misses: int = 0  # that could be seen, and are not reported
-    ghosts: int = 0  # reported, with nothing there
-    reported: int = 0  # near the head
-    visible: int = 0  # true ones that could be seen
+    position_errors_m: list[float] = field(default_factory=list[float])  # distance from the reported to the true center
+    surface_errors_m: list[float] = field(
+        default_factory=list[float]
+    )  # mean distance of the side that faces the head to the true outline
+    size_errors_m: list[float] = field(default_factory=list[float])  # reported minus true radius, or longer half edge
+    position_errors_in_sd: list[float] = field(
+        default_factory=list[float]
+    )  # position error divided by the reported standard deviation
+    missed_count: int = 0  # true obstacles that are visible, but not reported
+    ghost_count: int = 0  # reported obstacles without a true obstacle there
+    reported_count: int = 0  # reported obstacles near the head
+    visible_count: int = 0  # true obstacles that are visible
 
     def add(self, other: "MapScore") -> None:
-        """Add the score of another map."""
-        for name in ("position_m", "surface_m", "size_m", "in_sd"):
+        """Add the errors and counts of another map to this score."""
+        for name in ("position_errors_m", "surface_errors_m", "size_errors_m", "position_errors_in_sd"):
             getattr(self, name).extend(getattr(other, name))
-        self.misses += other.misses
-        self.ghosts += other.ghosts
-        self.reported += other.reported
-        self.visible += other.visible
+        self.missed_count += other.missed_count
+        self.ghost_count += other.ghost_count
+        self.reported_count += other.reported_count
+        self.visible_count += other.visible_count
 
 
-def score(
+def score_map(
     reported: Sequence[Obstacle],
-    truth: Sequence[Obstacle],
+    true_obstacles: Sequence[Obstacle],
     head_w: Sequence[float] | Floats,
     heading_rad: float,
 ) -> MapScore:
-    """Compare a perceived map with the true obstacles within NEAR_M of the head.
+    """Compare a perceived map with the true obstacles within MAX_RANGE_M of the head.
 
     A reported obstacle matches the true one whose outline is nearest to its side that faces the head, if the mean
-    distance is at most MATCH_M. Otherwise it is a ghost. A visible true obstacle without a match is a miss.
+    distance is at most MAX_MATCH_DISTANCE_M. Otherwise it is a ghost. A visible true obstacle without a match is a
+    miss.
 
     Args:
-        reported: The obstacles of the map.
-        truth: The true obstacles.
-        head_w: (2,) or more, the front of the head, in m.
+        reported: Obstacles of the map.
+        true_obstacles: Obstacles of the scene.
+        head_w: (2,) or more, position of the front end of the head, in m.
         heading_rad: Direction in which the camera looks.
+
+    Returns:
+        Errors of the matched obstacles, and numbers of ghosts and misses.
     """
     head = np.asarray(head_w, dtype=np.float64)[:2]
-    near_truth = _within(truth, head, NEAR_M + MATCH_M)
-    true_outlines = Outlines.from_obstacles(near_truth)
-    result = MapScore()
+    near_true_obstacles = _select_nearby_obstacles(true_obstacles, head, MAX_RANGE_M + MAX_MATCH_DISTANCE_M)
+    true_outlines = Outlines.from_obstacles(near_true_obstacles)
+    map_score = MapScore()
     matched_names: set[str] = set()
-    for obstacle in _within(reported, head, NEAR_M):
-        result.reported += 1
-        if not near_truth:
-            result.ghosts += 1
+    for obstacle in _select_nearby_obstacles(reported, head, MAX_RANGE_M):
+        map_score.reported_count += 1
+        if not near_true_obstacles:
+            map_score.ghost_count += 1
             continue
-        distances_m = np.abs(true_outlines.distance_m(facing_points_w(obstacle, head)))  # (points, obstacles)
+        distances_m = np.abs(
+            true_outlines.compute_distances_m(find_facing_points_w(obstacle, head))
+        )  # (points, obstacles)
         outline_errors_m = distances_m.mean(axis=0)
         nearest = int(np.argmin(outline_errors_m))
-        if outline_errors_m[nearest] > MATCH_M:
-            result.ghosts += 1
+        if outline_errors_m[nearest] > MAX_MATCH_DISTANCE_M:
+            map_score.ghost_count += 1
             continue
-        true_obstacle = near_truth[nearest]
+        true_obstacle = near_true_obstacles[nearest]
         matched_names.add(true_obstacle.name)
         position_error_m = math.dist(obstacle.position_w[:2], true_obstacle.position_w[:2])
-        result.position_m.append(position_error_m)
-        result.surface_m.append(float(outline_errors_m[nearest]))
-        result.size_m.append(_size_m(obstacle) - _size_m(true_obstacle))
-        result.in_sd.append(position_error_m / max(obstacle.position_sd_m, 1e-4))
-    for true_obstacle in visible(truth, head, heading_rad):
-        result.visible += 1
+        map_score.position_errors_m.append(position_error_m)
+        map_score.surface_errors_m.append(float(outline_errors_m[nearest]))
+        map_score.size_errors_m.append(_get_half_size_m(obstacle) - _get_half_size_m(true_obstacle))
+        map_score.position_errors_in_sd.append(position_error_m / max(obstacle.position_sd_m, 1e-4))
+    for true_obstacle in find_visible_obstacles(true_obstacles, head, heading_rad):
+        map_score.visible_count += 1
         if true_obstacle.name not in matched_names:
-            result.misses += 1
-    return result
+            map_score.missed_count += 1
+    return map_score
 
 
-def visible(truth: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> list[Obstacle]:
-    """Return the obstacles within NEAR_M of the head that a camera at the head sees.
+def find_visible_obstacles(obstacles: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> list[Obstacle]:
+    """Return the obstacles within MAX_RANGE_M of the head that a camera at the head sees.
 
     An obstacle is visible if its center is in the field of view, its outline is at least MIN_RANGE_M away, and other
     obstacles hide less than half of the side that faces the camera.
 
     Args:
-        truth: The true obstacles.
+        obstacles: Obstacles of the scene, which may hide one another.
         head_w: (2,) position of the camera, in m.
         heading_rad: Direction in which the camera looks.
     """
-    near = _within(truth, head_w, NEAR_M)
-    outlines = Outlines.from_obstacles(near)
+    near_obstacles = _select_nearby_obstacles(obstacles, head_w, MAX_RANGE_M)
+    outlines = Outlines.from_obstacles(near_obstacles)
     visible_obstacles: list[Obstacle] = []
-    for i, obstacle in enumerate(near):
+    for i, obstacle in enumerate(near_obstacles):
         x, y = np.array(obstacle.position_w[:2]) - head_w
         bearing_rad = (math.atan2(y, x) - heading_rad + math.pi) % (2 * math.pi) - math.pi
-        is_in_view = abs(bearing_rad) <= VISIBLE_FRACTION * FOV_RAD
-        if not is_in_view or outlines.distance_m(head_w)[i] < MIN_RANGE_M:
+        is_in_view = abs(bearing_rad) <= HALF_FOV_FRACTION * FOV_RAD
+        if not is_in_view or outlines.compute_distances_m(head_w)[i] < MIN_RANGE_M:
             continue
         # Sample the line of sight to each point of the facing side, and look for other obstacles on it.
-        facing_w = facing_points_w(obstacle, head_w)
-        sight_w = head_w + SIGHT[:, None, None] * (facing_w - head_w)  # (steps, points, 2)
-        is_inside = outlines.distance_m(sight_w) < 0  # (steps, points, obstacles)
+        facing_w = find_facing_points_w(obstacle, head_w)
+        sight_w = head_w + LINE_OF_SIGHT_FRACTIONS[:, None, None] * (facing_w - head_w)  # (steps, points, 2)
+        is_inside = outlines.compute_distances_m(sight_w) < 0  # (steps, points, obstacles)
         is_inside[..., i] = False  # an obstacle does not hide itself
         is_hidden = is_inside.any(axis=(0, 2))  # (points,)
         if is_hidden.mean() < 0.5:
@@ -126,10 +136,18 @@ def visible(truth: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> li
     return visible_obstacles
 
 
-def facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
-    """Return points (n, 2) on the part of the outline that faces a place, whatever stands between."""
+def find_facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
+    """Return points on the side of an obstacle that faces a viewer, also if another obstacle hides them.
+
+    Args:
+        obstacle: A cylinder or a box.
+        from_w: (2,) position of the viewer, in m.
+
+    Returns:
+        (n, 2) points on the outline, in m; the whole outline if the viewer is inside.
+    """
     if obstacle.shape == "box":
-        points, normals = _box_outline(obstacle)
+        points, normals = _sample_box_outline(obstacle)
     else:
         angles = (np.arange(OUTLINE_POINTS) + 0.5) * 2 * math.pi / OUTLINE_POINTS
         normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -139,8 +157,8 @@ def facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
     return points[is_facing] if is_facing.any() else points
 
 
-def _box_outline(obstacle: Obstacle) -> tuple[Floats, Floats]:
-    """Return points around a box's center, and the outward normals there, both (n, 2)."""
+def _sample_box_outline(obstacle: Obstacle) -> tuple[Floats, Floats]:
+    """Return points on the outline of a box relative to its center, and the outward normals there, both (n, 2)."""
     side_points = OUTLINE_POINTS // 4
     half_size = np.array(obstacle.half_size_m[:2])
     along = (np.arange(side_points) + 0.5) / side_points * 2 - 1  # -1 to 1
@@ -154,8 +172,8 @@ def _box_outline(obstacle: Obstacle) -> tuple[Floats, Floats]:
     return points @ rotation, normals @ rotation
 
 
-def moved(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[Obstacle]:
-    """Move a map rigidly, by the motion that takes the estimated pose of the base to its true pose.
+def align_map(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[Obstacle]:
+    """Align a map with the true pose: move it rigidly, as the estimated pose of the base moves to the true pose.
 
     This removes the pose error from the errors of a map, so that only the errors of perception remain.
 
@@ -183,11 +201,11 @@ def moved(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[
     return corrected
 
 
-def _within(obstacles: Sequence[Obstacle], head_w: Floats, within_m: float) -> list[Obstacle]:
-    """Return the obstacles whose outline is within a distance of the head."""
-    near = Outlines.from_obstacles(obstacles).distance_m(head_w) <= within_m
-    return [one for one, is_near in zip(obstacles, near.tolist(), strict=True) if is_near]
+def _select_nearby_obstacles(obstacles: Sequence[Obstacle], head_w: Floats, max_distance_m: float) -> list[Obstacle]:
+    """Return the obstacles whose outline is within a distance of the head, in m."""
+    is_near_by_obstacle = Outlines.from_obstacles(obstacles).compute_distances_m(head_w) <= max_distance_m
+    return [obstacle for obstacle, is_near in zip(obstacles, is_near_by_obstacle.tolist(), strict=True) if is_near]
 
 
-def _size_m(obstacle: Obstacle) -> float:
+def _get_half_size_m(obstacle: Obstacle) -> float:
     return max(obstacle.half_size_m[:2]) if obstacle.shape == "box" else obstacle.radius_m

@@ -1,4 +1,4 @@
-"""What all pages of results share: charts, drawings, templates and colors.
+"""Charts, drawings, templates and colors that all pages of results share.
 
 `charts`   charts over time, as plain data for Plotly      `svg`      drawings of the snake and its forces
 `palette`  colors of both themes, one for each joint       `html`     templates, and numbers for people

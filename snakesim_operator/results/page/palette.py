@@ -1,4 +1,4 @@
-"""Colors, light and dark, which people with any kind of color vision can distinguish (after Okabe and Ito).
+"""Defines colors for light and dark pages that people with any color vision can distinguish (after Okabe and Ito).
 
 A joint has one color of its own, the same in every figure of every report.
 """
@@ -59,30 +59,30 @@ DARK: dict[str, str] = {
     "positive": "#f39a4d",
 }
 
-GOLDEN = 0.381966  # of a turn of hue: neighbors are far apart, and no hue comes twice
+HUE_STEP = 0.381966  # fraction of the hue circle between joints: neighbors differ strongly, and no hue is repeated
 
 
-def joint_colors(count: int, *, dark: bool) -> dict[str, str]:
-    """Return a color for every joint, tail to head."""
+def make_joint_colors(count: int, *, dark: bool) -> dict[str, str]:
+    """Make a color for every joint: "#rrggbb" by CSS name `joint-INDEX`, tail to head."""
     lightness = (0.66, 0.76) if dark else (0.45, 0.34)  # of even and odd joints
     colors: dict[str, str] = {}
     for joint in range(count):
-        hue = (0.56 + GOLDEN * joint) % 1
+        hue = (0.56 + HUE_STEP * joint) % 1
         rgb = colorsys.hls_to_rgb(hue, lightness[joint % 2], 0.72)
         colors[f"joint-{joint}"] = "#" + "".join(f"{round(255 * part):02x}" for part in rgb)
     return colors
 
 
-def themes(joints: int) -> str:
-    """Return the colors of both themes as CSS variables. Paper is always light."""
-    light = LIGHT | joint_colors(joints, dark=False)
-    dark = DARK | joint_colors(joints, dark=True)
+def make_theme_css(joints: int) -> str:
+    """Make the CSS rules with the colors of both themes as variables. A printed page is always light."""
+    light = LIGHT | make_joint_colors(joints, dark=False)
+    dark = DARK | make_joint_colors(joints, dark=True)
     return (
-        f":root{{{variables(light)}}}@media screen and (prefers-color-scheme:dark)"
-        f"{{:root:not(.paper){{{variables(dark)}}}}}"
+        f":root{{{format_css_variables(light)}}}@media screen and (prefers-color-scheme:dark)"
+        f"{{:root:not(.paper){{{format_css_variables(dark)}}}}}"
     )
 
 
-def variables(colors: dict[str, str]) -> str:
-    """Return colors as CSS variables."""
+def format_css_variables(colors: dict[str, str]) -> str:
+    """Format colors as CSS variables, `--NAME:COLOR;`."""
     return "".join(f"--{name}:{value};" for name, value in colors.items())

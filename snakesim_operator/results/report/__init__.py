@@ -1,9 +1,9 @@
-"""The report on a run: one page that needs no network, no program and no other file, `report.html`.
+"""The report of a run: one self-contained page, `report.html`.
 
 `timeline`, `snapshots`, `events`, `verdict` find the content; `playback`, `top_view`, `polygon` draw the snake and
-its forces, `figures` names the charts; `page` and the template `report.html` put it together. Imports the HAL only.
+its forces, `figures` draws the charts; `page` and the template `report.html` put it together. Imports the HAL only.
 """
 
-from snakesim_operator.results.report.page import page, playback_page
+from snakesim_operator.results.report.page import render_playback_page, render_report
 
-__all__ = ["page", "playback_page"]
+__all__ = ["render_playback_page", "render_report"]

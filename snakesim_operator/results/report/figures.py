@@ -1,150 +1,171 @@
-"""The charts of the report: what is drawn over time, and in which color."""
+"""Draws the charts of the report over time, each with its colors."""
 
 from typing import Any
 
 import numpy as np
 
-from snakesim_operator.results.metrics.motion import MOVING, STANDING, measure_motion
-from snakesim_operator.results.metrics.propulsion import Propulsion
-from snakesim_operator.results.page.charts import Bar, Figure, Floats, Line, Mark, bars, joint_map, lines
+from snakesim_operator.results.metrics.motion import MOVING_LABEL, STATIONARY_LABEL, find_stops
+from snakesim_operator.results.metrics.propulsion import PropulsionInterval
+from snakesim_operator.results.page.charts import (
+    Bar,
+    Floats,
+    Line,
+    PlotlyDict,
+    TimeMarker,
+    make_bar_chart,
+    make_joint_heatmap,
+    make_line_chart,
+)
 from snakesim_operator.results.report.timeline import (
     Series,
-    commanded_torque_nm,
-    in_words,
-    jam_bands,
-    reference_rad,
-    state_bands,
+    compute_reference_rad,
+    describe_state,
+    find_jam_intervals,
+    find_state_intervals,
+    select_commanded_torque_nm,
 )
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import SATURATED_FROM, largest
-from snakesim_operator.results.time_axis import end_s, zero_s
+from snakesim_operator.results.summary import SATURATION_RATIO, max_or_none
+from snakesim_operator.results.time_axis import get_run_end_s, get_time_origin_s
 
-MOTION_COLORS = {MOVING: "--locomoting", STANDING: "--notlocomoting"}
-LOWERED_FRACTION = 0.995  # of the joint's limit: a controller's own limit below that is drawn
+MOTION_COLORS = {MOVING_LABEL: "--locomoting", STATIONARY_LABEL: "--notlocomoting"}
+LOWERED_FRACTION = 0.995  # of the limit of the joint; a limit that the controller set below that is drawn
 
 
-def faults(record: RunRecord) -> list[Mark]:
-    """Return a mark for every fault."""
-    marks: list[Mark] = []
+def mark_faults(record: RunRecord) -> list[TimeMarker]:
+    """Return a marker for every fault of the run."""
+    marks: list[TimeMarker] = []
     for fault in record.host.faults:
-        time_s = fault.tick * record.config.period_ns * 1e-9 - zero_s(record)
-        marks.append(Mark(time_s, "", "--bad"))
+        time_s = fault.tick * record.config.period_ns * 1e-9 - get_time_origin_s(record)
+        marks.append(TimeMarker(time_s, "", "--bad"))
     return marks
 
 
-def color(joint: int) -> str:
-    """Return the name of a joint's color."""
+def get_joint_color(joint: int) -> str:
+    """Return the CSS variable with the color of a joint, by its index."""
     return f"--joint-{joint}"
 
 
-def advance(record: RunRecord, moved: Series) -> Figure:
-    """Draw how far the body moved."""
-    return _lines(record, "Advance over time", "advance, m", [Line(moved.what, moved.time_s, moved.value)])
+def draw_advance(record: RunRecord, moved: Series) -> PlotlyDict:
+    """Draw the advance of the body over time."""
+    return _make_line_chart_of_run(
+        record, "Advance over time", "advance, m", [Line(moved.label, moved.time_s, moved.values)]
+    )
 
 
-def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
-    """Return a chart of bars over time: measured motion, reported states, jams, and each joint that propelled.
+def draw_states_and_propulsion(record: RunRecord, intervals: list[PropulsionInterval]) -> PlotlyDict:
+    """Draw bars over time: measured motion, reported states, jams, and each joint that propelled.
 
     Args:
         record: The recorded run.
-        intervals: When which joint propelled.
+        intervals: Intervals in which joints propelled.
     """
     joint_names = [joint.name for joint in record.description.joints]
     drawn: list[Bar] = []
-    motion = measure_motion(record)
-    if motion is not None:
-        for span in motion.spans:
-            drawn.append(Bar("motion", span.start_s, span.end_s, span.what, MOTION_COLORS[span.what]))
-    for band in state_bands(record):
-        drawn.append(Bar("control", band.start_s, band.end_s, in_words(band.what), f"--{band.what.lower()}"))
-    for band in jam_bands(record):
+    stop_intervals = find_stops(record)
+    if stop_intervals is not None:
+        for span in stop_intervals.all_intervals:
+            drawn.append(Bar("motion", span.start_s, span.end_s, span.label, MOTION_COLORS[span.label]))
+    for band in find_state_intervals(record):
+        drawn.append(Bar("control", band.start_s, band.end_s, describe_state(band.label), f"--{band.label.lower()}"))
+    for band in find_jam_intervals(record):
         drawn.append(Bar("jam", band.start_s, band.end_s, "jammed", "--bad"))
     rows_with_bars = {bar.row for bar in drawn}
     rows = [row for row in ("motion", "control", "jam") if row in rows_with_bars]
 
     for interval in intervals:
-        name = joint_names[interval.joint]
+        name = joint_names[interval.joint_index]
         words = f"{interval.duration_s:.1f} s"
-        drawn.append(Bar(name, interval.start_s, interval.end_s, words, color(interval.joint)))
-    head_to_tail = sorted({interval.joint for interval in intervals}, reverse=True)
+        drawn.append(Bar(name, interval.start_s, interval.end_s, words, get_joint_color(interval.joint_index)))
+    head_to_tail = sorted({interval.joint_index for interval in intervals}, reverse=True)
     rows += [joint_names[joint] for joint in head_to_tail]
-    return bars("States and propulsion joint over time", rows, drawn, end_s(record), faults(record))
+    return make_bar_chart(
+        "States and propulsion joint over time", rows, drawn, get_run_end_s(record), mark_faults(record)
+    )
 
 
-def joint_angle(record: RunRecord, joint: int, intervals: list[Propulsion]) -> Figure:
-    """Draw a joint's measured angle and its reference (paper, Fig. 12)."""
+def draw_joint_angle(record: RunRecord, joint: int, intervals: list[PropulsionInterval]) -> PlotlyDict:
+    """Draw the measured angle of a joint and its reference (Fig. 12 of the paper), shaded while it propelled."""
     drawn = [
-        _line(record, "measured", record.angle_rad[:, joint], color(joint)),
-        _line(record, "reference", reference_rad(record, joint), "--ink", "dot"),
+        _make_line(record, "measured", record.angle_rad[:, joint], get_joint_color(joint)),
+        _make_line(record, "reference", compute_reference_rad(record, joint), "--ink", "dot"),
     ]
     label = f"Angle of {record.description.joints[joint].name} over time"
-    return _lines(record, label, "angle, rad", drawn, shades=_shades(intervals, joint))
+    return _make_line_chart_of_run(record, label, "angle, rad", drawn, shades=_shade_propulsion(intervals, joint))
 
 
-def joint_torque(record: RunRecord, joint: int, intervals: list[Propulsion]) -> Figure:
-    """Draw a joint's measured torque, the one commanded in torque mode, and the limits (paper, Fig. 13)."""
+def draw_joint_torque(record: RunRecord, joint: int, intervals: list[PropulsionInterval]) -> PlotlyDict:
+    """Draw the measured and the commanded torque of a joint, and the torque limits (Fig. 13 of the paper)."""
     limit_nm = record.description.joints[joint].torque_limit_nm
     controller_limit_nm = record.torque_limit_nm[:, joint]
     lowered_nm = np.where(controller_limit_nm < LOWERED_FRACTION * limit_nm, controller_limit_nm, np.nan)
     drawn = [
-        _line(record, "measured", record.torque_nm[:, joint], color(joint)),
-        _line(record, "commanded", commanded_torque_nm(record, joint), "--ink", "dot"),
+        _make_line(record, "measured", record.torque_nm[:, joint], get_joint_color(joint)),
+        _make_line(record, "commanded", select_commanded_torque_nm(record, joint), "--ink", "dot"),
     ]
     if np.isfinite(lowered_nm).any():
         for signed_limit_nm in (lowered_nm, -lowered_nm):
-            drawn.append(_line(record, "limit set by the controller", signed_limit_nm, "--faint", "dot", 1.0))
+            drawn.append(_make_line(record, "limit set by the controller", signed_limit_nm, "--faint", "dot", 1.0))
     label = f"Torque of {record.description.joints[joint].name} over time"
     levels = [(limit_nm, "limit of the joint"), (-limit_nm, "")]
-    return _lines(record, label, "torque, N·m", drawn, levels=levels, shades=_shades(intervals, joint))
-
-
-def torque_map(record: RunRecord, intervals: list[Propulsion]) -> Figure:
-    """Draw every joint's torque (paper, Fig. 11). Propulsion is framed."""
-    names = [joint.name for joint in record.description.joints]
-    frames = [(one.start_s, one.end_s, one.joint) for one in intervals]
-    full_nm = full_color_nm(record)
-    return joint_map(
-        "Torque of every joint over time", names, record.torque_nm, "N·m", full_nm, end_s(record), frames=frames
+    return _make_line_chart_of_run(
+        record, label, "torque, N·m", drawn, levels=levels, shades=_shade_propulsion(intervals, joint)
     )
 
 
-def full_color_nm(record: RunRecord) -> float:
-    """Return the torque that is drawn in full color: the run's maximum, unless that is negligible."""
+def draw_torque_map(record: RunRecord, intervals: list[PropulsionInterval]) -> PlotlyDict:
+    """Draw the torque of every joint as a heatmap (Fig. 11 of the paper), with frames around propulsion."""
+    names = [joint.name for joint in record.description.joints]
+    frames = [(one.start_s, one.end_s, one.joint_index) for one in intervals]
+    full_nm = find_full_color_torque_nm(record)
+    return make_joint_heatmap(
+        "Torque of every joint over time", names, record.torque_nm, "N·m", full_nm, get_run_end_s(record), frames=frames
+    )
+
+
+def find_full_color_torque_nm(record: RunRecord) -> float:
+    """Return the torque in N·m that is drawn in full color: the maximum of the run, unless that is negligible."""
     min_full_nm = 0.05 * max(joint.torque_limit_nm for joint in record.description.joints)
-    return max(largest(np.abs(record.torque_nm)) or 0.0, min_full_nm, 1e-9)
+    return max(max_or_none(np.abs(record.torque_nm)) or 0.0, min_full_nm, 1e-9)
 
 
-def torque_use(record: RunRecord) -> Figure:
-    """Draw the hardest-worked joint's torque as a fraction of its limit. At the limit it is marked."""
+def draw_max_torque_ratio(record: RunRecord) -> PlotlyDict:
+    """Draw the largest ratio of torque to torque limit of all joints, with the ticks at the limit in red."""
     limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
     percent = 100 * np.fmax.reduce(np.abs(record.torque_nm) / limits, axis=1)
-    drawn = [_line(record, "largest of any joint", percent)]
-    at_limit = percent >= 100 * SATURATED_FROM
+    drawn = [_make_line(record, "largest of any joint", percent)]
+    at_limit = percent >= 100 * SATURATION_RATIO
     if at_limit.any():
-        drawn.append(_line(record, "at its limit", np.where(at_limit, percent, np.nan), "--bad", "solid", 3))
+        drawn.append(_make_line(record, "at its limit", np.where(at_limit, percent, np.nan), "--bad", "solid", 3))
     label = "Largest torque of any joint as a share of its limit"
-    return _lines(record, label, "of limit, %", drawn, levels=[(100, "limit")], height=190)
+    return _make_line_chart_of_run(record, label, "of limit, %", drawn, levels=[(100, "limit")], height=190)
 
 
-def contacts(record: RunRecord) -> list[Figure]:
-    """Draw the strongest contact, and how many obstacles are touched; three make a triplet."""
-    force = [_line(record, "strongest contact", record.contact_peak_n, "--measured")]
-    count = [_line(record, "obstacles touched", record.contact_count, "--measured", shape="hv")]
+def draw_contacts(record: RunRecord) -> list[PlotlyDict]:
+    """Draw two charts: the strongest contact force, and the number of touched obstacles."""
+    force = [_make_line(record, "strongest contact", record.contact_peak_n, "--measured")]
+    count = [_make_line(record, "obstacles touched", record.contact_count, "--measured", shape="hv")]
     levels = [(3, "three carry it")]
     return [
-        _lines(record, "Strongest contact force over time, mean over 50 ms", "force, N", force, height=190),
-        _lines(record, "Obstacles touched over time", "touched", count, levels=levels, height=160, from_zero=True),
+        _make_line_chart_of_run(
+            record, "Strongest contact force over time, mean over 50 ms", "force, N", force, height=190
+        ),
+        _make_line_chart_of_run(
+            record, "Obstacles touched over time", "touched", count, levels=levels, height=160, from_zero=True
+        ),
     ]
 
 
-def _line(record: RunRecord, name: str, values: Floats, *look: Any, **more: Any) -> Line:
-    return Line(name, record.time_s - zero_s(record), values, *look, **more)
+def _make_line(record: RunRecord, name: str, values: Floats, *style: Any, **more_style: Any) -> Line:
+    return Line(name, record.time_s - get_time_origin_s(record), values, *style, **more_style)
 
 
-def _lines(record: RunRecord, label: str, axis: str, drawn: list[Line], **more: Any) -> Figure:
-    return lines(label, axis, drawn, end_s(record), marks=faults(record), **more)
+def _make_line_chart_of_run(
+    record: RunRecord, label: str, axis: str, drawn: list[Line], **chart_options: Any
+) -> PlotlyDict:
+    return make_line_chart(label, axis, drawn, get_run_end_s(record), markers=mark_faults(record), **chart_options)
 
 
-def _shades(intervals: list[Propulsion], joint: int) -> list[Bar]:
-    of_joint = [interval for interval in intervals if interval.joint == joint]
-    return [Bar("", interval.start_s, interval.end_s, "", color(joint)) for interval in of_joint]
+def _shade_propulsion(intervals: list[PropulsionInterval], joint: int) -> list[Bar]:
+    of_joint = [interval for interval in intervals if interval.joint_index == joint]
+    return [Bar("", interval.start_s, interval.end_s, "", get_joint_color(joint)) for interval in of_joint]

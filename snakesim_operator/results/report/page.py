@@ -1,4 +1,4 @@
-"""The page: verdict, playback, advance, snapshots, joints, loads, numbers. An empty section gives the reason."""
+"""Renders the report of a run. A section without content states the reason."""
 
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -8,49 +8,59 @@ from markupsafe import Markup
 from msgspec import Meta
 
 from snakesim_hal.wire.messages import TICK_TIMES
-from snakesim_operator.results.metrics.propulsion import Propulsion, find_propulsion_intervals
-from snakesim_operator.results.page.html import render
+from snakesim_operator.results.metrics.propulsion import PropulsionInterval, find_propulsion_intervals
+from snakesim_operator.results.page.html import render_page
 from snakesim_operator.results.report import figures
-from snakesim_operator.results.report.events import Event, drawn_snapshots, find_events, select_listed
-from snakesim_operator.results.report.playback import playback
-from snakesim_operator.results.report.polygon import common_scale, force_polygon, with_subscript
-from snakesim_operator.results.report.pushing import pushing
-from snakesim_operator.results.report.reasons import why_at_limit, why_empty, why_late, why_refused
-from snakesim_operator.results.report.snapshots import measured_along_n
-from snakesim_operator.results.report.timeline import distance, in_words, joined, most_used_joints
-from snakesim_operator.results.report.top_view import top_view
-from snakesim_operator.results.report.verdict import verdict
-from snakesim_operator.results.report.view import nodes_xy_w, views
+from snakesim_operator.results.report.events import Event, find_events, select_listed_events, select_snapshots_to_draw
+from snakesim_operator.results.report.playback import make_playback
+from snakesim_operator.results.report.polygon import draw_force_polygon, find_common_force_scale, format_subscript
+from snakesim_operator.results.report.pushing import make_pushing_section
+from snakesim_operator.results.report.reasons import (
+    explain_late_commands,
+    explain_push_points_without_contact,
+    explain_refused_commands,
+    explain_torque_limit,
+)
+from snakesim_operator.results.report.snapshots import project_measured_force_n
+from snakesim_operator.results.report.timeline import (
+    describe_state,
+    find_most_propelling_joints,
+    join_intervals,
+    measure_distance,
+)
+from snakesim_operator.results.report.top_view import draw_top_view
+from snakesim_operator.results.report.verdict import make_verdict
+from snakesim_operator.results.report.view import compute_viewports, find_body_points_xy_w
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import CONFIG
-from snakesim_operator.results.summary import RunSummary, distance_m
-from snakesim_operator.results.time_axis import end_s, zero_s
+from snakesim_operator.results.run_reader import CONFIG_FILENAME
+from snakesim_operator.results.summary import RunSummary, get_distance_m
+from snakesim_operator.results.time_axis import get_run_end_s, get_time_origin_s
 
 HERE = Path(__file__).parent
 VIEW_WIDTH = 500.0
-MAX_SPANS_SHOWN = 100  # of one joint in a chart
+MAX_INTERVALS_SHOWN = 100  # of one joint in a chart
 POLYGON_SIZE = (236.0, 226.0)
 ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_times")
 """Fields of the summary that are not in the table of numbers, because another section has them."""
 
 
-def page(record: RunRecord, summary: RunSummary) -> str:
-    """Return the report of one run as an HTML page.
+def render_report(record: RunRecord, summary: RunSummary) -> str:
+    """Render the report of one run as an HTML page.
 
     Args:
         record: The recorded run.
-        summary: The numbers of the run.
+        summary: Summary of the run.
     """
     events = find_events(record, summary)
     all_intervals = find_propulsion_intervals(record)
-    shown_intervals = joined(all_intervals, end_s(record) / MAX_SPANS_SHOWN)
-    intervals_by_joint: list[tuple[int, list[Propulsion]]] = []
-    for joint in most_used_joints(shown_intervals):
-        intervals_of_joint = [interval for interval in all_intervals if interval.joint == joint]
+    shown_intervals = join_intervals(all_intervals, get_run_end_s(record) / MAX_INTERVALS_SHOWN)
+    intervals_by_joint: list[tuple[int, list[PropulsionInterval]]] = []
+    for joint in find_most_propelling_joints(shown_intervals):
+        intervals_of_joint = [interval for interval in all_intervals if interval.joint_index == joint]
         intervals_by_joint.append((joint, intervals_of_joint))
-    propelling_joints = {interval.joint for interval in shown_intervals}
+    propelling_joints = {interval.joint_index for interval in shown_intervals}
     config_json = msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode()
-    return render(
+    return render_page(
         HERE / "report.html",
         len(record.description.joints),
         styles=[HERE / "figure.css"],
@@ -59,95 +69,98 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         title=record.config.title or summary.scenario,
         record=record,
         summary=summary,
-        verdict=verdict(record, summary),
-        film=playback(record),
+        verdict=make_verdict(record, summary),
+        film=make_playback(record),
         # Sections and figures.
-        events=select_listed(events),
-        snapshots=_describe_snapshots(record, events),
-        pushing=pushing(record),
-        moved=distance(record) if len(record.time_s) else None,
-        moved_m=distance_m(summary),
+        events=select_listed_events(events),
+        snapshots=_make_snapshot_cards(record, events),
+        pushing=make_pushing_section(record),
+        moved=measure_distance(record) if len(record.time_s) else None,
+        moved_m=get_distance_m(summary),
         figures=figures,
         names=[joint.name for joint in record.description.joints],
         limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
         intervals=shown_intervals,
         joints=intervals_by_joint,
         propelled=len(propelling_joints),
-        begin_s=zero_s(record),
+        begin_s=get_time_origin_s(record),
         # Explanations of numbers that are not good.
-        why_empty=why_empty(record),
-        why_at_limit=why_at_limit(record),
-        why_late=why_late(summary),
-        why_refused=why_refused(summary),
+        why_empty=explain_push_points_without_contact(record),
+        why_at_limit=explain_torque_limit(record),
+        why_late=explain_late_commands(summary),
+        why_refused=explain_refused_commands(summary),
         # Lists and tables.
         tick_times=TICK_TIMES,
-        first_faults=len(summary.faults) // 2,  # of a log that left some out, the first half are the first ones
-        numbers=_numbers(summary),
-        config_file=_config_file(record),
+        first_faults=len(summary.faults) // 2,  # if faults are left out, the first half are the first ones of the run
+        numbers=_list_summary_fields(summary),
+        config_file=_find_config_path(record),
         config=config_json,
         # Functions for the template.
-        pretty=with_subscript,
-        in_words=in_words,
+        pretty=format_subscript,
+        in_words=describe_state,
     )
 
 
-def playback_page(record: RunRecord, summary: RunSummary) -> str:
-    """Return a page with verdict and playback alone, without charts: small enough for a notebook."""
-    return render(
+def render_playback_page(record: RunRecord, summary: RunSummary) -> str:
+    """Render a page with only the verdict and the playback of a run, which is small enough for a notebook."""
+    return render_page(
         HERE / "playback.html",
         len(record.description.joints),
         styles=[HERE / "figure.css"],
         scripts=[HERE / "playback.js"],
         charts=False,
         title=record.config.title or summary.scenario,
-        verdict=verdict(record, summary),
-        film=playback(record),
-        events=select_listed(find_events(record, summary)),
+        verdict=make_verdict(record, summary),
+        film=make_playback(record),
+        events=select_listed_events(find_events(record, summary)),
         names=[joint.name for joint in record.description.joints],
     )
 
 
-def _describe_snapshots(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
-    """Return what the template shows for each event that is drawn: drawings as SVG, and numbers.
+def _make_snapshot_cards(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
+    """Make the content of the snapshot cards of the report: for each drawn event its drawings as SVG, and numbers.
 
     Args:
         record: The recorded run.
         events: All events of the run; only some of them are drawn.
 
     Returns:
-        A dictionary for each event: the event, its snapshot, the top view, the force polygon (None without balanced
-        forces), and `pushed_n`, the measured contact force in the direction of travel.
+        A dictionary for each card, whose keys the template reads: `event`, `snapshot`, `view` (top view), `polygon`
+        (force polygon; None if the snapshot has no balanced forces), and `pushed_n` (measured contact force in the
+        direction of travel, in N).
     """
-    chosen = drawn_snapshots(record, events)
-    snapshots = [snapshot for _, snapshot in chosen]
-    top_views = views(record, snapshots, VIEW_WIDTH)
-    balances = [snapshot.balance for snapshot in snapshots if snapshot.balance is not None]
+    drawn_events = select_snapshots_to_draw(record, events)
+    snapshots = [snapshot for _, snapshot in drawn_events]
+    viewports = compute_viewports(record, snapshots, VIEW_WIDTH)
+    force_balances = [snapshot.force_balance for snapshot in snapshots if snapshot.force_balance is not None]
     cards: list[dict[str, Any]] = []
-    for (event, snapshot), view in zip(chosen, top_views, strict=True):
-        balance = snapshot.balance
-        if balance is None:
-            nodes = nodes_xy_w(record, snapshot.row)
-            forward = nodes[-1] - nodes[0]  # from the tail to the head
+    for (event, snapshot), viewport in zip(drawn_events, viewports, strict=True):
+        force_balance = snapshot.force_balance
+        if force_balance is None:
+            body_points_w = find_body_points_xy_w(record, snapshot.row)
+            forward_w = body_points_w[-1] - body_points_w[0]  # from the tail to the head
             polygon = None
         else:
-            forward = balance.resultant_n
-            scale = common_scale(balances, *POLYGON_SIZE, upright=view.upright)
-            drawing = force_polygon(balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=view.upright)
+            forward_w = force_balance.resultant_force_n
+            scale = find_common_force_scale(force_balances, *POLYGON_SIZE, upright=viewport.is_rotated)
+            drawing = draw_force_polygon(
+                force_balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=viewport.is_rotated
+            )
             polygon = Markup(drawing)
         cards.append(
             {
                 "event": event,
                 "snapshot": snapshot,
-                "view": Markup(top_view(record, snapshot, view)),
+                "view": Markup(draw_top_view(record, snapshot, viewport)),
                 "polygon": polygon,
-                "pushed_n": measured_along_n(snapshot, forward),
+                "pushed_n": project_measured_force_n(snapshot, forward_w),
             }
         )
     return cards
 
 
-def _numbers(summary: RunSummary) -> list[tuple[str, Any, str, str]]:
-    """Return name, value, unit and description of every field that the page shows in its table."""
+def _list_summary_fields(summary: RunSummary) -> list[tuple[str, Any, str, str]]:
+    """List name, value, unit and description of every field of the summary that the table of the report shows."""
     hints = get_type_hints(RunSummary, include_extras=True)
     rows: list[tuple[str, Any, str, str]] = []
     for field in msgspec.structs.fields(RunSummary):
@@ -164,19 +177,22 @@ def _numbers(summary: RunSummary) -> list[tuple[str, Any, str, str]]:
 
 
 def _find_meta(hint: Any) -> Meta | None:
+    """Return the Meta object of an annotated type, or None if it has none."""
     for note in getattr(hint, "__metadata__", ()):
         if isinstance(note, Meta):
             return note
     return None
 
 
-def _config_file(record: RunRecord) -> Path:
-    """Return the path of the configuration, as the page names it.
+def _find_config_path(record: RunRecord) -> Path:
+    """Return the path of the configuration as the report shows it, relative to the working folder if possible.
 
-    A recording alone has no such file beside it: its configuration is on the page.
+    If only a recording exists, this is the file name under which a user may save the configuration on the page.
     """
-    path = record.config_path
-    if path is None:
-        return Path(CONFIG)
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
+    config_path = record.config_path
+    if config_path is None:
+        return Path(CONFIG_FILENAME)
+    working_folder = Path.cwd()
+    if config_path.is_relative_to(working_folder):
+        return config_path.relative_to(working_folder)
+    return config_path

@@ -1,28 +1,28 @@
-"""The parts of a verdict's sentence: distance, hand-overs, trouble, and how the run ended.
+"""Describes parts of a run for the sentence of its verdict: distance, hand-overs, trouble, and ending.
 
 A phrase that is part of a longer sentence ends with its own separator; without anything to describe it is empty.
 """
 
-from snakesim_operator.results.metrics.motion import Motion
-from snakesim_operator.results.report.timeline import reported_while_moving
-from snakesim_operator.results.run_ending import COMPLETE, UNKNOWN
+from snakesim_operator.results.metrics.motion import StopIntervals
+from snakesim_operator.results.report.timeline import find_report_mismatch
+from snakesim_operator.results.run_ending import COMPLETE, UNKNOWN_PREFIX
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.results.time_axis import reported_at_s
+from snakesim_operator.results.time_axis import get_report_time_s
 
 MOVED_M = 0.02  # a body that moved less did not locomote
-MIN_PUSH_N = 0.5  # a smaller measured force is no push
+MIN_PUSH_N = 0.5  # a smaller measured force does not count as a push
 MAX_HAND_OVERS_NAMED = 8
 
 
-def as_sentence(words: str) -> str:
-    """Return the words with exactly one full stop at the end."""
+def end_with_full_stop(words: str) -> str:
+    """End a text with exactly one full stop; an empty text stays empty."""
     words = words.strip().rstrip(".;")
     return f"{words}." if words else ""
 
 
 def describe_distance(record: RunRecord, summary: RunSummary) -> str:
-    """Describe how far the body moved, and in which time."""
+    """Describe how far the body moved in which time, or why the distance is unknown."""
     duration = f"in {summary.duration_s:.1f} s"
     if summary.path_distance_m is not None:
         back = " backward" if summary.path_distance_m <= -MOVED_M else ""
@@ -34,7 +34,7 @@ def describe_distance(record: RunRecord, summary: RunSummary) -> str:
 
 
 def describe_hand_overs(summary: RunSummary) -> str:
-    """Describe which joints propelled, one after the other."""
+    """Describe which joints propelled, one after another; empty if none is known."""
     names = summary.propulsion_joints
     if not names:
         return ""
@@ -47,9 +47,9 @@ def describe_hand_overs(summary: RunSummary) -> str:
 
 
 def describe_pushed_obstacles(record: RunRecord) -> str:
-    """Describe how many obstacles the body pushed off: chosen by the controller, with a measured contact."""
+    """Describe how many obstacles the body pushed off: those of push-points with a measured contact force."""
     obstacles: set[str] = set()
-    for state in record.control:
+    for state in record.control_states:
         for point, measured_n in zip(state.push_points, state.measured_force_n, strict=False):
             if point.obstacle is not None and measured_n is not None and measured_n >= MIN_PUSH_N:
                 obstacles.add(point.obstacle)
@@ -60,7 +60,7 @@ def describe_pushed_obstacles(record: RunRecord) -> str:
 
 
 def describe_trouble(summary: RunSummary) -> str:
-    """Describe what went wrong without stopping the run: lost joints, other faults, refused commands."""
+    """Describe problems that did not stop the run: lost joints, other faults, refused commands."""
     phrases: list[str] = []
     lost_joints: list[str] = []
     for fault in summary.faults:
@@ -71,7 +71,7 @@ def describe_trouble(summary: RunSummary) -> str:
     other_faults = [fault for fault in summary.faults if fault.reach == "none"]
     if other_faults:
         count = "a fault" if len(other_faults) == 1 else f"{len(other_faults)} faults"
-        cause = as_sentence(other_faults[0].cause)[:-1]
+        cause = end_with_full_stop(other_faults[0].cause)[:-1]
         phrases.append(f"{count} ({cause})")
     if not phrases:
         phrases.append("no fault")
@@ -79,7 +79,7 @@ def describe_trouble(summary: RunSummary) -> str:
 
 
 def describe_refused_commands(summary: RunSummary) -> list[str]:
-    """Return a phrase about the commands that the limiter refused; empty if it refused none."""
+    """Describe by a phrase the commands that the limiter refused; an empty list if it refused none."""
     counts = {reason: count for reason, count in summary.rejected_commands.items() if count}
     if not counts:
         return []
@@ -89,29 +89,33 @@ def describe_refused_commands(summary: RunSummary) -> list[str]:
 
 
 def describe_ending(ended: str) -> str:
-    """Describe how a run ended that was not complete."""
+    """Describe how an incomplete run ended; empty if the run is complete."""
     if ended == COMPLETE:
         return ""
-    if ended.startswith(UNKNOWN):
-        return f" How the run ended is not known: {as_sentence(ended.removeprefix(UNKNOWN))}"
-    return f" The run ended early: {as_sentence(ended)}"
+    if ended.startswith(UNKNOWN_PREFIX):
+        return f" How the run ended is not known: {end_with_full_stop(ended.removeprefix(UNKNOWN_PREFIX))}"
+    return f" The run ended early: {end_with_full_stop(ended)}"
 
 
-def describe_contradiction(record: RunRecord, motion: Motion) -> str:
-    """Describe what control reported as a reason for no motion while the body moved."""
-    mismatch = reported_while_moving(record, motion)
+def describe_contradiction(record: RunRecord, motion: StopIntervals) -> str:
+    """Describe for how long control reported no motion while the body moved; empty if it did not for long."""
+    mismatch = find_report_mismatch(record, motion)
     if mismatch is None:
         return ""
     reason = mismatch.reason.strip().rstrip(".;")
-    return f' For {mismatch.lasted_s:.1f} s of its motion control reported "{reason}".'
+    return f' For {mismatch.duration_s:.1f} s of its motion control reported "{reason}".'
 
 
 def describe_last_control_state(record: RunRecord, at_s: float) -> str:
-    """Describe what control was missing when a fault stopped the robot.
+    """Describe why the controller did not locomote when a fault stopped the robot; empty if it did.
 
-    A fault of the lease alone only shows that no command came.
+    An expired lease alone only shows that no command arrived.
+
+    Args:
+        record: The recorded run.
+        at_s: Time of the fault on the time axis.
     """
-    states = [state for state in record.control if reported_at_s(record, state) <= at_s]
+    states = [state for state in record.control_states if get_report_time_s(record, state) <= at_s]
     if not states or states[-1].state != "NotLocomoting":
         return ""
-    return f" Control reported: {as_sentence(states[-1].reason)}"
+    return f" Control reported: {end_with_full_stop(states[-1].reason)}"

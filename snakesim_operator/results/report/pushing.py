@@ -1,4 +1,4 @@
-"""How a whole body pushed: forces along it over time, which obstacle when, why it stood, and how good its map was."""
+"""Makes the report section on pushing with the whole body: forces, obstacles, stops, and quality of the map."""
 
 import math
 from dataclasses import dataclass
@@ -6,33 +6,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.friction import surface_friction
+from snakesim_hal.model.friction import compute_surface_friction
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
-from snakesim_operator.results.metrics.map_score import MapScore, score
-from snakesim_operator.results.metrics.motion import measure_motion
-from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
-from snakesim_operator.results.report.timeline import longest_reason, state_bands
+from snakesim_operator.results.metrics.map_score import MapScore, score_map
+from snakesim_operator.results.metrics.motion import find_stops
+from snakesim_operator.results.page.charts import Bar, Line, PlotlyDict, make_bar_chart, make_line_chart
+from snakesim_operator.results.report.timeline import find_longest_reason, find_state_intervals
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.time_axis import end_s, reported_at_s, reported_spans, zero_s
+from snakesim_operator.results.time_axis import get_report_time_s, get_run_end_s, get_time_origin_s, list_report_spans
 
-MAX_OBSTACLES = 24  # that get a row of their own: those with the largest impulse
-MIN_FORCE_N = 0.5  # a smaller desired force is none
+MAX_OBSTACLES = 24  # with a row of their own: those with the largest impulse
+MIN_FORCE_N = 0.5  # a smaller desired force is ignored
 MIN_STOP_S = 0.5  # a shorter stop is not listed
 MAX_STOPS = 40
 MAX_MAPS_SCORED = 60
 
 
 @dataclass(frozen=True)
-class StandingSpan:
-    """A span in which the body was stationary.
-
-    why: the reason that control reported for longest, or what was measured.
-    """
+class StationaryInterval:
+    """An interval in which the body was stationary."""
 
     start_s: float
     end_s: float
-    why: str
+    reason: str  # the reason that control reported for longest, or the measured state
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class ForceSample:
 
 @dataclass(frozen=True)
 class ForceSpan:
-    """A span in which the controller planned to push off one obstacle."""
+    """An interval in which the controller desired a force on one obstacle."""
 
     start_s: float
     end_s: float
@@ -54,20 +51,22 @@ class ForceSpan:
 
 
 @dataclass(frozen=True)
-class Pushing:
-    """The content of the section."""
+class PushingSection:
+    """Content of the report section on pushing."""
 
-    forces: Figure
-    obstacles: Figure
-    stops: list[StandingSpan]  # the longest, in order of time
-    shorter: int  # stops that are left out
-    score: MapScore | None  # of the map that guidance perceived; None when it was known
-    position_mm: tuple[float, float]  # errors of the perceived obstacles: median, and below which 90 % are
-    map_errors: Figure | None
+    forces: PlotlyDict
+    obstacles: PlotlyDict
+    stops: list[StationaryInterval]  # the longest, in order of time
+    hidden_stop_count: int  # number of shorter stops that are not shown
+    map_score: MapScore | None  # of the perceived map; None if the map was given
+    position_error_percentiles_mm: tuple[
+        float, float
+    ]  # 50th and 90th percentile of the position errors of perceived obstacles
+    map_errors: PlotlyDict | None
 
 
-def pushing(record: RunRecord) -> Pushing | None:
-    """Return the section of the report about pushing with many push-points at once.
+def make_pushing_section(record: RunRecord) -> PushingSection | None:
+    """Make the section of the report about pushing off many obstacles at once.
 
     Args:
         record: The recorded run.
@@ -76,7 +75,7 @@ def pushing(record: RunRecord) -> Pushing | None:
         The section, or None if it does not apply: the controller reported no push-points, or it drives one propulsion
         joint at a time, which other sections of the report cover.
     """
-    states = [state for state in record.control if state.push_points]
+    states = [state for state in record.control_states if state.push_points]
     has_propulsion_joint = any(state.propulsion_joint is not None for state in states)
     if not states or has_propulsion_joint or not len(record.time_s):
         return None
@@ -84,33 +83,35 @@ def pushing(record: RunRecord) -> Pushing | None:
     longest_first = sorted(stops, key=lambda stop: stop.start_s - stop.end_s)
     shown_stops = longest_first[:MAX_STOPS]
     score, map_errors = _score_maps(record)
-    return Pushing(
-        forces=_force_chart(record),
-        obstacles=_obstacle_chart(record),
+    return PushingSection(
+        forces=_draw_contact_forces(record),
+        obstacles=_draw_pushed_obstacles(record),
         stops=sorted(shown_stops, key=lambda stop: stop.start_s),
-        shorter=len(stops) - len(shown_stops),
-        score=score,
-        position_mm=_position_errors_mm(score),
+        hidden_stop_count=len(stops) - len(shown_stops),
+        map_score=score,
+        position_error_percentiles_mm=_position_errors_mm(score),
         map_errors=map_errors,
     )
 
 
 def _position_errors_mm(score: MapScore | None) -> tuple[float, float]:
-    """Return the median and the 90th percentile; NaN without any perceived obstacle."""
-    if score is None or not score.position_m:
+    """Return the 50th and 90th percentile of the position errors in mm; NaN if no obstacle was matched."""
+    if score is None or not score.position_errors_m:
         return math.nan, math.nan
-    errors_mm = [1e3 * error_m for error_m in score.position_m]
+    errors_mm = [1e3 * error_m for error_m in score.position_errors_m]
     return float(np.percentile(errors_mm, 50)), float(np.percentile(errors_mm, 90))
 
 
-def _force_chart(record: RunRecord) -> Figure:
+def _draw_contact_forces(record: RunRecord) -> PlotlyDict:
     """Draw desired and measured contact forces in the direction from tail to head, and the drag that they overcome."""
     desired: list[ForceSample] = []
-    for state in record.control:
-        desired.append(ForceSample(reported_at_s(record, state), state.timestamp_ns, _sum_forces(state.push_points)))
+    for state in record.control_states:
+        desired.append(
+            ForceSample(get_report_time_s(record, state), state.timestamp_ns, _sum_forces(state.push_points))
+        )
     measured: list[ForceSample] = []
     for world in record.worlds:
-        time_s = world.timestamp_ns * 1e-9 - zero_s(record)
+        time_s = world.timestamp_ns * 1e-9 - get_time_origin_s(record)
         measured.append(ForceSample(time_s, world.timestamp_ns, _sum_forces(world.contacts)))
     drawn = [
         Line("desired at all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
@@ -119,9 +120,9 @@ def _force_chart(record: RunRecord) -> Figure:
     weight_n = GRAVITY_M_S2 * sum(link.mass_kg for link in record.description.links)
     ground = record.config.scene.ground
     robot = record.config.robot
-    drag_n = surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * weight_n
+    drag_n = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * weight_n
     label = "Contact forces along the body over time"
-    return lines(label, "force, N", drawn, end_s(record), levels=[(drag_n, "friction of the ground")])
+    return make_line_chart(label, "force, N", drawn, get_run_end_s(record), levels=[(drag_n, "friction of the ground")])
 
 
 def _times_s(samples: list[ForceSample]) -> Floats:
@@ -129,23 +130,24 @@ def _times_s(samples: list[ForceSample]) -> Floats:
 
 
 def _forward_forces_n(record: RunRecord, samples: list[ForceSample]) -> Floats:
-    """Return the part of each force in the direction from tail to head at its time; NaN if the pose is unknown."""
+    """Project each force onto the direction from tail to head at its time; NaN if the pose is unknown."""
     forward_n = np.full(len(samples), np.nan)
     for i, sample in enumerate(samples):
-        nodes = record.nodes_w(record.row_at(sample.timestamp_ns * 1e-9))
-        if nodes is not None:
-            tail_to_head = nodes[-1, :2] - nodes[0, :2]
+        body_points_w = record.find_body_points_w(record.find_nearest_row(sample.timestamp_ns * 1e-9))
+        if body_points_w is not None:
+            tail_to_head = body_points_w[-1, :2] - body_points_w[0, :2]
             forward_n[i] = float(sample.force_w @ tail_to_head) / max(float(np.hypot(*tail_to_head)), 1e-9)
     return forward_n
 
 
 def _sum_forces(contacts: list[WorldContact]) -> Floats:
+    """Sum the horizontal forces of contacts, (2,) in the world, in N."""
     if not contacts:
         return np.zeros(2)
     return np.sum([contact.force_w[:2] for contact in contacts], axis=0)
 
 
-def _obstacle_chart(record: RunRecord) -> Figure:
+def _draw_pushed_obstacles(record: RunRecord) -> PlotlyDict:
     """Draw a row for each obstacle that the controller pushed off, in the order of their first use."""
     spans = _spans_by_obstacle(record)
     impulse_n_s = {
@@ -158,12 +160,12 @@ def _obstacle_chart(record: RunRecord) -> Figure:
     for name in shown:
         for span in _merge_adjacent(spans[name]):
             drawn.append(Bar(name, span.start_s, span.end_s, f"{span.force_n:.0f} N", "--reference"))
-    return bars("Obstacles pushed off over time", shown, drawn, end_s(record))
+    return make_bar_chart("Obstacles pushed off over time", shown, drawn, get_run_end_s(record))
 
 
 def _spans_by_obstacle(record: RunRecord) -> dict[str, list[ForceSpan]]:
     spans: dict[str, list[ForceSpan]] = {}
-    for start_s, until_s, state in reported_spans(record):
+    for start_s, until_s, state in list_report_spans(record):
         for contact in state.push_points:
             force_n = math.hypot(*contact.force_w[:2])
             if force_n >= MIN_FORCE_N and until_s > start_s:
@@ -177,7 +179,7 @@ def _sort_key(span: ForceSpan) -> tuple[float, float, float]:
 
 
 def _merge_adjacent(spans: list[ForceSpan]) -> list[ForceSpan]:
-    """Merge spans that touch into one with the largest of their forces."""
+    """Merge adjacent intervals into one with the largest of their forces."""
     merged: list[ForceSpan] = []
     for span in spans:
         if merged and span.start_s <= merged[-1].end_s + 1e-6:
@@ -188,21 +190,21 @@ def _merge_adjacent(spans: list[ForceSpan]) -> list[ForceSpan]:
     return merged
 
 
-def _find_stops(record: RunRecord) -> list[StandingSpan]:
-    """Return the spans in which the body was stationary, as measured; without a pose, as control reported it."""
-    motion = measure_motion(record)
-    if motion is None:
-        standing = [band for band in state_bands(record) if band.what == "NotLocomoting"]
+def _find_stops(record: RunRecord) -> list[StationaryInterval]:
+    """Find the intervals in which the body was stationary, as measured; without a pose, as control reported."""
+    stop_intervals = find_stops(record)
+    if stop_intervals is None:
+        intervals = [band for band in find_state_intervals(record) if band.label == "NotLocomoting"]
     else:
-        standing = motion.stops
-    stops: list[StandingSpan] = []
-    for span in standing:
+        intervals = stop_intervals.stops
+    stops: list[StationaryInterval] = []
+    for span in intervals:
         if span.end_s - span.start_s >= MIN_STOP_S:
-            stops.append(StandingSpan(span.start_s, span.end_s, longest_reason(record, span)))
+            stops.append(StationaryInterval(span.start_s, span.end_s, find_longest_reason(record, span)))
     return stops
 
 
-def _score_maps(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
+def _score_maps(record: RunRecord) -> tuple[MapScore | None, PlotlyDict | None]:
     """Compare the perceived maps of a run with the true obstacles within a meter of the head.
 
     At most about MAX_MAPS_SCORED maps are scored, at equal intervals.
@@ -211,10 +213,10 @@ def _score_maps(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
         The total over all maps, and a chart over time of errors, missed obstacles and ghosts. Both are None if the
         mission does not use a perceived map, the scene has no obstacles, or no pose is known.
     """
-    truth = [placed.obstacle for placed in record.placed if not placed.walkable]
-    if record.config.mission.map != "perceived" or not truth:
+    true_obstacles = [placed.obstacle for placed in record.placed_obstacles if not placed.walkable]
+    if record.config.mission.map != "perceived" or not true_obstacles:
         return None, None
-    start_s = zero_s(record)
+    start_s = get_time_origin_s(record)
     total = MapScore()
     times_s: list[float] = []
     median_errors_mm: list[float] = []
@@ -223,20 +225,20 @@ def _score_maps(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
     step = max(len(record.worlds) // MAX_MAPS_SCORED, 1)
     for world in record.worlds[::step]:
         world_time_s = world.timestamp_ns * 1e-9
-        nodes = record.nodes_w(record.row_at(world_time_s))
-        if nodes is None:
+        body_points_w = record.find_body_points_w(record.find_nearest_row(world_time_s))
+        if body_points_w is None:
             continue
-        head_w = nodes[-1]
-        forward_x, forward_y = nodes[-1, :2] - nodes[-2, :2]
-        map_score = score(world.obstacles, truth, head_w, math.atan2(forward_y, forward_x))
+        head_w = body_points_w[-1]
+        forward_x, forward_y = body_points_w[-1, :2] - body_points_w[-2, :2]  # along the head link
+        map_score = score_map(world.obstacles, true_obstacles, head_w, math.atan2(forward_y, forward_x))
         total.add(map_score)
         median_error_mm = math.nan
-        if map_score.position_m:
-            median_error_mm = 1e3 * float(np.median(map_score.position_m))
+        if map_score.position_errors_m:
+            median_error_mm = 1e3 * float(np.median(map_score.position_errors_m))
         times_s.append(world_time_s - start_s)
         median_errors_mm.append(median_error_mm)
-        miss_counts.append(map_score.misses)
-        ghost_counts.append(map_score.ghosts)
+        miss_counts.append(map_score.missed_count)
+        ghost_counts.append(map_score.ghost_count)
     if not times_s:
         return None, None
     time_s = np.array(times_s)
@@ -246,4 +248,4 @@ def _score_maps(record: RunRecord) -> tuple[MapScore | None, Figure | None]:
         Line("ghosts", time_s, np.array(ghost_counts, dtype=np.float64), "--commanded", shape="hv"),
     ]
     label = "Map against truth over time"
-    return total, lines(label, "mm, or how many", drawn, end_s(record), height=190, from_zero=True)
+    return total, make_line_chart(label, "mm, or how many", drawn, get_run_end_s(record), height=190, from_zero=True)

@@ -1,4 +1,4 @@
-"""Time series of a record: states, propulsion intervals, references, distance; all from the first tick on."""
+"""Extracts time series from a record: states, propulsion intervals, references and distance."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,123 +8,141 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.metrics.motion import Motion
-from snakesim_operator.results.metrics.propulsion import Propulsion
+from snakesim_operator.results.metrics.motion import StopIntervals
+from snakesim_operator.results.metrics.propulsion import PropulsionInterval
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import arc_position_m
-from snakesim_operator.results.time_axis import Interval, merge_reports, reported_at_s, reported_spans, zero_s
+from snakesim_operator.results.summary import measure_route_position_m
+from snakesim_operator.results.time_axis import (
+    Interval,
+    get_report_time_s,
+    get_time_origin_s,
+    list_report_spans,
+    merge_equal_reports,
+)
 
 POSE_SAMPLES = 400
 STATES = {"Locomoting": "moving as meant", "NotLocomoting": "not moving", "Idle": "idle", "PowerOff": "power off"}
-MIN_MISMATCH_S = 1.0  # control's own measurement of motion looks back for as long
+MIN_MISMATCH_S = 1.0  # control measures motion over a preceding window of this length
 
 
 @dataclass(frozen=True)
 class Series:
-    """Values over time, and what they are."""
+    """Values over time with a label that names them."""
 
     time_s: Floats
-    value: Floats
-    what: str
+    values: Floats
+    label: str
 
 
-def in_words(state: str) -> str:
-    """Return a state of locomotion in plain words."""
+def describe_state(state: str) -> str:
+    """Describe a locomotion state in plain words."""
     return STATES.get(state, state)
 
 
-def state_bands(record: RunRecord) -> list[Interval]:
-    """Return the locomotion states that control reported; each holds until the next is reported."""
-    return merge_reports(record, [state.state for state in record.control])
+def find_state_intervals(record: RunRecord) -> list[Interval]:
+    """Find the intervals of the locomotion states that control reported; each lasts until the next report."""
+    return merge_equal_reports(record, [state.state for state in record.control_states])
 
 
 @dataclass(frozen=True)
-class Mismatch:
-    """Control reported for some time that the body did not locomote, and it moved."""
+class ReportMismatch:
+    """Control reported for some time that the body did not locomote while it moved."""
 
-    lasted_s: float
-    since_s: float
-    reason: str  # that was reported for longest
+    duration_s: float
+    start_s: float
+    reason: str  # the reason that was reported for longest
 
 
-def reported_while_moving(record: RunRecord, motion: Motion) -> Mismatch | None:
-    """Return what control reported as a reason for no motion while the body moved; None if that was short."""
-    lasted_s: dict[str, float] = {}
-    since_s: list[float] = []
-    for since, until, state in reported_spans(record):
+def find_report_mismatch(record: RunRecord, stop_intervals: StopIntervals) -> ReportMismatch | None:
+    """Find the reports of control that the body did not locomote while it moved.
+
+    Args:
+        record: The recorded run.
+        stop_intervals: Measured intervals without motion.
+
+    Returns:
+        Their total duration, start and main reason; None if they lasted less than MIN_MISMATCH_S.
+    """
+    duration_s_by_reason: dict[str, float] = {}
+    start_times_s: list[float] = []
+    for start_s, end_s, state in list_report_spans(record):
         is_report = state.state == "NotLocomoting" and state.reason != STANDING_STILL
-        if not is_report or until <= since or motion.is_stationary_at((since + until) / 2):
+        if not is_report or end_s <= start_s or stop_intervals.is_stationary_at((start_s + end_s) / 2):
             continue
-        lasted_s[state.reason] = lasted_s.get(state.reason, 0.0) + until - since
-        since_s.append(since)
-    total_s = sum(lasted_s.values())
+        duration_s_by_reason[state.reason] = duration_s_by_reason.get(state.reason, 0.0) + end_s - start_s
+        start_times_s.append(start_s)
+    total_s = sum(duration_s_by_reason.values())
     if total_s < MIN_MISMATCH_S:
         return None
-    return Mismatch(total_s, since_s[0], max(lasted_s, key=lambda reason: lasted_s[reason]))
+    return ReportMismatch(
+        total_s, start_times_s[0], max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason])
+    )
 
 
-def longest_reason(record: RunRecord, span: Interval) -> str:
-    """Return the reason for standing that control reported for longest within a span; else what was measured."""
-    lasted_s: dict[str, float] = {}
-    for since, until, state in reported_spans(record):
-        overlap_s = min(until, span.end_s) - max(since, span.start_s)
+def find_longest_reason(record: RunRecord, interval: Interval) -> str:
+    """Return the reason for no motion that control reported for longest in an interval; without any, STANDING_STILL."""
+    duration_s_by_reason: dict[str, float] = {}
+    for start_s, end_s, state in list_report_spans(record):
+        overlap_s = min(end_s, interval.end_s) - max(start_s, interval.start_s)
         if state.state != "Locomoting" and overlap_s > 0:
-            lasted_s[state.reason] = lasted_s.get(state.reason, 0.0) + overlap_s
-    return max(lasted_s, key=lambda reason: lasted_s[reason], default="") or STANDING_STILL
+            duration_s_by_reason[state.reason] = duration_s_by_reason.get(state.reason, 0.0) + overlap_s
+    return max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason], default="") or STANDING_STILL
 
 
-def jam_bands(record: RunRecord) -> list[Interval]:
-    """Return when the controller reported that the snake was jammed."""
-    bands = merge_reports(record, ["jammed" if state.jammed else None for state in record.control])
-    return [band for band in bands if band.what == "jammed"]
+def find_jam_intervals(record: RunRecord) -> list[Interval]:
+    """Find the intervals in which the controller reported a jam."""
+    intervals = merge_equal_reports(record, ["jammed" if state.jammed else None for state in record.control_states])
+    return [interval for interval in intervals if interval.label == "jammed"]
 
 
-def joined(intervals: list[Propulsion], gap_s: float) -> list[Propulsion]:
-    """Join intervals of one joint with less than a gap between them: a chart could not show them apart."""
-    merged: list[Propulsion] = []
-    newest_index: dict[int, int] = {}  # by joint
+def join_intervals(intervals: list[PropulsionInterval], gap_s: float) -> list[PropulsionInterval]:
+    """Join intervals of the same joint with a gap of less than `gap_s`, which a chart could not show separately."""
+    merged: list[PropulsionInterval] = []
+    newest_index: dict[int, int] = {}  # into `merged`, by joint
     for interval in intervals:
-        index = newest_index.get(interval.joint)
+        index = newest_index.get(interval.joint_index)
         if index is not None and interval.start_s - merged[index].end_s < gap_s:
-            merged[index] = Propulsion(merged[index].start_s, interval.end_s, interval.joint)
+            merged[index] = PropulsionInterval(merged[index].start_s, interval.end_s, interval.joint_index)
         else:
-            newest_index[interval.joint] = len(merged)
+            newest_index[interval.joint_index] = len(merged)
             merged.append(interval)
     return merged
 
 
-def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
-    """Return the joints that propelled longest, from head to tail, in which order hand-overs happen."""
-    spent: dict[int, float] = {}
+def find_most_propelling_joints(intervals: list[PropulsionInterval], max_count: int = 6) -> list[int]:
+    """Find the indices of the joints that propelled longest, from head to tail, the usual order of hand-overs."""
+    duration_s_by_joint: dict[int, float] = {}
     for interval in intervals:
-        spent[interval.joint] = spent.get(interval.joint, 0.0) + interval.duration_s
-    longest = sorted(spent, key=lambda joint: -spent[joint])[:most]
+        duration_s_by_joint[interval.joint_index] = (
+            duration_s_by_joint.get(interval.joint_index, 0.0) + interval.duration_s
+        )
+    longest = sorted(duration_s_by_joint, key=lambda joint: -duration_s_by_joint[joint])[:max_count]
     return sorted(longest, reverse=True)
 
 
-def reference_rad(record: RunRecord, joint: int) -> Floats:
-    """Return a joint's reference, (n,): its target in position mode, else as the controller reported it."""
+def compute_reference_rad(record: RunRecord, joint: int) -> Floats:
+    """Return the reference angle of a joint, (n,): its target in position mode, else as the controller reported it."""
     reference = np.full(len(record.time_s), np.nan)
-    states = [state for state in record.control if len(state.reference_rad) > joint]
+    states = [state for state in record.control_states if len(state.reference_rad) > joint]
     if states:
-        stamps = np.array([state.timestamp_ns * 1e-9 for state in states])
+        timestamps_s = np.array([state.timestamp_ns * 1e-9 for state in states])
         angles = np.array([state.reference_rad[joint] for state in states])
-        reference = np.interp(record.time_s, stamps, angles, left=np.nan, right=angles[-1])
+        reference = np.interp(record.time_s, timestamps_s, angles, left=np.nan, right=angles[-1])
     in_position = record.mode[:, joint] == Mode.POSITION
     return np.where(in_position, record.target[:, joint], reference)
 
 
-def commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
-    """Return the torque that was commanded in torque mode, (n,); NaN in every other mode."""
+def select_commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
+    """Return the commanded torque of a joint in torque mode, (n,); NaN in all other modes."""
     return np.where(record.mode[:, joint] == Mode.TORQUE, record.target[:, joint], np.nan)
 
 
-@lru_cache(maxsize=2)  # the chart and the comparison of two runs ask for the same series
-def distance(record: RunRecord) -> Series | None:
-    """Return how far the robot advanced since the first tick, as a series over time.
+@lru_cache(maxsize=2)  # chart and comparison of two runs need the same series
+def measure_distance(record: RunRecord) -> Series | None:
+    """Measure how far the robot advanced since the first tick, as a series over time.
 
     The best available measure is used: the mean position of the body along the route; without a route, the distance of
-    the tail end from where it was; without a measured pose, the advance that the controller reported.
+    the tail end from its start; without a measured pose, the advance that the controller reported.
 
     Args:
         record: The recorded run.
@@ -134,14 +152,14 @@ def distance(record: RunRecord) -> Series | None:
     """
     tick_count = len(record.time_s)
     if not tick_count:
-        return reported_distance(record)
+        return read_reported_distance(record)
     sample_count = min(tick_count, POSE_SAMPLES)
     sampled_rows = np.unique(np.linspace(0, tick_count - 1, sample_count).astype(int))
-    rows = sampled_rows[record.posed[sampled_rows]]
+    rows = sampled_rows[record.has_pose[sampled_rows]]
     if len(rows) < 2:
-        return reported_distance(record)
-    time_s = record.time_s[rows] - zero_s(record)
-    route_positions_m = [arc_position_m(record, int(row)) for row in rows]
+        return read_reported_distance(record)
+    time_s = record.time_s[rows] - get_time_origin_s(record)
+    route_positions_m = [measure_route_position_m(record, int(row)) for row in rows]
     if None not in route_positions_m:
         along_m = np.array(route_positions_m, dtype=np.float64)
         return Series(time_s, along_m - along_m[0], "advance along the route, mean over the body")
@@ -149,11 +167,11 @@ def distance(record: RunRecord) -> Series | None:
     return Series(time_s, np.hypot(*displacement_w.T), "distance of the tail end from where it was")
 
 
-def reported_distance(record: RunRecord) -> Series | None:
-    """Return the advance of the tail since the controller first reported its place on the path."""
-    states = [state for state in record.control if state.path_s_m is not None]
+def read_reported_distance(record: RunRecord) -> Series | None:
+    """Return the advance of the tail along the path, as the controller reported it; None if it is unknown."""
+    states = [state for state in record.control_states if state.path_s_m is not None]
     if len(states) < 2:
         return None
     along = np.array([state.path_s_m for state in states], dtype=np.float64)
-    stamps = np.array([reported_at_s(record, state) for state in states])
-    return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
+    timestamps_s = np.array([get_report_time_s(record, state) for state in states])
+    return Series(timestamps_s, along - along[0], "advance of the tail along the path, as the controller knew it")

@@ -1,17 +1,16 @@
-"""The result of a run in one sentence, and whether it is good or bad news."""
+"""Judges a run: makes its verdict, a short text with a rating."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from snakesim_hal.model.checked import CHECK
+from snakesim_hal.model.checked import START_CHECK_CONTROLLER
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import Fault
-from snakesim_operator.results.metrics.motion import Motion, measure_motion
+from snakesim_operator.results.metrics.motion import StopIntervals, find_stops
 from snakesim_operator.results.report.phrases import (
     MOVED_M,
-    as_sentence,
     describe_contradiction,
     describe_distance,
     describe_ending,
@@ -20,18 +19,19 @@ from snakesim_operator.results.report.phrases import (
     describe_pushed_obstacles,
     describe_refused_commands,
     describe_trouble,
+    end_with_full_stop,
 )
-from snakesim_operator.results.report.timeline import longest_reason
+from snakesim_operator.results.report.timeline import find_longest_reason
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
-from snakesim_operator.results.time_axis import end_s, reported_at_s
+from snakesim_operator.results.summary import RunSummary, get_distance_m, get_estimates
+from snakesim_operator.results.time_axis import get_report_time_s, get_run_end_s
 
 MIN_STOP_S = 0.5  # a shorter stop at the end is not mentioned
-MAX_STANDING_FRACTION = 0.5  # a run that was stationary for more of its time, up to its end, is a poor one
-MOVED_RAD = 1e-3  # a joint whose target changed by less, as by rounding, was not moved
-JUDGING_COMMANDS = {  # controller that does not locomote -> command that judges its run
-    CHECK: "snakesim robot check",
+MAX_STANDING_FRACTION = 0.5  # a run that was stationary for a larger fraction, and at its end, is rated poor
+MIN_MOVED_RAD = 1e-3  # a joint whose target changed by less, such as by rounding, was not moved
+JUDGING_COMMANDS = {  # by controller that does not locomote, the command that judges its run
+    START_CHECK_CONTROLLER: "snakesim robot check",
     "identify": "snakesim robot identify",
 }
 Kind = Literal["good", "poor", "bad"]
@@ -39,28 +39,28 @@ Kind = Literal["good", "poor", "bad"]
 
 @dataclass(frozen=True)
 class Verdict:
-    """One sentence, and how good the news is."""
+    """A text about the result of a run, and its rating."""
 
-    kind: Kind
-    words: str
+    rating: Kind
+    text: str
 
 
 @dataclass(frozen=True)
 class Stop:
     """The end of locomotion, before the end of the run."""
 
-    at_s: float
-    why: str
-    on_purpose: bool
+    time_s: float
+    reason: str
+    is_intended: bool
 
 
-def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
-    """Return the result of a run in plain words, and which of its numbers are estimates."""
-    measured = _judge_run(record, summary)
-    estimates = "; ".join(estimates_of(summary).in_words())
+def make_verdict(record: RunRecord, summary: RunSummary) -> Verdict:
+    """Make the verdict on a run, with a sentence about numbers that are estimates."""
+    verdict = _judge_run(record, summary)
+    estimates = "; ".join(get_estimates(summary).describe())
     if not estimates:
-        return measured
-    return Verdict(measured.kind, f"{measured.words} {as_sentence(estimates.capitalize())}")
+        return verdict
+    return Verdict(verdict.rating, f"{verdict.text} {end_with_full_stop(estimates.capitalize())}")
 
 
 def _judge_run(record: RunRecord, summary: RunSummary) -> Verdict:
@@ -72,20 +72,20 @@ def _judge_run(record: RunRecord, summary: RunSummary) -> Verdict:
     command = JUDGING_COMMANDS.get(record.config.controller)
     if command is not None:
         return _judge_joint_test(record, summary, command)
-    motion = measure_motion(record)
-    if motion is None:
+    stop_intervals = find_stops(record)
+    if stop_intervals is None:
         moved = describe_distance(record, summary)
         rest = f"{describe_hand_overs(summary)}{describe_trouble(summary)}.{describe_ending(summary.ended)}"
         return Verdict("poor", f"{moved}; {rest}")
-    return _judge_motion(record, summary, motion)
+    return _judge_motion(record, summary, stop_intervals)
 
 
 def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> Verdict:
-    """Judge a run that a fault stopped."""
-    begin_s = float(record.time_s[0]) if len(record.time_s) else 0.0
-    at_s = fault.tick / summary.rate_hz - begin_s
+    """Make the verdict on a run that a fault stopped."""
+    start_s = float(record.time_s[0]) if len(record.time_s) else 0.0
+    at_s = fault.tick / summary.rate_hz - start_s
     joint = f" at {fault.joint}" if fault.joint else ""
-    stopped = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {as_sentence(fault.cause)}"
+    stopped = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {end_with_full_stop(fault.cause)}"
     moved = describe_distance(record, summary)
     before = ", ".join([moved[0].lower() + moved[1:], *describe_refused_commands(summary)])
     return Verdict("bad", f"{stopped}{describe_last_control_state(record, at_s)} Before that: {before}.")
@@ -98,8 +98,8 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> V
 
     Args:
         record: The recorded run.
-        summary: The numbers of the run.
-        command: The command that judges such a run in detail.
+        summary: Summary of the run.
+        command: Command that judges such a run in detail.
     """
     all_joints_moved = False
     if not len(record.target):
@@ -109,12 +109,12 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> V
         max_deviation_rad = np.nanmax(deviation_rad, axis=0)
         unmoved: list[str] = []
         for joint, joint_deviation_rad in zip(record.description.joints, max_deviation_rad, strict=True):
-            was_moved = joint_deviation_rad > MOVED_RAD  # False for NaN, which is a joint without any target
+            was_moved = joint_deviation_rad > MIN_MOVED_RAD  # False for NaN, which is a joint without any target
             if not was_moved:
                 unmoved.append(joint.name)
         all_joints_moved = not unmoved
         if all_joints_moved:
-            words = f"Every joint was moved. Judge the run with `{command} {record.folder}`."
+            words = f"Every joint was moved. Judge the run with `{command} {record.path}`."
         else:
             words = f"Not moved: {', '.join(unmoved)}. Run it again with a longer --duration."
     ending = describe_ending(summary.ended)
@@ -123,33 +123,33 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> V
     return Verdict("good" if is_good else "poor", words)
 
 
-def _judge_motion(record: RunRecord, summary: RunSummary, motion: Motion) -> Verdict:
-    """Judge a run that no fault stopped and whose pose is known, by the measured motion.
+def _judge_motion(record: RunRecord, summary: RunSummary, stop_intervals: StopIntervals) -> Verdict:
+    """Judge a run that no fault stopped and whose pose is known, by the measured stop_intervals.
 
     The run is poor if it did not locomote, if it jammed or was stationary for long, or if it ended early or behind its
     start. The controller's own report is added to the words, also where it contradicts the measurement.
 
     Args:
         record: The recorded run.
-        summary: The numbers of the run.
-        motion: When the body moved and when it stood.
+        summary: Summary of the run.
+        stop_intervals: Measured intervals without stop_intervals.
     """
     moved = describe_distance(record, summary)
     trouble = describe_trouble(summary)
     ending = describe_ending(summary.ended)
     if _did_not_locomote(summary):
         outcome = "Jammed" if summary.jammed else "Did not locomote"
-        reason = as_sentence(_why_not_locomoted(summary))
+        reason = end_with_full_stop(_explain_no_locomotion(summary))
         return Verdict("poor", f"{outcome}: {reason} {moved}; {trouble}.{ending}")
 
     pushed = describe_hand_overs(summary) or describe_pushed_obstacles(record)
-    stop = stop_of(record, motion)
-    standing_fraction = 1.0 - motion.moving_fraction
+    stop = find_final_stop(record, stop_intervals)
+    standing_fraction = 1.0 - stop_intervals.moving_fraction
     stood_long = summary.jammed or standing_fraction > MAX_STANDING_FRACTION
-    if stop is not None and not stop.on_purpose and stood_long:
+    if stop is not None and not stop.is_intended and stood_long:
         outcome = "Jammed" if summary.jammed else "Stopped"
-        reason = stop.why.removeprefix("jammed: ")
-        stopped = f"{outcome} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {reason}"
+        reason = stop.reason.removeprefix("jammed: ")
+        stopped = f"{outcome} at {stop.time_s:.1f} s of {get_run_end_s(record):.1f} s: {reason}"
         return Verdict("poor", f"{stopped} {moved}; {pushed}{trouble}.{ending}")
 
     still_moving = ""
@@ -158,13 +158,13 @@ def _judge_motion(record: RunRecord, summary: RunSummary, motion: Motion) -> Ver
     jam = "it jammed on the way; " if summary.jammed else ""
     stopped = ""
     if stop is not None:
-        stopped = f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
-    contradiction = describe_contradiction(record, motion)
+        stopped = f" Locomotion ended at {stop.time_s:.1f} s of {get_run_end_s(record):.1f} s: {stop.reason}"
+    contradiction = describe_contradiction(record, stop_intervals)
     words = f"{moved}{still_moving}; {pushed}{jam}{trouble}.{stopped}{contradiction}{ending}"
 
     ended_early = bool(ending)
     went_backward = (summary.path_distance_m or 0.0) < 0
-    is_distance_unknown = distance_m(summary) is None
+    is_distance_unknown = get_distance_m(summary) is None
     is_poor = ended_early or went_backward or is_distance_unknown
     return Verdict("poor" if is_poor else "good", words)
 
@@ -178,20 +178,21 @@ def _did_not_locomote(summary: RunSummary) -> bool:
     return bool(distances) and max(distances) < MOVED_M
 
 
-def _why_not_locomoted(summary: RunSummary) -> str:
+def _explain_no_locomotion(summary: RunSummary) -> str:
     if summary.last_state == "Locomoting":
         return "it ended less than 2 cm from where it began"
     return summary.last_reason or STANDING_STILL
 
 
-def stop_of(record: RunRecord, motion: Motion) -> Stop | None:
-    """Return when the body came to rest for the rest of the run, as measured, and why, as control reported it.
+def find_final_stop(record: RunRecord, stop_intervals: StopIntervals) -> Stop | None:
+    """Find when the body came to rest until the end of the run, as measured, and the reason that control reported.
 
-    None if it moved to the end, or stood for less than MIN_STOP_S.
+    Returns:
+        The stop, or None if the body moved at the end, or was stationary there for less than MIN_STOP_S.
     """
-    stop = motion.final_stop
-    if stop is None or motion.end_s - stop.start_s < MIN_STOP_S:
+    stop = stop_intervals.final_stop
+    if stop is None or stop_intervals.run_end_s - stop.start_s < MIN_STOP_S:
         return None
-    reported = [state for state in record.control if reported_at_s(record, state) >= stop.start_s]
-    on_purpose = bool(reported) and reported[-1].state == "Idle"
-    return Stop(stop.start_s, as_sentence(longest_reason(record, stop)), on_purpose)
+    reported = [state for state in record.control_states if get_report_time_s(record, state) >= stop.start_s]
+    is_intended = bool(reported) and reported[-1].state == "Idle"
+    return Stop(stop.start_s, end_with_full_stop(find_longest_reason(record, stop)), is_intended)

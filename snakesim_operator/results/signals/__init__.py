@@ -1,17 +1,23 @@
-"""The signals of a run: what was measured, applied and published in each tick, and what follows from it."""
+"""Signals of a run: values that were measured, applied and published in each tick, and values computed from them."""
 
-from snakesim_operator.results.signals.signal_table import arrays, name_parts, recorded_arrays, select_columns, table
-from snakesim_operator.results.signals.units import CONTROLLER, OF_JOINTS, PARQUET_UNIT, UNITS, unit_of
+from snakesim_operator.results.signals.signal_table import (
+    compute_signals,
+    get_recorded_signals,
+    list_component_names,
+    make_signal_columns,
+    select_columns,
+)
+from snakesim_operator.results.signals.units import CONTROLLER_SUFFIX, JOINT_SIGNALS, PARQUET_UNIT, UNITS, find_unit
 
 __all__ = [
-    "CONTROLLER",
-    "OF_JOINTS",
+    "CONTROLLER_SUFFIX",
+    "JOINT_SIGNALS",
     "PARQUET_UNIT",
     "UNITS",
-    "arrays",
-    "name_parts",
-    "recorded_arrays",
+    "compute_signals",
+    "find_unit",
+    "get_recorded_signals",
+    "list_component_names",
+    "make_signal_columns",
     "select_columns",
-    "table",
-    "unit_of",
 ]

@@ -1,12 +1,12 @@
-"""Names and units of signals."""
+"""Defines the names and units of signals."""
 
 from snakesim_hal.model.field_words import find_unit_in_name
 from snakesim_hal.wire.custom_sample import find_custom_messages
-from snakesim_operator.results.recording_contents import CONTROLLER
+from snakesim_operator.results.recording_contents import CONTROLLER_SUFFIX
 from snakesim_operator.results.run_log import RunRecord
 
 PARQUET_UNIT = b"unit"  # metadata of a column of a Parquet file
-OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
+JOINT_SIGNALS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
 
 MEASURED_UNITS = {
     "time_s": "s",
@@ -38,16 +38,16 @@ CONTACT_UNITS = {
 UNITS = MEASURED_UNITS | MOTION_UNITS | CONTACT_UNITS
 
 
-def unit_of(name: str, record: RunRecord) -> str:
-    """Return the unit of a column, or of a whole signal.
+def find_unit(name: str, record: RunRecord) -> str:
+    """Find the unit of a column or of a whole signal, such as "rad/s"; "1" for a dimensionless value.
 
-    A number that a controller defined has the unit in which its name ends.
+    The unit of a value that a controller defined is read from the end of its name.
     """
     signal = name.partition(".")[0]
-    if name.endswith(f".{CONTROLLER}"):
+    if name.endswith(f".{CONTROLLER_SUFFIX}"):
         return find_unit_in_name(signal) or "1"
     units: dict[str, str] = {}
-    for kind in find_custom_messages(record.description).values():
-        units |= kind.units
-    units |= UNITS  # the robot's own signals win
+    for message in find_custom_messages(record.description).values():
+        units |= message.units
+    units |= UNITS  # signals of SnakeSIM override custom sensors of the same name
     return units[signal]

@@ -30,11 +30,11 @@ CLOCK_MONOTONIC = 1  # the clock that is requested for the time of events
 STICK_AGE_S = 5.0  # after this long without an event the stick counts as released
 
 
-def _write_ioctl(number: int, size: int) -> int:
+def _encode_write_ioctl(number: int, size: int) -> int:
     return 1 << 30 | size << 16 | ord("E") << 8 | number
 
 
-def _read_ioctl(number: int, size: int) -> int:
+def _encode_read_ioctl(number: int, size: int) -> int:
     return 2 << 30 | size << 16 | ord("E") << 8 | number
 
 
@@ -57,28 +57,34 @@ class Axis:
 class Joystick:
     """The left stick and the buttons of one device."""
 
-    def __init__(self, handle: int, x: Axis, y: Axis) -> None:
-        """Read events from a device that does not block. handle: its file descriptor, which `close` closes."""
-        self.handle = handle
-        self._x = x
-        self._y = y
-        self.right = 0.0  # from -1 to 1
-        self.forward = 0.0  # from -1 to 1
-        self.lost = False  # unplugged, or its driver is gone
-        self.moved_s = -math.inf  # monotonic time at which the kernel received the newest event
-
-    def read_events(self, wait_s: float) -> bool:
-        """Read all events that have arrived, and update the position of the stick.
-
-        If the joystick is unplugged, `lost` becomes true and the stick counts as released.
+    def __init__(self, handle: int, x_axis: Axis, y_axis: Axis) -> None:
+        """Start with a released stick.
 
         Args:
-            wait_s: Maximum time to wait for the first event.
+            handle: Non-blocking file descriptor of the device, which `close` closes.
+            x_axis: Range of the stick's axis to the right.
+            y_axis: Range of the stick's axis toward the operator.
+        """
+        self.handle = handle
+        self._x_axis = x_axis
+        self._y_axis = y_axis
+        self.right = 0.0  # from -1 to 1
+        self.forward = 0.0  # from -1 to 1
+        self.is_lost = False  # unplugged, or its driver is gone
+        self.last_event_s = -math.inf  # monotonic time at which the kernel received the newest event
+
+    def read_events(self, timeout_s: float) -> bool:
+        """Read all events that have arrived, and update the position of the stick.
+
+        If the joystick is unplugged, `is_lost` becomes true and the stick counts as released.
+
+        Args:
+            timeout_s: Maximum time to wait for the first event.
 
         Returns:
             Whether a button was pressed.
         """
-        ready, _, _ = select.select([self.handle], [], [], wait_s)
+        ready, _, _ = select.select([self.handle], [], [], timeout_s)
         if not ready:
             return False
         try:
@@ -88,22 +94,22 @@ class Joystick:
         except OSError:  # ENODEV: unplugged
             data = b""
         if not data:
-            self.lost = True
+            self.is_lost = True
             self._release()
             return False
         event_count = len(data) // EVENT.size  # an incomplete event at the end is dropped
-        button_pressed = False
-        for seconds, microseconds, kind, code, value in EVENT.iter_unpack(data[: event_count * EVENT.size]):
-            self.moved_s = seconds + 1e-6 * microseconds
-            if kind == EV_ABS and code == ABS_X:
-                self.right = self._x.normalize(value)
-            elif kind == EV_ABS and code == ABS_Y:
-                self.forward = -self._y.normalize(value)  # away from the operator is negative
-            elif kind == EV_SYN and code == SYN_DROPPED:
+        is_button_pressed = False
+        for seconds, microseconds, event_type, code, value in EVENT.iter_unpack(data[: event_count * EVENT.size]):
+            self.last_event_s = seconds + 1e-6 * microseconds
+            if event_type == EV_ABS and code == ABS_X:
+                self.right = self._x_axis.normalize(value)
+            elif event_type == EV_ABS and code == ABS_Y:
+                self.forward = -self._y_axis.normalize(value)  # away from the operator is negative
+            elif event_type == EV_SYN and code == SYN_DROPPED:
                 self._release()  # the kernel lost events; the stick counts again once it is moved
-            elif kind == EV_KEY and code in BUTTONS and value == 1:
-                button_pressed = True
-        return button_pressed
+            elif event_type == EV_KEY and code in BUTTONS and value == 1:
+                is_button_pressed = True
+        return is_button_pressed
 
     def _release(self) -> None:
         """Count the stick as released."""
@@ -111,35 +117,36 @@ class Joystick:
         self.forward = 0.0
 
     def is_silent(self, now_s: float) -> bool:
-        """Return whether there was no event for so long that the operator, or the pad, may be gone."""
-        return now_s - self.moved_s > STICK_AGE_S
+        """Return whether there was no event for so long that the operator may have left or the connection be lost."""
+        return now_s - self.last_event_s > STICK_AGE_S
 
     def close(self) -> None:
         """Close the device."""
         os.close(self.handle)
 
 
-def open_joystick(device: Path | None) -> Joystick:
+def open_joystick(device_path: Path | None) -> Joystick:
     """Open a joystick of Linux' event interface that has a stick and buttons.
 
     Args:
-        device: such as /dev/input/event5; None: the first device with a stick and buttons.
+        device_path: Path of the device, such as /dev/input/event5. None selects the first device with a stick and
+            buttons.
 
     Raises:
-        ConfigError: there is no such device, or it cannot be opened.
+        ConfigError: There is no such device, or it cannot be opened.
     """
-    paths = [device] if device is not None else sorted(Path("/dev/input").glob("event*"))
-    problem = "there is no /dev/input/event*" if device is None else ""
+    paths = [device_path] if device_path is not None else sorted(Path("/dev/input").glob("event*"))
+    problem = "there is no /dev/input/event*" if device_path is None else ""
     for path in paths:
         try:
-            handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+            file_descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
             problem = f"{path}: {error.strerror}"
             continue
-        axes = _read_axes(handle)
-        if axes is not None and _use_monotonic_times(handle):
-            return Joystick(handle, *axes)
-        os.close(handle)
+        axes = _read_axes(file_descriptor)
+        if axes is not None and _enable_monotonic_timestamps(file_descriptor):
+            return Joystick(file_descriptor, *axes)
+        os.close(file_descriptor)
         problem = f"{path}: has no stick with axes X and Y, and buttons"
     raise ConfigError(
         f"--joystick: {problem}. Plug one in, name its device, or get the permission: sudo usermod -aG input $USER, "
@@ -148,17 +155,17 @@ def open_joystick(device: Path | None) -> Joystick:
     )
 
 
-def _use_monotonic_times(handle: int) -> bool:
-    """Request events with the time of the monotonic clock, which is never set. Returns whether the device does it."""
+def _enable_monotonic_timestamps(handle: int) -> bool:
+    """Request that events have timestamps of the monotonic clock, and return whether the device supports that."""
     try:
-        fcntl.ioctl(handle, _write_ioctl(0xA0, 4), struct.pack("i", CLOCK_MONOTONIC))
+        fcntl.ioctl(handle, _encode_write_ioctl(0xA0, 4), struct.pack("i", CLOCK_MONOTONIC))
     except OSError:
         return False
     return True
 
 
 def _read_axes(handle: int) -> tuple[Axis, Axis] | None:
-    """Return the axes X and Y of the stick; None for a device without them, or without buttons of a joystick."""
+    """Return the axes X and Y of the stick; None if an axis or the buttons of a joystick are missing."""
     try:
         if not _has_joystick_buttons(handle):
             return None
@@ -174,14 +181,14 @@ def _read_axes(handle: int) -> tuple[Axis, Axis] | None:
 def _has_joystick_buttons(handle: int) -> bool:
     """Return whether a device has any of BUTTONS; a touch pad has none."""
     bits = bytearray(96)  # one bit for each key code
-    fcntl.ioctl(handle, _read_ioctl(0x20 + EV_KEY, len(bits)), bits)
+    fcntl.ioctl(handle, _encode_read_ioctl(0x20 + EV_KEY, len(bits)), bits)
     return any(bits[code // 8] >> code % 8 & 1 for code in BUTTONS)
 
 
 def _read_axis(handle: int, axis: int) -> Axis | None:
     """Return the range of an axis; None if it is empty."""
     info = bytearray(ABSINFO.size)
-    fcntl.ioctl(handle, _read_ioctl(0x40 + axis, len(info)), info)
+    fcntl.ioctl(handle, _encode_read_ioctl(0x40 + axis, len(info)), info)
     _, lower, upper, *_ = ABSINFO.unpack(info)
     if upper <= lower:
         return None

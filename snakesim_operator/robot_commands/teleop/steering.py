@@ -4,70 +4,87 @@ import math
 
 from snakesim_hal.wire.messages import Intent
 
-VALID_NS = 500_000_000  # in robot time; ten times as long as the period in which intents are repeated
+INTENT_VALIDITY_NS = 500_000_000  # in robot time; ten times as long as the period in which intents are repeated
 SPEED_STEP_M_S = 0.05
 HEADING_STEP_RAD = math.radians(10)
 TURN_RAD_S = 0.8  # with the stick fully to one side
-LEAD_RAD = math.pi / 2  # the requested direction is ahead of the body's by at most this
+MAX_HEADING_OFFSET_RAD = math.pi / 2  # the requested direction is ahead of the body's by at most this
 
 
 class Steering:
     """Speed and direction, changed by keys or by a stick."""
 
-    def __init__(self, requester: str, fastest_m_s: float) -> None:
+    def __init__(self, requester: str, max_speed_m_s: float) -> None:
         self._requester = requester
-        self._max_speed_m_s = fastest_m_s
+        self._max_speed_m_s = max_speed_m_s
         self.speed_m_s = 0.0
         self.heading_w_rad: float | None = None  # None: the mission's own goal
-        self.touched_s: float | None = None  # monotonic time of the operator's last input; None: no input yet
+        self.last_input_s: float | None = None  # monotonic time of the operator's last input; None: no input yet
 
     def change_speed(self, steps: int, now_s: float) -> None:
-        """Change the speed by steps; negative steps decrease it, down to full speed backwards."""
+        """Change the requested speed by steps of SPEED_STEP_M_S, within the maximum speed in both directions.
+
+        Args:
+            steps: Number of steps; negative steps decrease the speed.
+            now_s: Monotonic time of the operator's input.
+        """
         self.set_speed_fraction((self.speed_m_s + steps * SPEED_STEP_M_S) / self._max_speed_m_s, now_s)
 
     def set_speed_fraction(self, fraction: float, now_s: float) -> None:
-        """Request a fraction of the maximum speed, from -1 to 1. now_s: when the operator requested it."""
+        """Request a fraction of the maximum speed.
+
+        Args:
+            fraction: Fraction from -1, full speed backwards, to 1; values beyond are limited.
+            now_s: Monotonic time of the operator's input.
+        """
         limited = max(-1.0, min(1.0, fraction))
         self.speed_m_s = round(limited * self._max_speed_m_s, 3) + 0.0  # + 0.0 turns -0.0 into 0.0
-        self.touched_s = now_s
+        self.last_input_s = now_s
 
-    def rotate_heading(self, by_rad: float, body_w_rad: float | None, now_s: float) -> None:
-        """Rotate the requested direction, positive to the left.
+    def rotate_heading(self, rotation_rad: float, body_heading_w_rad: float | None, now_s: float) -> None:
+        """Rotate the requested heading. The first rotation starts at the heading of the body.
 
-        The first rotation starts at the direction of the body, or at 0 if that is unknown.
+        Args:
+            rotation_rad: Angle of the rotation, positive to the left.
+            body_heading_w_rad: Heading of the body in the world; None if it is unknown, which counts as 0.
+            now_s: Monotonic time of the operator's input.
         """
         start_w_rad = self.heading_w_rad
         if start_w_rad is None:
-            start_w_rad = body_w_rad or 0.0
-        self.heading_w_rad = rotate_heading(start_w_rad, by_rad, body_w_rad)
-        self.touched_s = now_s
+            start_w_rad = body_heading_w_rad or 0.0
+        self.heading_w_rad = compute_limited_heading(start_w_rad, rotation_rad, body_heading_w_rad)
+        self.last_input_s = now_s
 
     def stop(self, now_s: float) -> None:
-        """Request speed 0; the direction stays."""
+        """Request speed 0, and keep the requested heading."""
         self.speed_m_s = 0.0
-        self.touched_s = now_s
+        self.last_input_s = now_s
 
-    def intent(self, robot_ns: int) -> Intent:
-        """Return the request as a message. robot_ns: the present robot time."""
+    def make_intent(self, robot_time_ns: int) -> Intent:
+        """Return the operator's request as an Intent message, which expires after INTENT_VALIDITY_NS.
+
+        Args:
+            robot_time_ns: Current robot time.
+        """
         return Intent(
-            timestamp_ns=robot_ns,
+            timestamp_ns=robot_time_ns,
             requester=self._requester,
             speed_m_s=self.speed_m_s,
             go=self.speed_m_s != 0.0,
-            valid_for_ns=VALID_NS,
+            valid_for_ns=INTENT_VALIDITY_NS,
             heading_w_rad=self.heading_w_rad,
         )
 
 
-def rotate_heading(heading_w_rad: float, by_rad: float, body_w_rad: float | None) -> float:
-    """Return a direction after a rotation, limited to LEAD_RAD to either side of the body.
+def compute_limited_heading(heading_w_rad: float, rotation_rad: float, body_heading_w_rad: float | None) -> float:
+    """Return a heading after a rotation, limited to MAX_HEADING_OFFSET_RAD to either side of the body's heading.
 
     Args:
-        heading_w_rad: the direction before.
-        by_rad: the rotation, positive to the left.
-        body_w_rad: direction of the body; None if unknown, then only the rotation is limited.
+        heading_w_rad: Heading before the rotation, in the world.
+        rotation_rad: Angle of the rotation, positive to the left.
+        body_heading_w_rad: Heading of the body in the world. If None, it is unknown, and only the rotation is limited.
     """
-    body = heading_w_rad if body_w_rad is None else body_w_rad
-    ahead = math.remainder(heading_w_rad + by_rad - body, 2 * math.pi)
-    limited = max(-LEAD_RAD, min(LEAD_RAD, ahead))
-    return math.remainder(body + limited, 2 * math.pi)
+    reference_w_rad = heading_w_rad if body_heading_w_rad is None else body_heading_w_rad
+    offset_rad = math.remainder(heading_w_rad + rotation_rad - reference_w_rad, 2 * math.pi)
+    limited_offset_rad = max(-MAX_HEADING_OFFSET_RAD, min(MAX_HEADING_OFFSET_RAD, offset_rad))
+    return math.remainder(reference_w_rad + limited_offset_rad, 2 * math.pi)

@@ -1,17 +1,17 @@
 """What goes wrong with a bus, as the driver sees it on a kernel interface: what it says, and what the modules do.
 
-Times are the modules' and the driver's periods of 10 ms, not this machine's: see `shared_bus`.
+Times are the modules' and the driver's periods of 10 ms, not this machine's: see `open_shared_bus`.
 """
 
 import socket
 
 import pytest
 
-from snakesim_can_backend.driver.module_monitor import IN_A_ROW
+from snakesim_can_backend.driver.module_monitor import MIN_CONSECUTIVE_ERRORS
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode, frame_id, parse_opcode
 from snakesim_testing.can.driver_loop import cleared_and_armed_again
 from snakesim_testing.can.interface import frame, ip, must, tc
-from snakesim_testing.can.shared_bus import SharedBus, shared_bus
+from snakesim_testing.can.shared_bus import SharedBus, open_shared_bus
 
 NODES = [1, 2, 3, 4]
 PERIOD_MS, WATCHDOG_MS, LEASE_MS = 10, 100, 50
@@ -33,7 +33,7 @@ def set_points_out(run: SharedBus) -> int:
 
 
 def test_can_interface_down_stops_joints_and_recovers(spare_channel: str) -> None:
-    with shared_bus(spare_channel) as run:
+    with open_shared_bus(spare_channel) as run:
         must(ip("link", "set", spare_channel, "down"))
         start = run.tick
         run.run(WATCHDOG_MS // PERIOD_MS + 3, run.waving)
@@ -59,7 +59,7 @@ def test_can_interface_down_stops_joints_and_recovers(spare_channel: str) -> Non
 
 @pytest.mark.slow
 def test_can_adapter_unplugged_and_plugged_in_again_is_used(spare_channel: str) -> None:
-    with shared_bus(spare_channel) as run:
+    with open_shared_bus(spare_channel) as run:
         must(ip("link", "delete", spare_channel))
         run.run(20, run.waving)
         (fault,) = run.faults
@@ -96,7 +96,7 @@ def unclog(channel: str) -> None:
 
 @pytest.mark.slow
 def test_can_queue_full_for_three_periods_is_a_fault(slow_channel: str) -> None:
-    with shared_bus(slow_channel) as run:
+    with open_shared_bus(slow_channel) as run:
         clog(slow_channel)
         run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
         (fault,) = run.faults
@@ -115,9 +115,9 @@ def test_can_queue_full_for_three_periods_is_a_fault(slow_channel: str) -> None:
 
 @pytest.mark.slow
 def test_can_queue_full_for_a_moment_is_counted_and_skipped(slow_channel: str) -> None:
-    with shared_bus(slow_channel) as run:
+    with open_shared_bus(slow_channel) as run:
         clog(slow_channel)
-        run.run(IN_A_ROW - 1, run.waving)
+        run.run(MIN_CONSECUTIVE_ERRORS - 1, run.waving)
         unclog(slow_channel)
         full, out = run.watch_seen("queue_full"), set_points_out(run)
         run.run(1, run.waving)
@@ -131,7 +131,7 @@ def test_can_queue_full_for_a_moment_is_counted_and_skipped(slow_channel: str) -
 @pytest.mark.slow
 def test_can_long_queue_with_socket_share_full_counts_as_full(slow_channel: str) -> None:
     must(ip("link", "set", slow_channel, "txqueuelen", "1000"))
-    with shared_bus(slow_channel) as run:
+    with open_shared_bus(slow_channel) as run:
         run.wire._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the kernel makes it its minimum
         clog(slow_channel, frames=1000)
         run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
@@ -147,7 +147,7 @@ def error_frame(kind: int) -> bytes:
 
 def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_socket: socket.socket) -> None:
     """All kinds are told apart in tests/system/can_bus/test_wire.py."""
-    with shared_bus(channel) as run:
+    with open_shared_bus(channel) as run:
         raw_socket.send(error_frame(ACK))
         run.run(5, run.waving)
         assert run.watch_seen("not_acknowledged") == 1
@@ -171,7 +171,7 @@ def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_
 
 
 def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: socket.socket) -> None:
-    with shared_bus(channel) as run:
+    with open_shared_bus(channel) as run:
         ours = run.wire._socket
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel makes it its minimum
         for _ in range(50):
@@ -181,7 +181,7 @@ def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: so
         (fault,) = run.faults
         assert fault.what == "receive_overflow"
         dropped = int(fault.cause.partition("dropped ")[2].partition(" ")[0])
-        kept = run.backend.modules.reading.malformed
+        kept = run.backend.modules.module_reports.malformed
         assert dropped > 0
         assert dropped + kept == 50
         moves_again(run)
@@ -192,7 +192,7 @@ def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: so
 
 @pytest.mark.slow
 def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket: socket.socket) -> None:
-    with shared_bus(channel) as run:
+    with open_shared_bus(channel) as run:
         raw_socket.send(frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"))
         run.run(1, run.waving)
         assert run.true_states() == [ModuleState.EMERGENCY] * 4, "one frame"
@@ -205,7 +205,7 @@ def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket
 
 
 def test_extended_and_remote_frames_stay_in_the_kernel(channel: str, raw_socket: socket.socket) -> None:
-    with shared_bus(channel) as run:
+    with open_shared_bus(channel) as run:
         for number in (frame_id(Opcode.HEARTBEAT, 40), frame_id(Opcode.SYNC, 0), frame_id(Opcode.JOINT_STATE, 1)):
             for _ in range(5):
                 raw_socket.send(frame(CAN_EFF_FLAG | number, bytes(8)))

@@ -74,7 +74,7 @@ def test_a_joystick_is_found_read_and_lost() -> None:
     device.sends(EV_KEY, BTN_SOUTH, 1)
     assert stick.read_events(1.0), "the emergency stop"
     device.unplug()
-    wait_until(lambda: stick.read_events(0.1) or stick.lost, "the stick to be lost")
+    wait_until(lambda: stick.read_events(0.1) or stick.is_lost, "the stick to be lost")
     assert stick.forward == 0.0
     stick.close()
 

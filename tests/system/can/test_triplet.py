@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.runs.command import snakesim
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -25,7 +25,7 @@ def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, ch
     took_s: dict[str, float] = {}
     for name, sets in (("virtual", ()), (channel, over_the_bus)):
         began = time.monotonic()
-        arguments = ["triplet", "--backend", "can", "--duration", ROBOT_TIME_S, "--endpoint", free_endpoint()]
+        arguments = ["triplet", "--backend", "can", "--duration", ROBOT_TIME_S, "--endpoint", find_free_endpoint()]
         arguments += [argument for value in ("stall_limit_s=300", *sets) for argument in ("--set", value)]
         ended = snakesim("run", *arguments, "--out", name, cwd=tmp_path, limit_s=LIMIT_S)
         took_s[name] = time.monotonic() - began

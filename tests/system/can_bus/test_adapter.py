@@ -7,15 +7,15 @@ import can
 import pytest
 
 from snakesim_can_backend.bus.adapter import (
-    NEEDS,
+    REQUIREMENT_BY_INTERFACE,
     AdapterWire,
-    check_channel,
-    check_channels,
     is_emulated,
     open_bus,
     open_wire,
+    validate_channel,
+    validate_channels,
 )
-from snakesim_can_backend.bus.load import ReportSchedule, bus_load, busiest_period_s
+from snakesim_can_backend.bus.load import ReportSchedule, busiest_period_s, compute_bus_load
 from snakesim_can_backend.emulator.bus_time import BusTime
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id
 from snakesim_hal.base.errors import BackendError, ConfigError, SnakesimError
@@ -71,7 +71,7 @@ def test_adapter_receives_only_requested_frames_and_leaves_nothing(channel: str,
 )
 def test_a_wrong_channel_is_wrong_input(channel: str) -> None:
     with raises_error(ConfigError, code=("bus/invalid-channel", "bus/not-available")):
-        check_channel(channel)
+        validate_channel(channel)
 
 
 def test_an_adapter_that_is_not_there_is_named() -> None:
@@ -88,14 +88,14 @@ def test_adapter_with_missing_library_or_device_explains_what_to_do(interface: s
         open_bus(f"{interface}:/dev/none", 1_000_000, data_bit_rate)
     words = str(raised.value)
     assert words.startswith(f"{interface}:/dev/none: cannot be opened: ")
-    assert NEEDS[interface] in words
+    assert REQUIREMENT_BY_INTERFACE[interface] in words
     assert "Traceback" not in words and len(words) < 700, words
 
 
 def test_a_bus_is_named_once() -> None:
     with raises_error(ConfigError, code="bus/invalid-channel", field="virtual:a"):
-        check_channels(["virtual:a", "virtual:b", "virtual:a"])
-    check_channels(["virtual:a", "virtual:b"])
+        validate_channels(["virtual:a", "virtual:b", "virtual:a"])
+    validate_channels(["virtual:a", "virtual:b"])
 
 
 def test_modules_are_emulated_where_no_real_ones_can_be() -> None:
@@ -108,7 +108,7 @@ def test_modules_are_emulated_where_no_real_ones_can_be() -> None:
 
 def test_half_the_bit_rate_takes_twice_as_long() -> None:
     slow = ReportSchedule(100.0, bit_rate=500_000)
-    assert bus_load(5, slow) == pytest.approx(2 * bus_load(5, ReportSchedule(100.0)))
+    assert compute_bus_load(5, slow) == pytest.approx(2 * compute_bus_load(5, ReportSchedule(100.0)))
     assert busiest_period_s(5, slow) == pytest.approx(2 * busiest_period_s(5, ReportSchedule(100.0)))
     bus, slow_bus = BusTime(), BusTime(500_000)
     for one in (bus, slow_bus):

@@ -18,7 +18,7 @@ from snakesim_hal.programs.commands import Command
 
 
 def test_emulator_command_answers_for_every_module_and_reports_traffic(monkeypatch, capsys):
-    for of_a_process in ("on_stop_signal", "tune_garbage_collector"):
+    for of_a_process in ("call_on_stop_signals", "tune_garbage_collector"):
         monkeypatch.setattr(program, of_a_process, lambda *_: None)
     channel = f"modules-{uuid.uuid4().hex[:8]}"
     with can.Bus(interface="virtual", channel=channel) as bus:

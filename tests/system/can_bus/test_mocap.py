@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_drivers.motion_capture.mocap import MAX_AT_ONCE, MocapReceiver
+from snakesim_drivers.motion_capture.mocap import MAX_DATAGRAMS_PER_CYCLE, MocapReceiver
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Pose
 from snakesim_testing.messages import raises_error
@@ -131,7 +131,7 @@ def test_mocap_velocity_after_gap_is_known_with_second_pose() -> None:
         for _ in range(5):
             jumped = {**bare(mocap, 0.1), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS}
             assert read(mocap, jumped) is None
-        assert mocap.refused == {"future": 4}
+        assert mocap.rejected_count_by_reason == {"future": 4}
         pose = read(mocap, {**bare(mocap, 0.105), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS})
         assert pose is not None
         assert pose.velocity_w == pytest.approx((0.5, 0.0, 0.0))
@@ -142,7 +142,7 @@ def test_a_leap_that_no_body_makes_is_no_velocity() -> None:
     with receiver() as mocap:
         read(mocap, bare(mocap, 0.0))
         assert read(mocap, bare(mocap, 1e6)) is None
-        assert mocap.refused == {"leap": 1}
+        assert mocap.rejected_count_by_reason == {"leap": 1}
         pose = read(mocap, bare(mocap, 1e6))
         assert pose is not None
         assert pose.velocity_w == (0.0, 0.0, 0.0)
@@ -176,7 +176,7 @@ def test_a_leap_that_no_body_makes_is_no_velocity() -> None:
 def test_what_is_malformed_is_counted_and_the_next_is_taken(datagram: object) -> None:
     with receiver() as mocap:
         assert read(mocap, datagram) is None
-        assert mocap.refused == {"malformed": 1}
+        assert mocap.rejected_count_by_reason == {"malformed": 1}
         assert read(mocap, mocap.at()) is not None
 
 
@@ -184,10 +184,10 @@ def test_a_flood_is_bounded_per_tick_and_soon_over(caplog: pytest.LogCaptureFixt
     with receiver() as mocap:
         ticks = 0
         send(mocap, *([b'{"a":' + b"[" * 2000] * 5000))
-        while (before := mocap.refused["malformed"]) >= 0 and mocap.read() is None:
+        while (before := mocap.rejected_count_by_reason["malformed"]) >= 0 and mocap.read() is None:
             ticks += 1
-            read_now = mocap.refused["malformed"] - before
-            assert read_now <= MAX_AT_ONCE
+            read_now = mocap.rejected_count_by_reason["malformed"] - before
+            assert read_now <= MAX_DATAGRAMS_PER_CYCLE
             if not read_now:
                 break
         assert ticks < 10, "what the kernel keeps is soon read"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.driver import own_emulators
-from snakesim_can_backend.driver.own_emulators import EmulatorProcess, check_emulators
+from snakesim_can_backend.driver.own_emulators import EmulatorProcess, validate_emulator_settings
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import Injection
@@ -41,7 +41,7 @@ def test_twins_that_cannot_be_are_refused(settings: CanSettings) -> None:
         ConfigError,
         code=("bus/not-virtual", "injection/not-supported", "injection/unknown-fault", "injection/unknown-target"),
     ):
-        check_emulators(RUN, settings)
+        validate_emulator_settings(RUN, settings)
 
 
 # --- the child ---------------------------------------------------------------------------------------------
@@ -110,7 +110,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: py
 
 
 def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(own_emulators, "STOP_LIMIT_S", 0.2)
+    monkeypatch.setattr(own_emulators, "STOP_TIMEOUT_S", 0.2)
     child.does("signal.signal(signal.SIGTERM, signal.SIG_IGN)", READY, SERVE)
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     began = time.monotonic()
@@ -143,7 +143,7 @@ def test_emulator_process_exit_is_noticed_without_its_log(child: Child) -> None:
     child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     assert emulators.describe_exit() is None
-    emulators._output.unlink()
+    emulators._output_path.unlink()
     wait_until(emulators.describe_exit, "the end of the child")
     assert emulators.describe_exit() == "the emulated joint modules have ended, with exit code 3"
     emulators.stop()

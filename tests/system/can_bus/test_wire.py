@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.bus import bus as wire_module
-from snakesim_can_backend.bus.bus import MAX_AT_ONCE, SocketCanWire, check_interface, drain_socket, is_up
+from snakesim_can_backend.bus.bus import MAX_AT_ONCE, SocketCanWire, drain_socket, is_up, validate_interface
 from snakesim_can_backend.bus.bus_errors import BusError, Kind, decode_error_frame
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
@@ -114,7 +114,7 @@ class Rig:
             return SimpleNamespace(socket=self.socket, shutdown=self.socket.close)
 
         monkeypatch.setattr(wire_module, "SocketcanBus", opened)
-        monkeypatch.setattr(wire_module, "check_interface", lambda _channel: None)
+        monkeypatch.setattr(wire_module, "validate_interface", lambda _channel: None)
         monkeypatch.setattr(wire_module, "is_up", lambda _channel: self.up)
         self.wire = SocketCanWire("can7", only)
 
@@ -279,15 +279,15 @@ def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest
 def test_an_interface_must_be_there_and_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wire_module, "_kernel_has_can", lambda: False)
     with raises_error(ConfigError, code="bus/not-available", field="lo"):
-        check_interface("lo")
+        validate_interface("lo")
     monkeypatch.setattr(wire_module, "_kernel_has_can", lambda: True)
     with raises_error(ConfigError, code="bus/not-available", field="nocan7"):
-        check_interface("nocan7")
+        validate_interface("nocan7")
     monkeypatch.setattr(wire_module, "is_up", lambda _channel: False)
     with raises_error(ConfigError, code="bus/not-available", field="lo"):
-        check_interface("lo")
+        validate_interface("lo")
     monkeypatch.setattr(wire_module, "is_up", lambda _channel: True)
-    check_interface("lo")
+    validate_interface("lo")
 
 
 def test_wire_absent_or_removed_interface_is_not_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

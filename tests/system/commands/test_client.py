@@ -16,8 +16,15 @@ from snakesim_hal.wire.messages import JointState, Status
 from snakesim_operator.playback.info import inspect_recording
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
-from snakesim_testing.runs.command import Ended, Running, armed_run, call, environment, running
-from snakesim_testing.runs.documents import REPOSITORY, sections
+from snakesim_testing.runs.command import (
+    CompletedRun,
+    Running,
+    make_environment,
+    run_to_end,
+    running_armed_snakesim,
+    running_snakesim,
+)
+from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 pytestmark = pytest.mark.e2e
 
@@ -31,7 +38,7 @@ EXTERNAL = ("--set", "services.control.external=true")
 @pytest.fixture(scope="module", params=["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
 def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A robot that waits for its controller."""
-    with running(tmp_path_factory.mktemp("robot") / "run", *ROBOT, request.param, *EXTERNAL) as started:
+    with running_snakesim(tmp_path_factory.mktemp("robot") / "run", *ROBOT, request.param, *EXTERNAL) as started:
         started.wait_for("a client that takes the lease")
         yield started
 
@@ -39,7 +46,7 @@ def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A robot with a controller of its own."""
-    with armed_run(tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime") as started:
+    with running_armed_snakesim(tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime") as started:
         yield started
 
 
@@ -60,7 +67,7 @@ def test_example_clients_are_as_short_as_documented() -> None:
 
 
 def status(session: Session) -> Status:
-    found = session.latest(keys.STATUS, Status, 10.0)
+    found = session.wait_for_latched(keys.STATUS, Status, 10.0)
     assert found is not None
     return found
 
@@ -74,8 +81,8 @@ def test_a_client_leases_arms_moves_and_disarms(waiting: Running) -> None:
     """First of those who wait with the robot: what it has counted is of this client."""
     with open_session(Link(waiting.endpoint, "planar13")) as session:
         wait_until(lambda: status(session).waiting_for == ["control"], "a run that waits for control alone")
-        joints = session.reader(keys.JOINTS, JointState, depth=DEPTH)
-        ended = call([sys.executable, CLIENT, waiting.endpoint, "planar13"], waiting.home, begin=urgently)
+        joints = session.declare_reader(keys.JOINTS, JointState, depth=DEPTH)
+        ended = run_to_end([sys.executable, CLIENT, waiting.endpoint, "planar13"], waiting.home, child_setup=urgently)
         assert ended.code == 0, ended.out + ended.err
         angles = [state.angle_rad for state in joints.drain()]
         furthest = [max(abs(angle - joint[0]) for angle in joint) for joint in zip(*angles, strict=True)]
@@ -92,19 +99,19 @@ def test_a_client_leases_arms_moves_and_disarms(waiting: Running) -> None:
 
 def test_a_stop_by_udp_stops_the_robot(waiting: Running) -> None:
     host, _, port = waiting.endpoint.removeprefix("tcp/").partition(":")
-    ended = call([sys.executable, STOP, host, port], waiting.home)
+    ended = run_to_end([sys.executable, STOP, host, port], waiting.home)
     assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, ended.out + ended.err
     with open_session(Link(waiting.endpoint, "planar13")) as session:
         assert status(session).lifecycle == "estop"
     settled(waiting)
 
 
-def script(text: str, run: Running, folder: Path) -> Ended:
+def script(text: str, run: Running, folder: Path) -> CompletedRun:
     """Run a script to its end, on a robot that waits for a controller."""
     settled(run)
     (folder / "script.py").write_text(textwrap.dedent(text))
-    env = environment(folder, PYTHONPATH=str(REPOSITORY))
-    return call([sys.executable, "script.py", run.endpoint], folder, env, 60.0, urgently)
+    env = make_environment(folder, PYTHONPATH=str(REPOSITORY))
+    return run_to_end([sys.executable, "script.py", run.endpoint], folder, env, 60.0, urgently)
 
 
 def settled(run: Running) -> None:
@@ -115,7 +122,9 @@ def settled(run: Running) -> None:
 
 
 def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running, tmp_path: Path) -> None:
-    nod = next(s for s in sections(REPOSITORY / "docs" / "how-to" / "python.md") if "nod.py" in s.files).files["nod.py"]
+    nod = next(s for s in parse_sections(REPOSITORY / "docs" / "how-to" / "python.md") if "nod.py" in s.files).files[
+        "nod.py"
+    ]
     ended = script(nod, waiting, tmp_path)
     assert ended.code == 0, ended.err
     assert "planar13, sim: disarmed\njoint_3 turned by +0.0" in ended.out or "turned by +0.1" in ended.out

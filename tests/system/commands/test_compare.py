@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.compare.command import compare
-from snakesim_operator.results.missing_data import INCOMPLETE
+from snakesim_operator.recording.message import RECORDING_FILENAME
+from snakesim_operator.results.compare.command import compare_runs
+from snakesim_operator.results.missing_data import EXIT_INCOMPLETE
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -79,8 +79,8 @@ def test_an_odd_record_is_one_clear_line(runs: Path, tmp_path: Path, odd: str) -
         (folder / name).unlink()
         ODD[odd](folder / name)
         try:
-            done = compare(folder, folder, tmp_path / "page.html")  # without a file that no comparison needs
-            assert done == (INCOMPLETE if name == RECORDING else 0)
+            done = compare_runs(folder, folder, tmp_path / "page.html")  # without a file that no comparison needs
+            assert done == (EXIT_INCOMPLETE if name == RECORDING_FILENAME else 0)
         except ConfigError as error:
             assert len(error.lines) == 1 and len(str(error)) < 1000, error
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import list_shipped
-from snakesim_hal.model.plugins import CONTROLLERS, list_installed
-from snakesim_testing.harness.command import call
+from snakesim_hal.model.files import list_shipped_names
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed_plugins
+from snakesim_testing.harness.command import run_to_end
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -18,10 +18,10 @@ ASK = {"bash": f'source "$1"; shift; {ASKED}', "zsh": f'source "$1"; shift; seto
 TYPED: dict[str, tuple[list[str], set[str]]] = {
     "command": (["ru"], {"run"}),
     "all commands": ([""], {"run", "topic", "fault", "drive", "lab", "completion"}),
-    "scenario": (["run", ""], set(list_shipped("scenarios"))),
+    "scenario": (["run", ""], set(list_shipped_names("scenarios"))),
     "flag": (["run", "triplet", "--clo"], {"--clock-mode"}),
     "value of a flag": (["run", "triplet", "--clock-mode", "l"], {"lockstep"}),
-    "controller": (["run", "--controller", ""], set(list_installed(CONTROLLERS))),
+    "controller": (["run", "--controller", ""], set(list_installed_plugins(CONTROLLERS))),
     "free value": (["run", "--duration", ""], set()),
     "after a free value": (["run", "--duration", "3", "pe"], {"peg_row"}),
     "of an installed package": (["drive", ""], {"load", "scan", "replay", "emulate", "dbc", "new"}),
@@ -56,7 +56,7 @@ def test_what_can_follow(script: tuple[str, Path], typed: str) -> None:
     shell, path = script
     words, wanted = TYPED[typed]
     plain = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
-    done = call([shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent)
+    done = run_to_end([shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent)
     assert done.code == 0, done.printed
     found = {word for word in done.out.split() if word.startswith(words[-1])}  # which zsh leaves to its matcher
     assert done.err == "" and (found >= wanted if typed == "all commands" else found == wanted), done.out

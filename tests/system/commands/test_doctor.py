@@ -10,14 +10,14 @@ import pytest
 
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.cli import main
-from snakesim_operator.this_computer.kernel import kernel
+from snakesim_operator.this_computer.kernel import check_kernel
 from snakesim_operator.this_computer.network_findings import check_ports, check_routers
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 
 
 def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.CaptureFixture[str]) -> None:
     before = os.sched_getscheduler(0)
-    assert main(["doctor", "--json", "--endpoint", free_endpoint()]) == 1, "nobody answers there"
+    assert main(["doctor", "--json", "--endpoint", find_free_endpoint()]) == 1, "nobody answers there"
     reported = json.loads(capsys.readouterr().out)
     assert {"Python", "OpenGL", "CAN", "disk", "kernel"} < {finding["what"] for finding in reported["findings"]}
     assert not reported["ok"]
@@ -59,7 +59,7 @@ def test_what_makes_ticks_late_is_named_with_its_remedy(
     for name, content in files.items():
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_text(f"{content}\n")
-    found = list(kernel(tmp_path))
+    found = list(check_kernel(tmp_path))
     assert [finding.what for finding in found if finding.state == "warn"] == warned
     assert all(finding.fix for finding in found if finding.state == "warn")
 
@@ -70,7 +70,7 @@ def test_doctor_serial_port_in_use_is_named_then_free(tmp_path: Path) -> None:
     port.write_text("")
 
     def said() -> tuple[str, str]:
-        (finding,) = (one for one in kernel(tmp_path) if one.what == "serial port")
+        (finding,) = (one for one in check_kernel(tmp_path) if one.what == "serial port")
         return finding.state, finding.detail
 
     assert said() == ("ok", "ttyUSB0 can be opened")

@@ -15,9 +15,16 @@ import pytest
 
 from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.run_log.host_record import HOST_RECORD
-from snakesim_operator.results.run_reader import REPORT
+from snakesim_operator.results.run_reader import REPORT_FILENAME
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import SNAKESIM, Ended, background, environment, run_to_summary, snakesim
+from snakesim_testing.runs.command import (
+    SNAKESIM_COMMAND,
+    CompletedRun,
+    make_environment,
+    run_in_background,
+    run_to_summary,
+    snakesim,
+)
 
 pytestmark = pytest.mark.e2e
 
@@ -47,18 +54,18 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(home: Path) -> tuple[Ended, Path]:
+def undisturbed(home: Path) -> tuple[CompletedRun, Path]:
     """An evaluation to compare others with."""
     ended = evaluate(home, "undisturbed", "--workers", "2")
     assert ended.code == 0 and not ended.err, ended.out + ended.err
     return ended, home / "undisturbed"
 
 
-def evaluate(home: Path, out: str, *arguments: str) -> Ended:
+def evaluate(home: Path, out: str, *arguments: str) -> CompletedRun:
     return snakesim("study", "evaluate", "./quick.toml", "--out", out, *arguments, cwd=home)
 
 
-def table_of(ended: Ended) -> str:
+def table_of(ended: CompletedRun) -> str:
     return ended.out[ended.out.index("setting ") : ended.out.index("written:")]
 
 
@@ -74,7 +81,7 @@ def lives(process: psutil.Process) -> bool:
 
 
 @pytest.mark.slow
-def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
     ended = evaluate(home, "part", "--rows", "2", "--controller", "hold", "--against", str(undisturbed[1]))
     assert ended.code == 0, ended.out + ended.err
     assert ended.out.count("cost of transport") == 1
@@ -92,7 +99,7 @@ def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tu
 
 
 @pytest.mark.slow
-def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> None:
+def test_the_table_tells_what_was_crossed(undisturbed: tuple[CompletedRun, Path]) -> None:
     ended, out = undisturbed
     rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
     assert [row[2:4] for row in rows] == [["path_following", "2/2"], ["hold", "0/2"]] * 2
@@ -104,7 +111,7 @@ def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> No
 
 
 @pytest.mark.slow
-def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+def test_it_can_be_repeated(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
     again = evaluate(home, "again", "--workers", "1")
     assert table_of(again) == table_of(undisturbed[0])
     for name in TABLES:
@@ -115,9 +122,9 @@ def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None
 
 
 @pytest.mark.slow
-def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
     out = home / "killed"
-    with background(home, "study", "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)) as process:
+    with run_in_background(home, "study", "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)) as process:
         wait_until(lambda: done(out) >= 2, "two cases done")
         command_itself = psutil.Process(process.pid)
         left = command_itself.children()
@@ -184,9 +191,9 @@ def test_evaluate_interrupted_stops_at_once_and_keeps_only_results(command: str,
     (tmp_path / "quick.toml").write_text(SUITE)
     (tmp_path / "tmp").mkdir()
     begun, kept = STOPPED[command]
-    environment_of_it = {**environment(tmp_path), "TMPDIR": str(tmp_path / "tmp")}
+    environment_of_it = {**make_environment(tmp_path), "TMPDIR": str(tmp_path / "tmp")}
     with subprocess.Popen(
-        [*SNAKESIM, *TYPED[command], "--workers", "2"],
+        [*SNAKESIM_COMMAND, *TYPED[command], "--workers", "2"],
         cwd=tmp_path,
         env=environment_of_it,
         stdout=subprocess.PIPE,
@@ -219,7 +226,7 @@ def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
     address, scheduler, worker = dask()
     small = ["--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5"]
     train = ["policy", "train", "surveyed_clutter", *small]
-    with background(home, *scheduler, program=DASK), background(home, *worker, program=DASK):
+    with run_in_background(home, *scheduler, program=DASK), run_in_background(home, *worker, program=DASK):
         there = snakesim(
             "policy", "train", "surveyed_clutter", *small, "--cluster", address, "--out", "there", cwd=home
         )
@@ -229,14 +236,16 @@ def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
     address, scheduler, worker = dask()
     out = home / "cluster"
     with (
-        background(home, *scheduler, program=DASK),
-        background(home, *worker, program=DASK) as lost,
-        background(home, *worker, program=DASK),
-        background(home, "study", "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)) as process,
+        run_in_background(home, *scheduler, program=DASK),
+        run_in_background(home, *worker, program=DASK) as lost,
+        run_in_background(home, *worker, program=DASK),
+        run_in_background(
+            home, "study", "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)
+        ) as process,
     ):
         wait_until(lambda: done(out) >= 2, "two cases done")
         lost.kill()
@@ -246,9 +255,9 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undistur
 
 
 @pytest.mark.slow
-def test_one_case_again_as_a_whole_run(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+def test_one_case_again_as_a_whole_run(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
     ended = evaluate(home, "one", "--only", "path_following:2:2")
-    assert ended.code == 0 and (home / "one" / REPORT).is_file(), ended.out + ended.err
+    assert ended.code == 0 and (home / "one" / REPORT_FILENAME).is_file(), ended.out + ended.err
     digest = json.loads((home / "one" / HOST_RECORD).read_bytes())["command_digest"]
     rows = [line.split(",") for line in (undisturbed[1] / "results.csv").read_text().splitlines()]
     names = rows[0]
@@ -273,7 +282,7 @@ class Deadly(Hold):
 
 
 @pytest.mark.slow
-def test_a_case_that_kills_its_workers_costs_no_other(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+def test_a_case_that_kills_its_workers_costs_no_other(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
     (home / "deadly.py").write_text(DEADLY)
     ended = evaluate(home, "deadly", "--controllers", "path_following,./deadly.py:Deadly", "--fields", "1")
     assert ended.code == 1 and "its worker process died" in ended.out, ended.out + ended.err

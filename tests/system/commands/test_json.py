@@ -1,4 +1,4 @@
-"""What `status`, `scenarios` and `config` tell: `--json` is one line for scripts, with the table's content and code."""
+"""With `--json`, `status`, `scenarios` and `config` print one line with the content of the table and a code."""
 
 import json
 from typing import Any
@@ -6,19 +6,19 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.files import list_shipped
+from snakesim_hal.model.files import list_shipped_names
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Status
 from snakesim_operator.cli import main
-from snakesim_testing.hal.small_robots import description, status
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.hal.small_robots import make_description, make_status
+from snakesim_testing.harness.endpoint import find_free_endpoint
 
 
 def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenario", "list", "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
-    assert sorted(reported["robots"]) == list_shipped("robots")
+    assert sorted(reported["robots"]) == list_shipped_names("robots")
     assert reported["scenarios"]["triplet"]
     assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
     reported = json.loads(capsys.readouterr().out)
@@ -26,11 +26,11 @@ def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     assert main(["status", "--json", "--endpoint", endpoint]) == 1
     assert json.loads(capsys.readouterr().out) == {"robots": [], "silent": []}
     with open_session(Link(endpoint, "worm", listen=True)) as session:
-        session.latched_publisher(keys.STATUS, Status).put(status(lifecycle="disarmed"))
+        session.declare_latched_publisher(keys.STATUS, Status).put(make_status(lifecycle="disarmed"))
         assert main(["status", "--json", "--endpoint", endpoint]) == 0
     (robot,) = json.loads(capsys.readouterr().out)["robots"]
     assert (robot["namespace"], robot["impostor"], robot["status"]["lifecycle"]) == ("worm", False, "disarmed")
@@ -51,12 +51,12 @@ def test_status_and_top_say_whether_something_real_moves(
     capsys: pytest.CaptureFixture[str], described: dict[str, Any] | None, said: str
 ) -> None:
     """In the second line of a robot; a description of another host counts nothing."""
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as session:
-        session.latched_publisher(keys.STATUS, Status).put(status())
+        session.declare_latched_publisher(keys.STATUS, Status).put(make_status())
         if described is not None:
-            robot = msgspec.structs.replace(description(), **described)
-            session.latched_publisher(keys.DESCRIPTION, Description).put(robot)
+            robot = msgspec.structs.replace(make_description(), **described)
+            session.declare_latched_publisher(keys.DESCRIPTION, Description).put(robot)
         main(["status", "--endpoint", endpoint])
         assert capsys.readouterr().out.splitlines()[1].startswith(said)
         if described is None or "host" not in described:
@@ -65,10 +65,10 @@ def test_status_and_top_say_whether_something_real_moves(
 
 
 def test_json_isolated_joint_is_reported_with_how_to_recover(capsys: pytest.CaptureFixture[str]) -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as session:
-        lost = status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)
-        session.latched_publisher(keys.STATUS, Status).put(lost)
+        lost = make_status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)
+        session.declare_latched_publisher(keys.STATUS, Status).put(lost)
         assert main(["status", "--endpoint", endpoint]) == 0
     said = capsys.readouterr().out
     assert "isolated: joint_3; passive until a reset" in said

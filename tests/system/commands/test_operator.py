@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.host.latch import ESTOP
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Running, armed_run
+from snakesim_testing.runs.command import Running, running_armed_snakesim
 from snakesim_testing.runs.in_process_command import snakesim, tell
 
 pytestmark = pytest.mark.e2e
@@ -30,7 +30,7 @@ LONG = (
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    with armed_run(tmp_path_factory.mktemp("operator") / "run", *LONG) as started:
+    with running_armed_snakesim(tmp_path_factory.mktemp("operator") / "run", *LONG) as started:
         yield started
         assert started.interrupt() == 130, started.printed()
 

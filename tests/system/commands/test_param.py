@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.process import get_user_name
-from snakesim_testing.runs.command import Ended, Running, armed_run
+from snakesim_testing.runs.command import CompletedRun, Running, running_armed_snakesim
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -16,13 +16,13 @@ LONG = ("peg_row", "--duration", "600", "--set", "rate_hz=50", "--clock-mode", "
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    with armed_run(tmp_path_factory.mktemp("param") / "run", *LONG) as started:
+    with running_armed_snakesim(tmp_path_factory.mktemp("param") / "run", *LONG) as started:
         yield started
 
 
 @pytest.fixture
 def param(run: Running, tmp_path: Path):
-    def call(*words: str, robot: str | None = None) -> Ended:
+    def call(*words: str, robot: str | None = None) -> CompletedRun:
         verb, *more = words
         selection = () if robot is None else ("--namespace", robot)
         return snakesim("param", verb, *more, *selection, "--endpoint", run.endpoint, cwd=tmp_path)

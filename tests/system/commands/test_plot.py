@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.signals import arrays
+from snakesim_operator.results.signals import compute_signals
 from snakesim_testing.harness.command import snakesim as started
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -48,19 +48,19 @@ def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Pa
     """A notebook's window library, and TeX without a TeX."""
     (run / "matplotlibrc").write_text("text.usetex: True\n")
     inherited = {"MPLBACKEND": "module://of_a_notebook", "MATPLOTLIBRC": str(run), "PATH": "/nowhere"}
-    ended = started("recording", "plot", str(run), "angle_rad", "--out", "inherited.svg", cwd=run, more=inherited)
+    ended = started("recording", "plot", str(run), "angle_rad", "--out", "inherited.svg", cwd=run, extra_env=inherited)
     assert ended.code == 0, ended.err
     assert "joint_13" in words(run / "inherited.svg")
 
 
 @pytest.mark.slow
 def test_every_signal_of_a_run_is_drawn(run: Path) -> None:
-    from snakesim_operator.features.figures.run_groups import make_single_groups
+    from snakesim_operator.features.figures.run_groups import make_single_run_groups
     from snakesim_operator.features.figures.signal_axes import draw_signals
 
     record = RunRecord.load(run)
-    signals = [name for name in arrays(record) if name != "time_s"]
-    axes = draw_signals(make_single_groups([record]), signals, 3.5, (0.0, 3.0)).axes
+    signals = [name for name in compute_signals(record) if name != "time_s"]
+    axes = draw_signals(make_single_run_groups([record]), signals, 3.5, (0.0, 3.0)).axes
     empty = [name for name, ax in zip(signals, axes, strict=True) if not ax.lines]
     assert empty == []
 
@@ -87,10 +87,10 @@ def test_runs_are_overlaid_and_their_mean_has_an_interval(run: Path, tmp_path: P
 
 @pytest.mark.slow
 def test_no_legend_covers_the_axes(run: Path) -> None:
-    from snakesim_operator.features.figures.run_groups import make_single_groups
+    from snakesim_operator.features.figures.run_groups import make_single_run_groups
     from snakesim_operator.features.figures.signal_axes import draw_signals
 
-    groups = make_single_groups([RunRecord.load(run)])
+    groups = make_single_run_groups([RunRecord.load(run)])
     figure = draw_signals(groups, ["angle_rad", "angle_rad.joint_1,target.joint_1"], 3.5, (0.0, 3.0))
     figure.draw_without_rendering()
     for axes in figure.axes:

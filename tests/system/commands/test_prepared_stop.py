@@ -14,10 +14,10 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.session import Link
-from snakesim_hal.network.stop_port import Reply, StopRequester, open_stop_port, serve_stops
+from snakesim_hal.network.stop_port import Reply, StopRequester, open_stop_port, start_stop_server
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.robot_commands import prepared_stop
-from snakesim_operator.robot_commands.prepared_stop import WAITING, PreparedStop
+from snakesim_operator.robot_commands.prepared_stop import WAITING_FOR_ROBOT, PreparedStop
 from snakesim_operator.robot_commands.stop_result import StopResult
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
@@ -33,12 +33,12 @@ class Network:
         self.present_keys = ["alive/hal"]
         self.error: Exception | None = None
 
-    def present(self, _pattern: str, _timeout_s: float) -> list[str]:
+    def list_tokens(self, _pattern: str, _timeout_s: float) -> list[str]:
         if self.error is not None:
             raise self.error
         return self.present_keys
 
-    def part(self) -> Any:
+    def create_subsession(self) -> Any:
         return SimpleNamespace(close=lambda: None)  # nothing is subscribed to
 
 
@@ -52,7 +52,7 @@ class Bench:
         self.go_on.set()
         self.log: list[tuple[str, str]] = []
         self.registry_error: OSError | None = None
-        serve_stops(opened, "worm", self._take)
+        start_stop_server(opened, "worm", self._take)
         robot = {(LOOPBACK, self.port): ("tcp/127.0.0.1:9", "worm")}
 
         def registry(_where: RobotSelection) -> Any:
@@ -60,9 +60,9 @@ class Bench:
                 raise self.registry_error
             return robot
 
-        monkeypatch.setattr(prepared_stop, "local_stop_ports", registry)
-        monkeypatch.setattr(prepared_stop, "ask_session", self._ask_session)
-        monkeypatch.setattr(prepared_stop, "estop", self._search)
+        monkeypatch.setattr(prepared_stop, "find_local_stop_ports", registry)
+        monkeypatch.setattr(prepared_stop, "request_stop_over_session", self._ask_session)
+        monkeypatch.setattr(prepared_stop, "stop_robots", self._search)
         self.network_error: Exception | None = None
         self.searched = 0
         self.stop = PreparedStop(RobotSelection("tcp/127.0.0.1:9", "worm"), Link("tcp/127.0.0.1:9", "worm"), self._note)
@@ -89,7 +89,7 @@ class Bench:
 def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     with open_stop_port(LOOPBACK, 0) as opened:
         made = Bench(monkeypatch, opened)
-        wait_until(lambda: made.stop._ports(), "the stop port", 5.0)
+        wait_until(lambda: made.stop._list_ports(), "the stop port", 5.0)
         yield made
         made.stop.close()
 
@@ -97,7 +97,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 def test_prepared_stop_works_with_full_file_table_and_broken_network(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench.stop.connect(Network())  # pyright: ignore[reportArgumentType]
+    bench.stop.use_session(Network())  # pyright: ignore[reportArgumentType]
     bench.registry_error, bench.network_error = FULL, KeyError("unexpected")
 
     def no_socket(*_: object, **__: object) -> socket.socket:
@@ -105,19 +105,19 @@ def test_prepared_stop_works_with_full_file_table_and_broken_network(
 
     monkeypatch.setattr(socket, "socket", no_socket)
     for _ in range(2):
-        assert bench.stop.stop("anna") == "worm: stopped: emergency stop (tcp/127.0.0.1:9)"
+        assert bench.stop.stop_and_wait("anna") == "worm: stopped: emergency stop (tcp/127.0.0.1:9)"
     assert bench.searched == 0
     assert bench.log[0] == ("anna", "worm: stopped: emergency stop (tcp/127.0.0.1:9)")
 
 
 def test_prepared_stop_requested_during_a_stop_starts_another(bench: Bench) -> None:
     bench.go_on.clear()
-    first = bench.stop.request("anna")
+    first = bench.stop.request_stop("anna")
     wait_until(lambda: bench.asked, "the first stop", 5.0)
-    later: list[Future[str]] = [bench.stop.request(f"viewer {number}") for number in range(100)]
+    later: list[Future[str]] = [bench.stop.request_stop(f"viewer {number}") for number in range(100)]
     assert not first.done()
     assert len({id(future) for future in later}) == 1
-    assert bench.stop.readiness().text.startswith("a stop has been under way")
+    assert bench.stop.check_readiness().text.startswith("a stop has been under way")
     bench.go_on.set()
     assert later[0].result(5.0).startswith("worm: stopped")
     assert first.done()
@@ -126,7 +126,7 @@ def test_prepared_stop_requested_during_a_stop_starts_another(bench: Bench) -> N
 
 
 def test_prepared_stop_of_unreachable_robot_explains_the_failure(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench.stop.connect(Network())  # pyright: ignore[reportArgumentType]
+    bench.stop.use_session(Network())  # pyright: ignore[reportArgumentType]
     bench.network_error = ValueError("no session")
 
     def closed(*_: object) -> None:
@@ -134,27 +134,27 @@ def test_prepared_stop_of_unreachable_robot_explains_the_failure(bench: Bench, m
 
     monkeypatch.setattr(StopRequester, "request_stop", closed)
     with raises_error(RefusedError, code="robot/not-confirmed"):
-        bench.stop.stop("anna")
+        bench.stop.stop_and_wait("anna")
     monkeypatch.undo()
-    monkeypatch.setattr(prepared_stop, "ask_session", lambda *_: [])
-    assert bench.stop.stop("anna").startswith("worm: stopped"), "the next one is taken"
+    monkeypatch.setattr(prepared_stop, "request_stop_over_session", lambda *_: [])
+    assert bench.stop.stop_and_wait("anna").startswith("worm: stopped"), "the next one is taken"
 
 
 def test_prepared_stop_ready_reflects_a_test_made_now(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prepared_stop, "TEST_EVERY_S", 0.02)
-    assert bench.stop.readiness() == prepared_stop.StopReadiness(ready=True, text=WAITING)
+    monkeypatch.setattr(prepared_stop, "SELF_TEST_PERIOD_S", 0.02)
+    assert bench.stop.check_readiness() == prepared_stop.StopReadiness(is_ready=True, text=WAITING_FOR_ROBOT)
     network = Network()
-    bench.stop.connect(network)  # pyright: ignore[reportArgumentType]
+    bench.stop.use_session(network)  # pyright: ignore[reportArgumentType]
 
     def says(ready: bool, words: str) -> None:
         def said() -> bool:
-            bench.stop.test_if_due()
-            found = bench.stop.readiness()
-            return found.ready == ready and words in found.text
+            bench.stop.start_self_test_if_due()
+            found = bench.stop.check_readiness()
+            return found.is_ready == ready and words in found.text
 
         wait_until(said, words, 5.0)
 
-    assert not bench.stop.readiness().ready, "not tested yet"
+    assert not bench.stop.check_readiness().is_ready, "not tested yet"
     says(True, "ready")
     assert bench.asked == [], "a test stops nothing"
     network.present_keys = []
@@ -163,16 +163,16 @@ def test_prepared_stop_ready_reflects_a_test_made_now(bench: Bench, monkeypatch:
     says(False, "OSError: [Errno 24] Too many open files")
     network.error, network.present_keys = None, ["alive/hal"]
     says(True, "ready")
-    monkeypatch.setattr(prepared_stop, "TEST_VALID_S", 0.05)
+    monkeypatch.setattr(prepared_stop, "SELF_TEST_VALIDITY_S", 0.05)
     time.sleep(0.1)
-    assert "the last self-test that succeeded was" in bench.stop.readiness().text
+    assert "the last self-test that succeeded was" in bench.stop.check_readiness().text
 
 
 def test_a_test_of_a_closed_stop_port_says_so() -> None:
     with contextlib.closing(StopRequester()) as requester, open_stop_port(LOOPBACK, 0) as opened:
         address = (LOOPBACK, opened.getsockname()[1])
-        requester.prepare([address])
-        requester.test(address)
+        requester.open_sockets([address])
+        requester.require_open_port(address)
         opened.close()
         with raises_error(NotConnectedError, code="network/no-answer"):
-            requester.test(address)
+            requester.require_open_port(address)

@@ -10,9 +10,9 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Preview, SensorDescription
-from snakesim_operator.monitoring.preview import cameras_of, preview_of
-from snakesim_testing.hal.small_robots import description
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_operator.monitoring.preview import encode_preview, find_cameras
+from snakesim_testing.hal.small_robots import make_description
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 
 CAMERA = {
@@ -33,7 +33,7 @@ def depth(tick: int = 0) -> DepthImage:
 
 
 def test_depth_keeps_its_values() -> None:
-    made = preview_of(depth(7), 80)
+    made = encode_preview(depth(7), 80)
     seen = np.array(PIL.Image.open(io.BytesIO(made.data)))
     assert made.tick == 7
     assert made.width == 80
@@ -48,7 +48,7 @@ def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) 
     ramp = np.zeros((120, 160, 3), dtype=np.uint8)
     ramp[..., 0] = np.linspace(0, 255, 160)
     image = ColorImage(tick=0, timestamp_ns=0, width=160, height=120, rgb=ramp.tobytes(), **CAMERA)
-    made = preview_of(image, width)
+    made = encode_preview(image, width)
     seen = np.array(PIL.Image.open(io.BytesIO(made.data))).astype(int)
     assert (made.width, made.height) == expected
     assert made.format == "jpeg"
@@ -61,15 +61,15 @@ def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) 
 
 def test_only_what_is_looked_at() -> None:
     sensor = SensorDescription(key=keys.depth_key("head"), rate_hz=20.0, delay_s=0.0)
-    robot = msgspec.structs.replace(description(), sensors=[sensor])
-    endpoint = free_endpoint()
+    robot = msgspec.structs.replace(make_description(), sensors=[sensor])
+    endpoint = find_free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as beside:
-        images = hal.publisher(keys.depth_key("head"), DepthImage)
-        (camera,) = cameras_of(beside, robot, 80)
+        images = hal.declare_publisher(keys.depth_key("head"), DepthImage)
+        (camera,) = find_cameras(beside, robot, 80)
         camera.publish_preview()
         assert not images.has_subscriber()
         with open_session(Link(endpoint, "worm")) as far:
-            seen = far.reader(keys.preview_key(keys.depth_key("head")), Preview)
+            seen = far.declare_reader(keys.preview_key(keys.depth_key("head")), Preview)
             wait_until(lambda: camera.publish_preview() or images.has_subscriber(), "the image fetched")
             images.put(depth(3))
             found: list[Preview] = []

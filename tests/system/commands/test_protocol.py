@@ -10,7 +10,7 @@ from typing import Any, get_args
 import pytest
 import zenoh
 
-from snakesim_gnc.control.state_reports import TELEMETRY_S
+from snakesim_gnc.control.state_reports import TELEMETRY_PERIOD_S
 from snakesim_hal.host.status_reporter import STATUS_PERIOD_NS
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.session import Link, open_session
@@ -18,9 +18,9 @@ from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import VERSIONS, DepthImage, Description, Done, JointCommand, JointState, Mode
-from snakesim_operator.this_computer.schemas import contract
-from snakesim_testing.hal.small_robots import description
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_operator.this_computer.schemas import generate_contract_files
+from snakesim_testing.hal.small_robots import make_description
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 
 REPOSITORY = Path(__file__).parents[3]
@@ -29,7 +29,7 @@ PROTOCOL = (REPOSITORY / "schemas" / "protocol.md").read_text(encoding="utf-8")
 
 @cache
 def published_contract() -> dict[str, str]:
-    return dict(contract())
+    return dict(generate_contract_files())
 
 
 def texts_in(schema: Any) -> Iterator[str]:
@@ -64,7 +64,7 @@ def test_the_modes_are_told_with_their_numbers_and_units() -> None:
 
 
 def test_every_refusal_is_told() -> None:
-    commands = {*get_args(limiter.Refusal), "before_arming"}
+    commands = {*get_args(limiter.RejectionReason), "before_arming"}
     source = "".join(
         (REPOSITORY / name).read_text(encoding="utf-8")
         for name in (
@@ -85,7 +85,7 @@ def test_every_refusal_is_told() -> None:
 def test_the_rates_are_those_of_the_code() -> None:
     when = {row.key: row.when for row in keys.SPACE}
     assert f"{1e9 / STATUS_PERIOD_NS:g} Hz" in when[keys.STATUS]
-    assert f"{1 / TELEMETRY_S:g} Hz" in when[keys.CONTROL_STATE]
+    assert f"{1 / TELEMETRY_PERIOD_S:g} Hz" in when[keys.CONTROL_STATE]
     for row in keys.SPACE:
         assert f"| {row.kind} | {row.when} |" in published_contract()["keys.md"]
 
@@ -106,13 +106,17 @@ ROWS = {
 @pytest.mark.parametrize("lossless", [False, True], ids=["realtime", "lockstep"])
 @pytest.mark.parametrize("name", ROWS)
 def test_streams_are_sent_with_the_priorities_of_the_table(name: str, lossless: bool) -> None:
-    (key, message), endpoint = ROWS[name], free_endpoint()
+    (key, message), endpoint = ROWS[name], find_free_endpoint()
     row = next(line for line in PROTOCOL.splitlines() if line.startswith(f"| {name} |"))
     priority, congestion, express = (cell.strip() for cell in row.strip("|").split("|")[1:])
     latched = key == keys.DESCRIPTION
     with open_session(Link(endpoint, "worm", listen=True)) as hal, plain(endpoint) as stranger:
         arrived = stranger.declare_subscriber(key)
-        publisher = hal.latched_publisher(key, message) if latched else hal.publisher(key, message, lossless=lossless)
+        publisher = (
+            hal.declare_latched_publisher(key, message)
+            if latched
+            else hal.declare_publisher(key, message, lossless=lossless)
+        )
         found: list[zenoh.Sample] = []
         wait_until(lambda: publisher.send(b"") or found.extend(filter(None, [arrived.try_recv()])) or found, "a sample")
     assert str(found[0].priority).endswith(f".{priority}")
@@ -125,9 +129,9 @@ def test_streams_are_sent_with_the_priorities_of_the_table(name: str, lossless: 
 
 
 def test_a_plain_client_gets_the_latched_description_by_a_query() -> None:
-    endpoint, robot = free_endpoint(), description()
+    endpoint, robot = find_free_endpoint(), make_description()
     with open_session(Link(endpoint, "worm", listen=True)) as hal:
-        hal.latched_publisher(keys.DESCRIPTION, Description).put(robot)
+        hal.declare_latched_publisher(keys.DESCRIPTION, Description).put(robot)
         with plain(endpoint) as stranger:
             assert "`hal/description/@adv/**`" in PROTOCOL
             replies = list(stranger.get("hal/description/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY, timeout=5.0))

@@ -24,10 +24,10 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.streams import Reader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent, Trajectory
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ros2_rig import SERVICE_HASHES
-from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.command import run_in_background, running_snakesim
 from snakesim_testing.runs.in_process_command import tell
 
 pytestmark = pytest.mark.e2e
@@ -64,9 +64,9 @@ RUN = ("clutter", "--clock-mode", "lockstep", "--duration", "600", "--stay", "--
 @contextmanager
 def ros_router(folder: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """The router of a ROS network, and where it listens."""
-    at = free_endpoint()
+    at = find_free_endpoint()
     (folder / "ros.json5").write_text(ROUTER % at)
-    with background(folder, "start", "router", "ros.json5") as router:
+    with run_in_background(folder, "start", "router", "ros.json5") as router:
         yield at, router
 
 
@@ -169,7 +169,7 @@ class RosSide:
 
 
 def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *RUN) as run, ros_router(tmp_path) as (at, router):
+    with running_snakesim(tmp_path / "run", *RUN) as run, ros_router(tmp_path) as (at, router):
         run.wait_for(" s  ")
         refused = tell(run, "start", "ros2", "--ros-router", run.endpoint)
         assert refused.code == 2
@@ -178,7 +178,7 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
         assert refused.code != 0
         assert "has a controller already, which holds the lease" in refused.err
         bridge = ("start", "ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
-        with session_at(at) as session, background(tmp_path, *bridge):
+        with session_at(at) as session, run_in_background(tmp_path, *bridge):
             _sees(RosSide(session))
             _steers(RosSide(session), run.endpoint)
             _tunes(RosSide(session))
@@ -191,16 +191,16 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     late = ("run", "triplet", "--clock-mode", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)
     with (
         ros_router(tmp_path) as (at, _),
         session_at(at) as session,
-        background(tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", at) as waiting,
+        run_in_background(tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", at) as waiting,
     ):
         assert waiting.stdout is not None
         assert "Waiting for it up to 60 s" in waiting.stdout.readline()
-        with background(tmp_path, *late):
+        with run_in_background(tmp_path, *late):
             ros = RosSide(session)
             ros.first("joint_states", "sensor_msgs/msg/JointState")
             assert ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)) is None
@@ -220,9 +220,9 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
         "--set",
         "services.control.external=true",
     )
-    with running(tmp_path / "run", *alone) as run, ros_router(tmp_path) as (at, _):
+    with running_snakesim(tmp_path / "run", *alone) as run, ros_router(tmp_path) as (at, _):
         bridge = ("start", "ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
-        with session_at(at) as session, background(tmp_path, *bridge):
+        with session_at(at) as session, run_in_background(tmp_path, *bridge):
             ros = RosSide(session)
             limp = ros.first("joint_states", "sensor_msgs/msg/JointState")
             ros.trigger("arm")
@@ -326,12 +326,12 @@ def _steers(ros: RosSide, endpoint: str) -> None:
     payload = bytes(STORE.serialize_cdr(twist, "geometry_msgs/msg/Twist"))
     key = ros.key("cmd_vel", "geometry_msgs/msg/Twist")
     with open_session(Link(endpoint, "planar13_camera")) as robot:
-        intents = robot.reader(keys.INTENT, Intent)
-        plans = robot.reader(keys.TRAJECTORY, Trajectory)
+        intents = robot.declare_reader(keys.INTENT, Intent)
+        plans = robot.declare_reader(keys.TRAJECTORY, Trajectory)
 
         def followed() -> bool:
             ros.session.put(key, payload)
-            plan = plans.newest(lambda _: True)
+            plan = plans.pop_newest(lambda _: True)
             return plan is not None and "ros2 /cmd_vel" in plan.reason and plan.speed_m_s > 0
 
         wait_until(followed, "navigation at the speed of /cmd_vel", 30.0)
@@ -340,7 +340,7 @@ def _steers(ros: RosSide, endpoint: str) -> None:
         assert newest.heading_w_rad is not None
         assert abs(newest.heading_w_rad) < 3.2
         wait_until(
-            lambda: plans.newest(lambda plan: plan.speed_m_s == 0 and "has expired" in plan.reason) is not None,
+            lambda: plans.pop_newest(lambda plan: plan.speed_m_s == 0 and "has expired" in plan.reason) is not None,
             "standing still without /cmd_vel",
             30.0,
         )
@@ -365,7 +365,7 @@ def _outlasts_a_frozen_router(ros: RosSide, router: int, endpoint: str) -> None:
         ros.key("head/depth/image_raw", "sensor_msgs/msg/Image"), handlers.RingChannel(1)
     )
     with open_session(Link(endpoint, "planar13_camera")) as robot:
-        clocks = robot.reader(keys.CLOCK, Clock)
+        clocks = robot.declare_reader(keys.CLOCK, Clock)
         os.kill(router, signal.SIGSTOP)
         try:
             (first, *_) = _within(3.0, clocks)

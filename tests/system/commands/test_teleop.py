@@ -15,7 +15,7 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Intent, Status, Trajectory
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Running, running
+from snakesim_testing.runs.command import Running, running_snakesim
 from snakesim_testing.runs.keyboard import LEFT, UP, at_the_keyboard
 
 pytestmark = pytest.mark.e2e
@@ -27,7 +27,7 @@ class Way:
     """What navigation makes of it: the newest speed along the path, and why."""
 
     def __init__(self, session: Session) -> None:
-        self._reader = session.reader(keys.TRAJECTORY, Trajectory)
+        self._reader = session.declare_reader(keys.TRAJECTORY, Trajectory)
         self.speed_m_s, self.reason = math.nan, ""
 
     def is_at(self, speed_m_s: float, why: str) -> bool:
@@ -37,16 +37,16 @@ class Way:
 
 
 def lifecycle(session: Session) -> str:
-    found = session.latest(keys.STATUS, Status, 5.0)
+    found = session.wait_for_latched(keys.STATUS, Status, 5.0)
     return "" if found is None else found.lifecycle
 
 
 def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with running(out, "peg_row", "--clock-mode", "realtime", "--duration", "300") as run:
+    with running_snakesim(out, "peg_row", "--clock-mode", "realtime", "--duration", "300") as run:
         run.wait_for("Locomoting")
         with open_session(Link(run.endpoint, "planar13")) as session:
-            intents, way = session.reader(keys.INTENT, Intent), Way(session)
+            intents, way = session.declare_reader(keys.INTENT, Intent), Way(session)
             with at_the_keyboard(run, tmp_path) as lost:
                 assert intents.drain() == []
                 assert lost.shows("nothing requested yet") is None
@@ -85,7 +85,7 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
 def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A robot on its way, whose processes wait for one another."""
     out = tmp_path_factory.mktemp("lockstep") / "run"
-    with running(out, "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
+    with running_snakesim(out, "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
         run.wait_for("Locomoting")
         yield run
 
@@ -106,7 +106,7 @@ def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: Running, tmp_pat
     with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
         operator.type(UP)
         operator.shows("requested: +0.05 m/s")
-        states, found = session.reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
+        states, found = session.declare_reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
 
         def told() -> bool:
             found.extend(states.drain())

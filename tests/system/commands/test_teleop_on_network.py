@@ -13,10 +13,10 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent
 from snakesim_operator.robot_commands.teleop import command, joystick
-from snakesim_operator.robot_commands.teleop.command import Teleop
+from snakesim_operator.robot_commands.teleop.command import TeleopLoop
 from snakesim_operator.robot_commands.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
-from snakesim_testing.hal.small_robots import clock
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.hal.small_robots import make_clock
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 
 SILENT_S = 0.3  # in the place of STICK_AGE_S
@@ -38,19 +38,19 @@ def test_a_stick_that_falls_silent_asks_for_nothing_any_more(monkeypatch: pytest
     monkeypatch.setattr(command, "STICK_AGE_S", SILENT_S)
     read, write = os.pipe()
     os.set_blocking(read, False)
-    link = Link(free_endpoint(), "worm")
+    link = Link(find_free_endpoint(), "worm")
     with open_session(Link(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
-        heard, clocks = robot.reader(keys.INTENT, Intent, depth=256), robot.publisher(keys.CLOCK, Clock)
+        heard, clocks = robot.declare_reader(keys.INTENT, Intent, depth=256), robot.declare_publisher(keys.CLOCK, Clock)
         stick = Joystick(read, Axis(0, 255), Axis(0, 255))
-        teleop = Teleop(session, link, 0.2, None, stick)
+        teleop = TeleopLoop(session, link, 0.2, None, stick)
         loop = threading.Thread(target=teleop.run)
-        monkeypatch.setattr(command, "on_stop_signal", lambda _stop: None)  # of the main thread alone
+        monkeypatch.setattr(command, "call_on_stop_signals", lambda _stop: None)  # of the main thread alone
         monkeypatch.setattr(signal, "signal", lambda *_: None)
         loop.start()
         intents, ticks = list[Intent](), itertools.count(1)
 
         def speeds_at_last(count: int) -> set[float | None]:
-            clocks.put(clock(next(ticks), arm_session=1, clock_mode="realtime"))
+            clocks.put(make_clock(next(ticks), arm_session=1, clock_mode="realtime"))
             time.sleep(0.02)
             intents.extend(heard.drain())
             return {intent.speed_m_s for intent in intents[-count:]}
@@ -77,21 +77,21 @@ def event(at_s: float, axis: int, value: int) -> bytes:
 def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFixture[str]) -> None:
     read, write = os.pipe()
     os.set_blocking(read, False)
-    link = Link(free_endpoint(), "worm")
+    link = Link(find_free_endpoint(), "worm")
     with open_session(Link(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
-        heard, clocks = robot.reader(keys.INTENT, Intent, depth=256), robot.publisher(keys.CLOCK, Clock)
+        heard, clocks = robot.declare_reader(keys.INTENT, Intent, depth=256), robot.declare_publisher(keys.CLOCK, Clock)
 
         def be_a_robot_and_a_hand() -> None:
             os.write(write, event(time.monotonic(), ABS_Y, 0))
             for tick in itertools.takewhile(lambda tick: tick < 60, itertools.count(1)):
-                clocks.put(clock(tick, arm_session=1, clock_mode="realtime"))
+                clocks.put(make_clock(tick, arm_session=1, clock_mode="realtime"))
                 time.sleep(0.01)
             os.close(write)
 
         hand = threading.Thread(target=be_a_robot_and_a_hand)
         hand.start()
         stick = Joystick(read, Axis(0, 255), Axis(0, 255))
-        assert Teleop(session, link, 0.2, None, stick).run() == 1
+        assert TeleopLoop(session, link, 0.2, None, stick).run() == 1
         hand.join()
         stick.close()
         intents = heard.drain()

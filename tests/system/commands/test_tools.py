@@ -13,11 +13,18 @@ from typing import Any
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.harness.processes import nothing_left
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.harness.processes import assert_no_process_left
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.command import SNAKESIM, Running, armed_run, call, environment, snakesim
+from snakesim_testing.runs.command import (
+    SNAKESIM_COMMAND,
+    Running,
+    make_environment,
+    run_to_end,
+    running_armed_snakesim,
+    snakesim,
+)
 
 pytestmark = pytest.mark.e2e
 
@@ -37,32 +44,37 @@ def echoed(run: Running, key: str, count: int, *more: str) -> list[dict[str, Any
 def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [*SNAKESIM, "scenario", "list"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            [*SNAKESIM_COMMAND, "scenario", "list"],
+            cwd=tmp_path,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
         )
     assert done.returncode == 1
     assert done.stderr.startswith("snakesim: ")
     assert done.stderr.count("\n") == 1
-    seen = call(["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"], tmp_path)
+    seen = run_to_end(["sh", "-c", f"{' '.join(SNAKESIM_COMMAND)} config triplet | head -1"], tmp_path)
     assert seen.err == ""
     assert seen.out.count("\n") == 1
 
 
 @pytest.mark.slow
 def test_a_run_goes_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
-    run = f"{' '.join(SNAKESIM)} run triplet --in-process --duration 1 --no-record --out"
+    run = f"{' '.join(SNAKESIM_COMMAND)} run triplet --in-process --duration 1 --no-record --out"
     for number, unread in enumerate(("| head -0", ">&-", "> /dev/full 2>&1")):
-        ended = call(["bash", "-c", f"set -o pipefail; {run} {number} {unread}"], tmp_path)
+        ended = run_to_end(["bash", "-c", f"set -o pipefail; {run} {number} {unread}"], tmp_path)
         assert (ended.code, ended.err) == (0, ""), f"{unread}: {ended.err}"
         assert (tmp_path / str(number) / "summary.json").exists(), unread
 
 
 def test_a_closed_terminal_ends_a_run_in_order(tmp_path: Path) -> None:
-    (ours, theirs), endpoint = pty.openpty(), free_endpoint()
+    (ours, theirs), endpoint = pty.openpty(), find_free_endpoint()
     run = ["run", "triplet", "--clock-mode", "realtime", "--out", "run", "--endpoint", endpoint]
     process = subprocess.Popen(
-        ["env", "--default-signal=HUP", "setsid", "--ctty", *SNAKESIM, *run],
+        ["env", "--default-signal=HUP", "setsid", "--ctty", *SNAKESIM_COMMAND, *run],
         cwd=tmp_path,
-        env=environment(tmp_path),
+        env=make_environment(tmp_path),
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
@@ -74,7 +86,7 @@ def test_a_closed_terminal_ends_a_run_in_order(tmp_path: Path) -> None:
     os.close(ours)
     assert process.wait(30) == 130
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["command_digest"]
-    nothing_left(tmp_path / "run")
+    assert_no_process_left(tmp_path / "run")
 
 
 INTERRUPTED = (
@@ -98,12 +110,12 @@ INTERRUPTED = (
 def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Path) -> None:
     """From the first line of ours on; what comes before is the interpreter's own start."""
     on_network = words[0] in ("topic", "status", "robot", "run")
-    endpoint = ["--endpoint", free_endpoint()] if on_network else []
+    endpoint = ["--endpoint", find_free_endpoint()] if on_network else []
     for snapshot in range(7):
         process = subprocess.Popen(
-            [*SNAKESIM, *words, *endpoint],
+            [*SNAKESIM_COMMAND, *words, *endpoint],
             cwd=tmp_path,
-            env=environment(tmp_path),
+            env=make_environment(tmp_path),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -115,7 +127,7 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Pa
         said, _ = process.communicate(timeout=60)
         assert "Traceback" not in said and "KeyboardInterrupt" not in said, said
         assert "Exception ignored" not in said, said
-    nothing_left(tmp_path / "run")
+    assert_no_process_left(tmp_path / "run")
 
 
 def first_line_ran(pid: int) -> bool:
@@ -129,7 +141,7 @@ def first_line_ran(pid: int) -> bool:
 
 def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--clock-mode", "realtime"]
-    with armed_run(tmp_path / "run", *arguments) as run:
+    with running_armed_snakesim(tmp_path / "run", *arguments) as run:
         rate = command.tell(run, "topic", "rate", "sensor/joints", "--count", "2")
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
@@ -162,11 +174,11 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
 def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) -> None:
     """In a network namespace of its own, which has nothing but loopback."""
     run = "ip link set lo up && exec " + " ".join(
-        [*SNAKESIM, "run", "triplet", "--controller", "hold", "--duration", "1", "--out", "run"]
+        [*SNAKESIM_COMMAND, "run", "triplet", "--controller", "hold", "--duration", "1", "--out", "run"]
     )
     for flags, code in (("", 2), (" --insecure", 0), (" --insecure --with-router", 0)):
         typed = ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"]
-        ended = call(typed, tmp_path, limit_s=120.0)
+        ended = run_to_end(typed, tmp_path, limit_s=120.0)
         assert ended.code == code, ended.printed
 
 
@@ -193,7 +205,7 @@ def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
     (tmp_path / "site" / "wave.py").write_text(example, encoding="utf-8")
     path = os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])
     typed = ("run", "triplet", "--controller", "wave", *flags, "--out", "again")
-    ended = snakesim(*typed, cwd=tmp_path, more={"PYTHONPATH": path})
+    ended = snakesim(*typed, cwd=tmp_path, extra_env={"PYTHONPATH": path})
     assert ended.code == 0, ended.out + ended.err
     assert RunRecord.load(tmp_path / "again").host.command_digest == summary.command_digest
     assert not (tmp_path / "executed").exists()

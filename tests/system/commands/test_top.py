@@ -12,10 +12,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.base.targets import RobotSelection
-from snakesim_operator.monitoring.top import TrafficSnapshot, top
-from snakesim_operator.monitoring.traffic import MAX_ARRIVALS, MAX_KEYS, Traffic
-from snakesim_testing.hal.small_robots import clock, command, description, state
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_operator.monitoring.top import TrafficSnapshot, show_traffic
+from snakesim_operator.monitoring.traffic import MAX_ARRIVAL_TIMES, MAX_KEYS, Traffic
+from snakesim_testing.hal.small_robots import make_clock, make_description, make_joint_command, make_joint_state
+from snakesim_testing.harness.endpoint import find_free_endpoint
 
 MS = 1_000_000
 
@@ -25,13 +25,17 @@ def arrival(key: str, message: Message, at_ms: float) -> Arrival:
 
 
 def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
-    robot, traffic = description(), Traffic()
+    robot, traffic = make_description(), Traffic()
     for tick in range(100):
-        traffic.add(arrival("lab/worm/sensor/joints", state(robot, tick=tick, timestamp_ns=tick * 10 * MS), 10 * tick))
-        traffic.add(arrival("lab/worm/hal/clock", clock(tick + 2), 10 * tick + 1))
-        answer = command(robot, tick=tick, sequence=tick)
+        traffic.add(
+            arrival(
+                "lab/worm/sensor/joints", make_joint_state(robot, tick=tick, timestamp_ns=tick * 10 * MS), 10 * tick
+            )
+        )
+        traffic.add(arrival("lab/worm/hal/clock", make_clock(tick + 2), 10 * tick + 1))
+        answer = make_joint_command(robot, tick=tick, sequence=tick)
         traffic.add(arrival("lab/worm/actuator/joints", answer, 10 * tick + 3))
-    lines = {line.key: line for line in traffic.lines(1000 * MS)}
+    lines = {line.key: line for line in traffic.measure_keys(1000 * MS)}
     joints = lines[keys.JOINTS]
     assert joints.robot == "lab/worm"
     assert joints.writer == "HAL"
@@ -39,7 +43,7 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
     assert joints.jitter_ms == pytest.approx(0.0, abs=1e-9)
     assert joints.received_ago_s == pytest.approx(0.01)
     assert joints.age_ms == pytest.approx(20.0)
-    (latency,) = traffic.latencies()
+    (latency,) = traffic.measure_latencies()
     assert (latency.arrival_median_ms, latency.arrival_p99_ms, latency.count) == pytest.approx((3.0, 3.0, 100))
 
 
@@ -48,9 +52,9 @@ def test_top_foreign_keys_are_bounded_and_harmless_to_terminal() -> None:
     traffic.add(Arrival("sensor/joints", b"noise", format_encoding(JointState), 0))
     for i in range(MAX_KEYS + 10):
         traffic.add(Arrival(f"evil/{i}", b"x", "", i))
-    for i in range(2 * MAX_ARRIVALS):
+    for i in range(2 * MAX_ARRIVAL_TIMES):
         traffic.add(Arrival("evil/0", b"x", "", i * MS))
-    lines = traffic.lines(MS)
+    lines = traffic.measure_keys(MS)
     assert len(lines) == MAX_KEYS
     assert traffic.keys_left_out == 11
     assert lines[0].failure == "malformed"
@@ -61,13 +65,13 @@ def test_top_foreign_keys_are_bounded_and_harmless_to_terminal() -> None:
 
 
 def test_a_table_for_scripts_from_a_real_network() -> None:
-    endpoint, over = free_endpoint(), threading.Event()
+    endpoint, over = find_free_endpoint(), threading.Event()
     lines: list[str] = []
 
     def tell_time(session: Session) -> None:
-        publisher = session.publisher(keys.CLOCK, Clock)
+        publisher = session.declare_publisher(keys.CLOCK, Clock)
         for tick in itertools.count():
-            publisher.put(clock(tick))
+            publisher.put(make_clock(tick))
             if over.wait(0.02):
                 return
 
@@ -75,7 +79,7 @@ def test_a_table_for_scripts_from_a_real_network() -> None:
         teller = threading.Thread(target=tell_time, args=(session,))
         teller.start()
         try:
-            assert top(RobotSelection(endpoint), lines.append, once=True, as_json=True) == 0
+            assert show_traffic(RobotSelection(endpoint), lines.append, once=True, as_json=True) == 0
         finally:
             over.set()
             teller.join()

@@ -65,9 +65,9 @@ def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
     record = recorded.record
     begin_s, end_s = recorded.span_s
     assert end_s - begin_s == pytest.approx(0.99, abs=0.03)
-    moment = recorded.snapshot_at(begin_s + 0.5)
-    row = record.row_at(begin_s + 0.5)
-    drawing, nodes = draw(moment, Surroundings(record.config)), record.nodes_w(row)
+    moment = recorded.make_snapshot(begin_s + 0.5)
+    row = record.find_nearest_row(begin_s + 0.5)
+    drawing, nodes = draw(moment, Surroundings(record.config)), record.find_body_points_w(row)
     assert drawing is not None
     assert nodes is not None
     assert drawing.hinges_w == pytest.approx(nodes[1:-1])

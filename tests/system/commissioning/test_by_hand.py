@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from snakesim_testing.runs.bench import host
-from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.command import run_in_background, running_snakesim
 from snakesim_testing.runs.hand_turned_robot import BACKEND, JOINTS, make_hand_turned_folder, robot, seen
 from snakesim_testing.runs.in_process_command import snakesim
 
@@ -31,7 +31,7 @@ def set_joint_angles(home: Path, joints_rad: Sequence[float]) -> None:
 
 def calibrating(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
     """A command that somebody answers by moving joints and pressing Enter."""
-    return background(home, "robot", "calibrate", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
+    return run_in_background(home, "robot", "calibrate", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
 
 
 def read_output_line(process: subprocess.Popen[str]) -> str:
@@ -103,13 +103,13 @@ def swapped(home: Path, endpoint: str) -> str:
 def test_by_hand_refuses_armed_robot_shipped_file_and_unknown_joint(home: Path) -> None:
     set_joint_angles(home, [0.0] * JOINTS)
     before = (home / "snake.toml").read_bytes()
-    with running(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:
+    with running_snakesim(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:
         run.wait_for(" of 600 s")  # armed
         for words, code, why in (
             (("zero", "snake.toml", "--now"), 1, "snakesim robot disarm"),
             (("zero", "planar13", "--now"), 2, "your own robot file"),
             (("limits", "snake.toml", "joint_9"), 2, "joint_1 to joint_4"),
         ):
-            refused = run.tell("robot", "calibrate", *words)
+            refused = run.run_tool("robot", "calibrate", *words)
             assert refused.code == code and why in refused.err, refused.printed
     assert (home / "snake.toml").read_bytes() == before

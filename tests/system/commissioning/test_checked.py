@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.runs.checked_robot import JOINTS, make_checked_folder
-from snakesim_testing.runs.command import Ended, snakesim
+from snakesim_testing.runs.command import CompletedRun, snakesim
 
 
 @pytest.fixture
@@ -14,8 +14,8 @@ def home(tmp_path: Path) -> Path:
     return make_checked_folder(tmp_path)
 
 
-def run(home: Path, out: str, *words: str) -> Ended:
-    flags = ("--backend", "./real.py:Real", "--out", out, "--endpoint", free_endpoint())
+def run(home: Path, out: str, *words: str) -> CompletedRun:
+    flags = ("--backend", "./real.py:Real", "--out", out, "--endpoint", find_free_endpoint())
     return snakesim("run", "bench.toml", *flags, *words, cwd=home)
 
 

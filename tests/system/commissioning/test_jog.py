@@ -12,7 +12,7 @@ import pytest
 
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.bench import host
-from snakesim_testing.runs.command import background
+from snakesim_testing.runs.command import run_in_background
 from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, read_setpoints, stopped
 
 REPEAT_S = 0.03  # of a key
@@ -30,7 +30,7 @@ def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], 
     """The command, once it is armed, and the other end of its terminal."""
     (ours, theirs), words = pty.openpty(), ("robot", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
     try:
-        with background(home, *words, stdin=theirs) as process:
+        with run_in_background(home, *words, stdin=theirs) as process:
             assert process.stdout is not None
             process.stdout.readline()  # "joint_2: from ...", once it is armed
             yield process, ours

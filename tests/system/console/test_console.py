@@ -9,21 +9,21 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from snakesim_hal.model.scenario import load
+from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, JointState, Status
-from snakesim_operator.features.console.operations import Operations, PageLog
+from snakesim_operator.features.console.operations import PageLog, RobotOperations
 from snakesim_operator.features.console.page.page import Page
 from snakesim_operator.features.console.robot_data.snapshot import make_expected_snapshot
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.page import origin_of
-from snakesim_testing.harness.processes import nothing_left, processes_with
+from snakesim_testing.harness.processes import assert_no_process_left, find_processes_with
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, Tab, chromium
+from snakesim_testing.operator.browser import CHROMIUM, MISSING, Tab, open_chromium
 from snakesim_testing.operator.ready_stop import ReadyStop
-from snakesim_testing.operator.served_console import served_console
-from snakesim_testing.runs.command import Running, running
+from snakesim_testing.operator.served_console import running_console
+from snakesim_testing.runs.command import Running, running_snakesim
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
@@ -50,7 +50,7 @@ def fastest_rad_s(joints: JointState) -> float:
 
 @pytest.mark.quiet
 def test_console_page_shows_moving_snake_and_escape_stops_it(tmp_path: Path) -> None:
-    with chromium() as browser, running(tmp_path / "run", *RUN) as run:
+    with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
         began_s = time.monotonic()
         address = run.console()
         told_after_s = time.monotonic() - began_s
@@ -82,7 +82,7 @@ TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab
 
 def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
-    with served_console(ReadyStop()) as (server, address), chromium() as browser:
+    with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
         Page(server, None, None, PageLog(), recorded="a run")
         page = browser.open("about:blank", *SMALL)
         for prefers in ("light", "dark"):
@@ -102,9 +102,9 @@ def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
 @pytest.mark.slow
 def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
     """And a wide screen shows the tabs in one line."""
-    config, log = load("triplet").config, PageLog()
-    with served_console(ReadyStop()) as (server, address), chromium() as browser:
-        Page(server, None, Operations(Link(free_endpoint(), "planar13"), log), log).show_snapshot(
+    config, log = load_scenario("triplet").config, PageLog()
+    with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
+        Page(server, None, RobotOperations(Link(find_free_endpoint(), "planar13"), log), log).show_snapshot(
             make_expected_snapshot(config)
         )
         page = browser.open(address, 400, 800, 0.5)
@@ -123,7 +123,7 @@ def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
 @pytest.mark.slow
 def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -> None:
     """On the page of the signals, which has the second stop and draws no scene."""
-    with chromium() as browser, running(tmp_path / "run", *RUN) as run:
+    with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
         address = run.console()
         origin = origin_of(address)
         port = origin.rpartition(":")[2]
@@ -136,7 +136,7 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
         page.wait_for("Self-test: ready")
         assert SILENT not in page.text()
         with open_session(Link(run.endpoint, "planar13")) as session:
-            status = session.latest(keys.STATUS, Status, 10.0)
+            status = session.wait_for_latched(keys.STATUS, Status, 10.0)
             assert status is not None and status.lifecycle != "estop", "another site has stopped the robot"
             front = console_process(run, ".front")
             os.kill(front, signal.SIGSTOP)
@@ -152,7 +152,7 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
                 page.wait_for("planar13: stopped")
             finally:
                 os.kill(pages, signal.SIGCONT)
-            assert session.latest(keys.STATUS, Status, 10.0, lambda one: one.lifecycle == "estop") is not None
+            assert session.wait_for_latched(keys.STATUS, Status, 10.0, lambda one: one.lifecycle == "estop") is not None
 
 
 # What another site tries, if it knows the token.
@@ -167,13 +167,13 @@ ANOTHER_SITE = """
 
 def console_process(run: Running, part: str = "") -> int:
     """Return the process id of the pages, or of the front server."""
-    found = processes_with("cmdline", f"snakesim_operator.features.console{part}\0")
+    found = find_processes_with("cmdline", f"snakesim_operator.features.console{part}\0")
     return next(pid for pid, line in found if f"\0{run.endpoint}\0" in line)
 
 
 @pytest.mark.slow
 def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
-    with chromium() as browser, running(tmp_path / "run", *RUN) as run:
+    with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
         address = run.console()
         first = browser.open(address, *SMALL)
         first.wait_for("Take control")
@@ -200,7 +200,7 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
         assert not first.errors and not second.errors, first.errors + second.errors
         run.process.terminate()
         run.end()
-    nothing_left(tmp_path / "run")
+    assert_no_process_left(tmp_path / "run")
 
 
 def change_settings(tab: Tab, run: Running) -> None:
@@ -210,7 +210,7 @@ def change_settings(tab: Tab, run: Running) -> None:
     tab.type("amplitude_rad, rad", "0.4")
     tab.click("Apply")
     with open_session(Link(run.endpoint, "planar13")) as session:
-        in_force = session.latest(
+        in_force = session.wait_for_latched(
             keys.PARAMETERS_IN_FORCE, ControlParameters, 10.0, lambda one: one.requester == "viewer 1"
         )
     assert in_force is not None
@@ -220,11 +220,14 @@ def change_settings(tab: Tab, run: Running) -> None:
 def stop_in(tab: Tab, run: Running) -> float:
     """Press the emergency stop's key in a page; seconds until the motors are off. Then the joints coast to rest."""
     with open_session(Link(run.endpoint, "planar13")) as session:
-        joints, status = session.reader(keys.JOINTS, JointState), session.latched_reader(keys.STATUS, Status)
+        joints, status = (
+            session.declare_reader(keys.JOINTS, JointState),
+            session.declare_latched_reader(keys.STATUS, Status),
+        )
         wait_until(lambda: any(fastest_rad_s(one) > 0.05 for one in joints.drain()), "moving joints")
         pressed_s = time.monotonic()
         tab.press("Escape", 27)
-        wait_until(lambda: status.newest(lambda one: one.lifecycle == "estop") is not None, "the stop")
+        wait_until(lambda: status.pop_newest(lambda one: one.lifecycle == "estop") is not None, "the stop")
         stopped_after_s = time.monotonic() - pressed_s
         joints.drain()
         from_ns, recent = None, deque[float](maxlen=5)

@@ -13,7 +13,7 @@ from snakesim_testing.operator.console_wait import LIMIT_S, until
 from snakesim_testing.operator.viewer import Viewer, viewing
 from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.checked_robot import make_checked_folder
-from snakesim_testing.runs.command import background, running
+from snakesim_testing.runs.command import run_in_background, running_snakesim
 from snakesim_testing.runs.hand_turned_robot import robot
 from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, read_setpoints, stopped
 
@@ -35,7 +35,7 @@ def bench(tmp_path: Path) -> Path:
 
 
 def test_console_arms_unchecked_robot_only_by_explicit_confirmation(home: Path) -> None:
-    with running(home / "run", *RUN) as run:
+    with running_snakesim(home / "run", *RUN) as run:
         asyncio.run(asyncio.wait_for(arm_unchecked(run.console()), 2 * LIMIT_S))
 
 
@@ -63,7 +63,7 @@ async def arm_unchecked(address: str) -> None:
 @contextmanager
 def console(home: Path, endpoint: str) -> Iterator[str]:
     """The address of one that may write into the robot file."""
-    with background(home, "console", "--endpoint", endpoint, "--commission", "snake.toml") as process:
+    with run_in_background(home, "console", "--endpoint", endpoint, "--commission", "snake.toml") as process:
         assert process.stdout is not None
         yield process.stdout.readline().split()[1]
 

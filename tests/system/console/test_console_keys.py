@@ -11,7 +11,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Intent, Status, Trajectory
 from snakesim_testing.operator.console_wait import LIMIT_S, until
 from snakesim_testing.operator.viewer import Viewer, viewing
-from snakesim_testing.runs.command import running
+from snakesim_testing.runs.command import running_snakesim
 
 pytestmark = pytest.mark.e2e
 REPEAT_S = 0.04  # of a held key
@@ -19,7 +19,7 @@ RUN = ("peg_row", "--clock-mode", "realtime", "--duration", "600", "--stay", "--
 
 
 def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *RUN) as run:
+    with running_snakesim(tmp_path / "run", *RUN) as run:
         asyncio.run(asyncio.wait_for(drive_and_stop(run.console(), run.endpoint), 2 * LIMIT_S))
 
 
@@ -30,8 +30,11 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
         watching = asyncio.create_task(other.watch())
         await until(lambda: other.shows("armed by snakesim run"), "an armed robot")
         with open_session(Link(endpoint, "planar13")) as session:
-            intents, paths = session.reader(keys.INTENT, Intent), session.reader(keys.TRAJECTORY, Trajectory)
-            status = session.latched_reader(keys.STATUS, Status)
+            intents, paths = (
+                session.declare_reader(keys.INTENT, Intent),
+                session.declare_reader(keys.TRAJECTORY, Trajectory),
+            )
+            status = session.declare_latched_reader(keys.STATUS, Status)
             async with viewing(address) as mine:
                 driver = Viewer(mine)
                 await driver.come()
@@ -52,11 +55,11 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
                 )
                 await hold(driver, "Drive: backwards", lambda: any((i.speed_m_s or 0) < 0 for i in intents.drain()))
             await driving  # the page is closed while its key is held
-            stopped = await until(lambda: paths.newest(lambda path: path.speed_m_s == 0), "a robot told to stand")
+            stopped = await until(lambda: paths.pop_newest(lambda path: path.speed_m_s == 0), "a robot told to stand")
             assert "viewer 2" in stopped.reason
             await until(lambda: other.shows("no viewer has control"), "the return of control")
             await other.trigger("Emergency stop")
-            await until(lambda: status.newest(lambda one: one.lifecycle == "estop"), "the stop")
+            await until(lambda: status.pop_newest(lambda one: one.lifecycle == "estop"), "the stop")
             await until(lambda: other.shows(">ESTOP<"), "the stop on the page")
         watching.cancel()
 

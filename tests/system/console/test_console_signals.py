@@ -10,13 +10,13 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.report import page
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_operator.results.report import render_report
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import summarise
+from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, Browser, Tab, chromium
+from snakesim_testing.operator.browser import CHROMIUM, MISSING, Browser, Tab, open_chromium
 from verification.screenshots import recording
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
@@ -43,11 +43,11 @@ def cells(tab: Tab) -> dict[str, list[str]]:
 
 @pytest.mark.slow
 def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: Path) -> None:
-    simulate(load("triplet", [parse_set("duration_s=2")]).config, tmp_path / "run")
+    simulate(load_scenario("triplet", [parse_set_option("duration_s=2")]).config, tmp_path / "run")
     record = RunRecord.load(tmp_path / "run")
     angle = record.angle_rad[:, 4]
     measured, wanted = "angle_rad.joint_5, rad", "control.reference_rad.joint_5, rad"
-    with recording(str(tmp_path / "run"), 1.0) as address, chromium() as browser:
+    with recording(str(tmp_path / "run"), 1.0) as address, open_chromium() as browser:
         tab = browser.open(f"{address.rstrip('/')}/signals", 800, 900)
         tab.wait_for(" signals")
         tab.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
@@ -61,7 +61,7 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
         wait_until(lambda: cells(tab).get(measured, ["–"])[0] != "–", "values")
         said = cells(tab)
         assert [float(value) for value in said[measured]] == pytest.approx(
-            [angle[record.row_at(1.0)], angle.min(), angle.mean(), angle.max()], rel=1e-3, abs=1e-3
+            [angle[record.find_nearest_row(1.0)], angle.min(), angle.mean(), angle.max()], rel=1e-3, abs=1e-3
         )
         assert said[wanted][0] != "–"
 
@@ -98,7 +98,7 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
 
 def labels_of_the_report_are_read_on_a_phone(browser: Browser, record: RunRecord, folder: Path) -> None:
     """Those of the scales in its drawings; a browser is there, and so is a run."""
-    (folder / "report.html").write_text(page(record, summarise(record, "complete")), encoding="utf-8")
+    (folder / "report.html").write_text(render_report(record, summarize_run(record, "complete")), encoding="utf-8")
     phone = browser.open((folder / "report.html").as_uri(), 400, 900)
     phone.size(400, 900, mobile=True)
     phone.wait_for("Playback")

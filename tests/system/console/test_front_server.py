@@ -13,11 +13,11 @@ import pytest
 from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
 from snakesim_operator.features.console.front import front_server
 from snakesim_operator.features.console.front.front_server import REQUESTER, FrontServer
-from snakesim_operator.features.console.front.requests import BadRequest, FrontRequest, check_head
+from snakesim_operator.features.console.front.requests import BadRequest, FrontRequest, parse_and_authorize_head
 from snakesim_operator.robot_commands.prepared_stop import StopReadiness
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
-from snakesim_testing.operator.served_console import fronted
+from snakesim_testing.operator.served_console import running_front_server
 
 FEW = 4
 HALF = (b"", b"GET / HTTP/1.1\r\nHost: ", b"POST /stop HTTP/1.1\r\n")
@@ -55,7 +55,7 @@ class Client:
 
 @contextmanager
 def front(stop: ReadyStop | None) -> Iterator[Client]:
-    with open_console_ports(None) as ports, fronted(ports, stop) as server:
+    with open_console_ports(None) as ports, running_front_server(ports, stop) as server:
         yield Client(ports, server)
 
 
@@ -128,9 +128,9 @@ class BrokenStop(ReadyStop):
         super().__init__()
         self.errors: list[Exception] = [OSError(errno.EMFILE, "Too many open files"), KeyError("uid")]
 
-    def request(self, requester: str) -> "Future[str]":
+    def request_stop(self, requester: str) -> "Future[str]":
         if not self.errors:
-            return super().request(requester)
+            return super().request_stop(requester)
         error = self.errors.pop(0)
         if isinstance(error, KeyError):
             raise error
@@ -150,8 +150,8 @@ def test_an_error_of_a_stop_is_its_answer_and_the_next_stop_is_carried_out() -> 
 class UnreadyStop(ReadyStop):
     """Its self-test fails."""
 
-    def readiness(self) -> StopReadiness:
-        return StopReadiness(ready=False, text="the robot's host does not answer")
+    def check_readiness(self) -> StopReadiness:
+        return StopReadiness(is_ready=False, text="the robot's host does not answer")
 
 
 def test_ready_is_what_the_self_test_reports() -> None:
@@ -161,7 +161,7 @@ def test_ready_is_what_the_self_test_reports() -> None:
 
 def check(first_line: str, *headers: str) -> FrontRequest | BadRequest:
     """Check a request to a console with the token `secret`."""
-    return check_head("\r\n".join([first_line, *headers, "", ""]).encode(), "secret")
+    return parse_and_authorize_head("\r\n".join([first_line, *headers, "", ""]).encode(), "secret")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from snakesim_operator.features.console.web.message_age import MAX_UNANSWERED, M
 from snakesim_testing.harness.page import Page
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
-from snakesim_testing.operator.served_console import served_console
+from snakesim_testing.operator.served_console import running_console
 
 HZ = 10.0
 VIEWER = 3
@@ -98,7 +98,7 @@ def test_answers_that_nobody_asked_for_make_nothing_younger() -> None:
 def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
     done: list[str] = []
     late: list[float] = []
-    with served_console(ReadyStop()) as (server, _):
+    with running_console(ReadyStop()) as (server, _):
         admission = Admission()
         group = server.gui.add_button_group("Robot", ("Arm", "Disarm"))
         hold = server.gui.add_button("Hold")
@@ -107,11 +107,11 @@ def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
         def note(what: str) -> Any:
             return lambda viewer, _action: done.append(f"{what} {viewer}")
 
-        admission.admit(
+        admission.admit_control(
             group, VIEWER, handler=note("group"), max_age_s=MAX_PRESS_AGE_S, at_any_age=("Disarm",), on_late=late.append
         )
-        admission.admit(hold, VIEWER, hold_hz=HZ, handler=note("hold"), max_age_s=MAX_HOLD_AGE_S)
-        admission.admit(stop, handler=note("stop"))
+        admission.admit_control(hold, VIEWER, hold_hz=HZ, handler=note("hold"), max_age_s=MAX_HOLD_AGE_S)
+        admission.admit_control(stop, handler=note("stop"))
         messages = {
             "arm": _update(group, "Arm"),
             "disarm": _update(group, "Disarm"),
@@ -123,16 +123,16 @@ def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
         for age, asked_s in ((old, time.monotonic() - 14.0), (fresh, time.monotonic())):
             age.note_question("question", asked_s, 0)
             answer = {"type": "LocalStorageGetItemResponseMessage", "request_uuid": "question"}
-            admission.check_message(VIEWER, msgspec.msgpack.encode(answer | {"value": None, "error": None}), age)
+            admission.filter_message(VIEWER, msgspec.msgpack.encode(answer | {"value": None, "error": None}), age)
         for name in raw:
-            assert admission.check_message(VIEWER, raw[name], old) is None
+            assert admission.filter_message(VIEWER, raw[name], old) is None
         assert done == [f"group {VIEWER}", f"stop {VIEWER}"], "to disarm and to stop"
         assert len(late) == 1
         assert late[0] == pytest.approx(14.0, abs=1.0)
         assert admission.dropped["too old"] == 2
         done.clear()
         for name in raw:
-            assert admission.check_message(VIEWER, raw[name], fresh) is None
+            assert admission.filter_message(VIEWER, raw[name], fresh) is None
         assert [name.split()[0] for name in done] == ["group", "group", "hold", "stop"]
 
 
@@ -142,15 +142,15 @@ def _update(handle: Any, value: object) -> dict[str, Any]:
 
 def test_console_page_without_scene_may_view_and_stop() -> None:
     stopped: list[int] = []
-    with served_console(ReadyStop()) as (server, address):
+    with running_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("EMERGENCY STOP  (Esc)")
-        server.admission.admit(button, handler=lambda viewer, _action: stopped.append(viewer))
+        server.admission.admit_control(button, handler=lambda viewer, _action: stopped.append(viewer))
         with Page(address, draws=False) as page:
             page.click("EMERGENCY STOP  (Esc)")
             wait_until(lambda: stopped == [0], "the stop", 10.0)
-            assert server.viewers() == 1
+            assert server.count_viewers() == 1
             assert not server.get_clients()
-        wait_until(lambda: server.viewers() == 0, "its end", 10.0)
+        wait_until(lambda: server.count_viewers() == 0, "its end", 10.0)
 
 
 def test_a_real_page_answers_what_it_is_asked(capfd: pytest.CaptureFixture[str]) -> None:
@@ -161,9 +161,9 @@ def test_a_real_page_answers_what_it_is_asked(capfd: pytest.CaptureFixture[str])
         if len(ages) == 1:
             raise RuntimeError(f"unexpected, of viewer {viewer}")
 
-    with served_console(ReadyStop()) as (server, address):
+    with running_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("Go")
-        server.admission.admit(button, handler=act)
+        server.admission.admit_control(button, handler=act)
         with Page(address) as page:
             wait_until(lambda: server.get_clients(), "a viewer", 10.0)
             page.click("Go")

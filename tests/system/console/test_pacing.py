@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from snakesim_testing.operator.served_console import served_console
+from snakesim_testing.operator.served_console import running_console
 from snakesim_testing.operator.viewer import ASKED, Viewer, viewing
 
 CHANGES = 200
@@ -13,7 +13,7 @@ LIMIT_S = 20.0
 
 
 def test_a_slow_page_gets_the_newest_state_only() -> None:
-    with served_console() as (server, address):
+    with running_console() as (server, address):
         text = server.gui.add_text("Tick", "0")
 
         async def slow() -> list[str]:
@@ -35,7 +35,7 @@ def test_a_slow_page_gets_the_newest_state_only() -> None:
 
 
 def test_a_page_that_keeps_up_gets_every_change() -> None:
-    with served_console() as (server, address):
+    with running_console() as (server, address):
         text = server.gui.add_text("Tick", "")
 
         async def quick() -> list[str]:

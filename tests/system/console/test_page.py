@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.model.scenario import capsules_at_start, load
+from snakesim_hal.model.scenario import load_scenario, make_start_capsules
 from snakesim_operator.base.console_port import open_console_ports, open_port
 from snakesim_operator.base.page_origin import explain_refusal
 from snakesim_operator.features.console.control_token import ControlToken
@@ -18,10 +18,10 @@ from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import draw
 from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.serve import serve_pages
-from snakesim_testing.hal.small_robots import description, status
+from snakesim_testing.hal.small_robots import make_description, make_status
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
-from snakesim_testing.operator.served_console import fronted, served_console
+from snakesim_testing.operator.served_console import running_console, running_front_server
 from snakesim_testing.operator.viewer import watch
 
 
@@ -53,7 +53,7 @@ def test_a_browser_that_comes_before_the_page_gets_it():
             viewers = [threading.Thread(target=come, args=(ports.address,)) for _ in range(3)]
             for viewer in viewers:
                 viewer.start()
-            with fronted(ports, None), serve_pages(ports.pages, has_stop=False) as server:
+            with running_front_server(ports, None), serve_pages(ports.pages, has_stop=False) as server:
                 assert early.recv(15) == b"HTTP/1.1 200 OK"
                 wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
         for viewer in viewers:
@@ -65,7 +65,7 @@ def come(address: str) -> None:
 
 
 def test_nobody_can_open_a_tunnel_to_the_internet():
-    with served_console() as (server, _):
+    with running_console() as (server, _):
         assert server.request_share_url() is None
 
 
@@ -85,9 +85,9 @@ def test_control_is_taken_while_free_and_never_taken_away():
 
 def test_text_from_the_network_is_no_markup():
     evil = "<img src=x onerror=alert(1)>\x1b[2J"
-    robot = description()
+    robot = make_description()
     named = {"lease_holder": evil[:40], "alive": [evil[:40]], "waiting_for": [evil[:40]]}
-    reported = status(lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named)
+    reported = make_status(lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named)
     snapshot = RobotSnapshot(robot=robot, status=reported)
     shown = page_html.format_header(snapshot) + page_html.format_state_table(snapshot) + page_html.format_log([evil])
     assert "<img" not in shown
@@ -96,18 +96,18 @@ def test_text_from_the_network_is_no_markup():
 
 
 def test_page_says_that_simulator_is_paused_and_by_whom():
-    shown = page_html.format_header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
+    shown = page_html.format_header(RobotSnapshot(robot=make_description(), status=make_status(paused_by="<b>ada")))
     assert ">PAUSED<" in shown
     assert "by &lt;b&gt;ada" in shown
-    assert "PAUSED" not in page_html.format_header(RobotSnapshot(robot=description(), status=status()))
+    assert "PAUSED" not in page_html.format_header(RobotSnapshot(robot=make_description(), status=make_status()))
 
 
 def test_page_draws_an_expected_robot_at_its_start():
-    config = load("triplet").config
+    config = load_scenario("triplet").config
     snapshot = make_expected_snapshot(config)
     drawing = draw(snapshot, None)
     assert drawing is not None
-    start = capsules_at_start(config)
+    start = make_start_capsules(config)
     middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
     assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
     assert "WAITING FOR THE ROBOT" in page_html.format_header(snapshot)
@@ -124,7 +124,7 @@ def test_page_draws_an_expected_robot_at_its_start():
     ],
 )
 def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
-    robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)
+    robot = msgspec.structs.replace(make_description(), backend=backend, emulated=emulated)
     assert f">{words}<" in page_html.format_header(RobotSnapshot(robot=robot))
 
 

@@ -6,18 +6,18 @@ from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import M_PER_N, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
-from snakesim_testing.hal.small_robots import description
+from snakesim_testing.hal.small_robots import make_description
 from snakesim_testing.operator.drawn_samples import contact, joints, pushing, world
-from snakesim_testing.operator.served_console import served_console
+from snakesim_testing.operator.served_console import running_console
 
 
 def test_scene_force_without_contact_is_dashed_until_contact():
     point = contact((0.0, 10.0, 0.0))
     control = pushing([point], [10.0])
-    with served_console() as (server, _):
-        scene = RobotScene(server.scene, description(), None)
+    with running_console() as (server, _):
+        scene = RobotScene(server.scene, make_description(), None)
         for felt in ([], [point], []):
-            snapshot = RobotSnapshot(robot=description(), body=joints(), world=world(felt, []), control=control)
+            snapshot = RobotSnapshot(robot=make_description(), body=joints(), world=world(felt, []), control=control)
             drawing = draw(snapshot, None)
             assert drawing is not None
             scene.show(drawing)
@@ -35,10 +35,10 @@ def test_scene_perceived_shapes_are_drawn_until_forgotten():
         Obstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, touched=True),
         Obstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), touched=True),
     ]
-    with served_console() as (server, _):
-        scene = RobotScene(server.scene, description(), None)
+    with running_console() as (server, _):
+        scene = RobotScene(server.scene, make_description(), None)
         for obstacles in (found, []):
-            drawing = draw(RobotSnapshot(robot=description(), body=joints(), world=world([], obstacles)), None)
+            drawing = draw(RobotSnapshot(robot=make_description(), body=joints(), world=world([], obstacles)), None)
             assert drawing is not None
             scene.show(drawing)
             shown = list(scene._perceived_obstacles.meshes.batches.values())

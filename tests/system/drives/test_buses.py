@@ -11,9 +11,9 @@ from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.mixed import MixedBackend, MixedSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import ClockMode, Mode
-from snakesim_testing.benches.emulated_drives import DrivesOfAnyFamily
+from snakesim_testing.benches.emulated_drives import DrivesOfAnyType
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
@@ -28,7 +28,7 @@ class Robot(DriveRig):
 
     def __init__(self, clock_mode: ClockMode = "lockstep", body: str = "odrive", **driver_types: Any) -> None:
         fixed = {name: {"bring_up_limit_s": 2.0} | driver_types.get(name, {}) for name in (body, "dynamixel")}
-        config = run_config(
+        config = make_run_config(
             backend="mixed",
             robot__chain__modules=4,
             robot__drive=HEAD[0] | {"driver": body},
@@ -52,11 +52,11 @@ class Robot(DriveRig):
         return {axis.state == AxisState.CLOSED_LOOP for axis in self.axes._emulator.axes}
 
     def servos_follow(self) -> set[bool]:
-        return {servo.on for servo in self.servos._emulator.servos}
+        return {servo.is_torque_on for servo in self.servos._emulator.servos}
 
     def enabled(self) -> list[bool]:
         """Of every drive, in truth."""
-        return DrivesOfAnyFamily(self.backend).enabled()
+        return DrivesOfAnyType(self.backend).list_enabled()
 
     def arm(self) -> None:
         """Until every drive is on, and the driver has no clear left to carry out: a busy computer makes faults."""
@@ -66,13 +66,13 @@ class Robot(DriveRig):
                 self.run(1, "disarmed")
                 time.sleep(0.05)
                 return False
-            return all(self.enabled()) and self.backend._grace_cycles <= 0
+            return all(self.enabled()) and self.backend._remaining_grace_cycles <= 0
 
         wait_until(is_armed, "arms", 20.0)
 
     def freeze_driver(self, seconds: float) -> None:
         """The driver's threads can do nothing for so long; its drives' time passes."""
-        DrivesOfAnyFamily(self.backend).freeze_driver(seconds, time.sleep)
+        DrivesOfAnyType(self.backend).freeze_driver(seconds, time.sleep)
 
 
 Opens = Callable[..., Robot]
@@ -249,7 +249,7 @@ def test_drives_that_stop_while_driver_is_frozen_stay_off(opened: Opens, body: s
         return named == {f"joint_{i + 1}" for i in range(4)}
 
     wait_until(all_are_named, "a fault of every drive", 10.0)
-    wait_until(lambda: (robot.run(1, "disarmed") and False) or not robot.backend._driven, "cleared", 10.0)
+    wait_until(lambda: (robot.run(1, "disarmed") and False) or not robot.backend._driven_joints, "cleared", 10.0)
     robot.arm()
 
 
@@ -282,7 +282,7 @@ def test_bus_thread_error_ends_run_and_disables_all_drives(opened: Opens) -> Non
 )
 def test_mixed_robot_errors_name_joint_family_and_section(changes: dict[str, Any]) -> None:
     fixed: dict[str, Any] = {"robot__drive": HEAD[0], "robot__joints": HEAD[1]}
-    config = run_config(**{"backend": "mixed", "robot__chain__modules": 4, "rate_hz": 100, **fixed, **changes})
+    config = make_run_config(**{"backend": "mixed", "robot__chain__modules": 4, "rate_hz": 100, **fixed, **changes})
     with raises_error(
         ConfigError,
         code=(
@@ -298,5 +298,5 @@ def test_mixed_robot_errors_name_joint_family_and_section(changes: dict[str, Any
 
 
 def test_ids_are_those_of_a_family_on_a_port() -> None:
-    config = run_config(robot__drive=HEAD[0], robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}})
+    config = make_run_config(robot__drive=HEAD[0], robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}})
     assert [joint.id for joint in config.robot.joint_table][:3] == [1, 2, 1]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.benches.workbench import text_of_the_example
+from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.runs.bench import host, lab_folder
 from snakesim_testing.runs.hand_turned_robot import BACKEND, HELD, JOINTS, SCENARIO, robot, seen
 from snakesim_testing.runs.in_process_command import snakesim
@@ -27,7 +27,7 @@ def why(home: Path, endpoint: str) -> str:
 
 
 def test_cable_turn_forgotten_by_its_drive_is_not_repeated(tmp_path: Path) -> None:
-    held = text_of_the_example().replace("emulated=True", "emulated=False") + HELD
+    held = read_example_from_docs().replace("emulated=True", "emulated=False") + HELD
     with (lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": held}) / "snake.toml").open("a") as file:
         file.write(ENDLESS)
     drives(tmp_path, 0.0)

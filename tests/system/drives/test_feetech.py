@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snakesim
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.command import SNAKESIM_COMMAND, CompletedRun, make_environment, snakesim
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import HURRIED
 from snakesim_testing.runs.servo_row import write_servo_row
@@ -30,9 +30,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     printed = folder / "servos.log"
     with printed.open("wb") as file:
         servos = subprocess.Popen(
-            [*first, *SNAKESIM, "drive", "emulate", "feetech", "row.toml", "--channel", "servos"],
+            [*first, *SNAKESIM_COMMAND, "drive", "emulate", "feetech", "row.toml", "--channel", "servos"],
             cwd=folder,
-            env=environment(folder),
+            env=make_environment(folder),
             stdout=file,
             stderr=file,
         )
@@ -52,9 +52,11 @@ def scan_torques(folder: Path) -> list[str]:
     return re.findall(r" rad +(on|off) ", found.out)
 
 
-def run(folder: Path, *arguments: str) -> Ended:
+def run(folder: Path, *arguments: str) -> CompletedRun:
     """Run the scenario, which holds its pose."""
-    return snakesim("run", "row.toml", "--backend", "feetech", "--endpoint", free_endpoint(), *arguments, cwd=folder)
+    return snakesim(
+        "run", "row.toml", "--backend", "feetech", "--endpoint", find_free_endpoint(), *arguments, cwd=folder
+    )
 
 
 def test_external_servos_are_detected_and_driven_and_off_afterwards(folder: Path) -> None:
@@ -77,16 +79,16 @@ def test_servos_hold_while_host_is_frozen_and_are_off_once_it_resumes(folder: Pa
 
 
 def test_servos_keep_their_torque_when_host_is_killed_and_the_next_start_switches_it_off(folder: Path) -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     printed = folder / "host.log"
     programs: list[subprocess.Popen[bytes]] = []
 
     def start(log: Path, *arguments: str) -> subprocess.Popen[bytes]:
         with log.open("wb") as file:
             program = subprocess.Popen(
-                [*SNAKESIM, *arguments, "--endpoint", endpoint],
+                [*SNAKESIM_COMMAND, *arguments, "--endpoint", endpoint],
                 cwd=folder,
-                env=environment(folder),
+                env=make_environment(folder),
                 stdout=file,
                 stderr=file,
             )

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import simulate
 
@@ -14,7 +14,7 @@ MIXED = ["joint_3.zero_rad=0.5", "joint_4.sign=-1", "joint_5.gear=1.5", "joint_5
 
 def simulate_peg_row(*sets: str, backend: str = "can", duration_s: float = 1.2) -> RunSummary:
     fixed = (f"backend={backend}", f"duration_s={duration_s}")
-    return simulate(load("peg_row", [parse_set(text) for text in (*fixed, *sets)]).config).summary
+    return simulate(load_scenario("peg_row", [parse_set_option(text) for text in (*fixed, *sets)]).config).summary
 
 
 @pytest.fixture(scope="module")

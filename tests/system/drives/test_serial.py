@@ -11,8 +11,8 @@ import pytest
 
 from snakesim_hal.network.free_ports import find_free_port
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.command import SNAKESIM, Ended, environment, snakesim
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.command import SNAKESIM_COMMAND, CompletedRun, make_environment, snakesim
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import HURRIED
 from snakesim_testing.runs.servo_row import write_servo_row
@@ -36,9 +36,20 @@ def pose(folder: Path) -> Iterator[str]:
     output, first = folder / "servos.log", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
     with output.open("wb") as file:
         servos = subprocess.Popen(
-            [*first, *SNAKESIM, "drive", "emulate", "dynamixel", "triplet", "--channel", "servos", "--pose", address],
+            [
+                *first,
+                *SNAKESIM_COMMAND,
+                "drive",
+                "emulate",
+                "dynamixel",
+                "triplet",
+                "--channel",
+                "servos",
+                "--pose",
+                address,
+            ],
             cwd=folder,
-            env=environment(folder),
+            env=make_environment(folder),
             stdout=file,
             stderr=file,
         )
@@ -51,12 +62,12 @@ def pose(folder: Path) -> Iterator[str]:
     assert not (folder / "servos").is_symlink(), "its name is taken away"
 
 
-def run(folder: Path, pose: str, *arguments: str) -> Ended:
+def run(folder: Path, pose: str, *arguments: str) -> CompletedRun:
     """A run that holds its pose."""
     where = ("--set", 'backend.ports=["servos"]', "--set", f'backend.pose_listen="{pose}"')
     slow = ("--set", "rate_hz=25", "--set", "backend.watchdog_s=0.5", "--clock-mode", "realtime")
     hold = ("run", "triplet", "--backend", "dynamixel", "--controller", "hold", *where, *slow)
-    return snakesim(*hold, "--endpoint", free_endpoint(), *arguments, cwd=folder)
+    return snakesim(*hold, "--endpoint", find_free_endpoint(), *arguments, cwd=folder)
 
 
 def test_external_servos_are_detected_and_driven_in_real_time(pose: str, folder: Path) -> None:
@@ -83,20 +94,20 @@ def test_servos_that_stop_while_host_is_frozen_stay_off(pose: str, folder: Path)
 def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_path: Path) -> None:
     """Servos have no velocity mode, which the robot file lists: the host leaves it out, and the service does not."""
     write_servo_row(tmp_path, "dynamixel", "row")
-    network = ("--endpoint", free_endpoint())
+    network = ("--endpoint", find_free_endpoint())
 
     def start(stack: contextlib.ExitStack, log: str, *arguments: str) -> Path:
         """Start a program; returns the file with its output."""
         path = tmp_path / log
         file = stack.enter_context(path.open("wb"))
         program = subprocess.Popen(
-            [*SNAKESIM, *arguments], cwd=tmp_path, env=environment(tmp_path), stdout=file, stderr=file
+            [*SNAKESIM_COMMAND, *arguments], cwd=tmp_path, env=make_environment(tmp_path), stdout=file, stderr=file
         )
         stack.callback(program.wait, 10)
         stack.callback(program.terminate)
         return path
 
-    def arm() -> Ended:
+    def arm() -> CompletedRun:
         return snakesim("robot", "arm", "row", "dynamixel", *network, cwd=tmp_path)
 
     with contextlib.ExitStack() as stack:

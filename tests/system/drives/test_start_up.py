@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from snakesim_testing.benches import homing_drives
-from snakesim_testing.harness.command import Running, running
+from snakesim_testing.harness.command import Running, running_snakesim
 from snakesim_testing.harness.wait import wait_until
 
 BACKEND = f"{homing_drives.__file__}:HomingBackend"
@@ -12,7 +12,7 @@ IN_REAL_TIME = ("--clock-mode", "realtime", "--duration", "0.5")
 
 def test_status_names_the_start_up_step_until_the_robot_is_armed(tmp_path: Path) -> None:
     homing = ("--set", "backend.homing_s=20", "--set", "backend.watchdog_s=0.5")
-    with running(tmp_path / "run", "triplet", "--backend", BACKEND, *homing, *IN_REAL_TIME) as run:
+    with running_snakesim(tmp_path / "run", "triplet", "--backend", BACKEND, *homing, *IN_REAL_TIME) as run:
         answer = wait_until(lambda: find_step(run), "status names the step")
         assert "joint_1 (drive 1): homing, " in answer
         assert " of 21.6 s" in answer
@@ -22,5 +22,5 @@ def test_status_names_the_start_up_step_until_the_robot_is_armed(tmp_path: Path)
 
 def find_step(run: Running) -> str:
     """Return the status if it names the step, or nothing: a busy host may not answer in time."""
-    status = run.tell("status").out
+    status = run.run_tool("status").out
     return status if "): homing, " in status else ""

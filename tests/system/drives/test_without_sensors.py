@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import REPORT
+from snakesim_operator.results.run_reader import REPORT_FILENAME
 from snakesim_testing.runs.in_process_command import snakesim
 
 SCRIPT = Path(__file__).parents[3] / "examples" / "without_sensors.py"
@@ -32,7 +32,7 @@ def test_drives_without_force_sensors_and_mocap_run_on_estimates(tmp_path: Path)
     assert said["blind"]["pose_from"] == "dead_reckoning"
     assert said["blind"]["contacts_from"] == "joint_torques"
     assert said["blind"]["peak_contact_force_n"] is None, "nobody has measured a force"
-    for text in (ended["blind"].out, (tmp_path / "blind" / REPORT).read_text()):
+    for text in (ended["blind"].out, (tmp_path / "blind" / REPORT_FILENAME).read_text()):
         assert "pose is estimated by dead reckoning" in text
         assert "contacts are estimated from joint torques" in text
     worlds = RunRecord.load(tmp_path / "blind").worlds

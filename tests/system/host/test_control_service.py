@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import pytest
 
 from snakesim_hal.base.errors import ControllerError
-from snakesim_hal.controller import ControllerCommand, Observation, Telemetry, positions
+from snakesim_hal.controller import ControllerCommand, Observation, Telemetry, make_position_setpoints
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
-from snakesim_testing.gnc.services import Showing, Stage, stage
-from snakesim_testing.gnc.stage import known
-from snakesim_testing.hal.local_network import threads_switching
+from snakesim_testing.gnc.services import ObservationRecorder, RunningServices, running_services
+from snakesim_testing.gnc.stage import require_value
+from snakesim_testing.hal.local_network import fast_thread_switching
 from snakesim_testing.harness.wait import wait_until
 
 pytestmark = pytest.mark.quiet  # a busy computer lets the command lease expire, and then nothing is observed
@@ -23,33 +23,33 @@ SEEN = 3  # observations in a row
 
 @pytest.fixture(autouse=True)
 def quick_threads() -> Iterator[None]:
-    with threads_switching():
+    with fast_thread_switching():
         yield
 
 
-def sighted(made: Stage, since: int = 0) -> bool:
+def sighted(made: RunningServices, since: int = 0) -> bool:
     observations = made.observations[since:][-SEEN:]
     return len(observations) == SEEN and all(
         observation.world is not None and observation.trajectory is not None for observation in observations
     )
 
 
-def blind(made: Stage, what: str) -> bool:
+def blind(made: RunningServices, what: str) -> bool:
     observations = made.observations[-SEEN:]
     return len(observations) == SEEN and all(getattr(observation, what) is None for observation in observations)
 
 
-def speed(made: Stage) -> float | None:
+def speed(made: RunningServices) -> float | None:
     trajectory = made.observations[-1].trajectory
     return None if trajectory is None else trajectory.speed_m_s
 
 
 def test_without_joints_it_sends_nothing_and_the_lease_ends() -> None:
-    with stage(faults=["drop:sensor/joints@1"]) as made:
-        commands = made.run.session.reader(keys.JOINT_COMMAND, JointCommand)
-        joints = made.run.session.reader(keys.JOINTS, JointState)
+    with running_services(faults=["drop:sensor/joints@1"]) as made:
+        commands = made.run.session.declare_reader(keys.JOINT_COMMAND, JointCommand)
+        joints = made.run.session.declare_reader(keys.JOINTS, JointState)
         made.run.arm()
-        made.run.reaches("fault")
+        made.run.wait_for_lifecycle("fault")
         assert [fault.what for fault in made.run.status.faults] == ["lease_expired"]
         reported = made.wait_for_reason("sensor/joints is ")
         assert reported.state in ("NotLocomoting", "Idle")  # the latter when a busy machine delays it until the stop
@@ -61,13 +61,13 @@ def test_without_joints_it_sends_nothing_and_the_lease_ends() -> None:
 
 def test_a_command_names_the_joint_state_that_it_answers() -> None:
     """Not the clock, which comes also when its joint state was lost on the way."""
-    with stage(max_age={"joints_s": 0.5}) as made:
+    with running_services(max_age={"joints_s": 0.5}) as made:
         session = made.run.session
-        clocks, joints = session.reader(keys.CLOCK, Clock), session.reader(keys.JOINTS, JointState)
-        commands = session.reader(keys.JOINT_COMMAND, JointCommand)
+        clocks, joints = session.declare_reader(keys.CLOCK, Clock), session.declare_reader(keys.JOINTS, JointState)
+        commands = session.declare_reader(keys.JOINT_COMMAND, JointCommand)
         wait_until(commands.drain, "commands")
         lose = FaultRequest(kind="drop", target=keys.JOINTS, amount=0.5)
-        assert made.run.ask(keys.fault_key("hal"), lose).ok
+        assert made.run.request(keys.fault_key("hal"), lose).ok
         for reader in (clocks, joints, commands):
             reader.drain()
         named: set[int] = set()
@@ -79,20 +79,22 @@ def test_a_command_names_the_joint_state_that_it_answers() -> None:
 
 def test_control_without_streams_withholds_them_until_they_return() -> None:
     limits = {"pose_s": 0.3, "trajectory_s": 0.5}
-    with stage(max_age=limits) as made:
+    with running_services(max_age=limits) as made:
         made.run.arm()
         wait_until(lambda: sighted(made), "observations with everything in them")
         for sender, key, what in (("hal", keys.POSE, "world"), ("navigation", keys.TRAJECTORY, "trajectory")):
-            assert made.run.ask(keys.fault_key(sender), FaultRequest(kind="drop", target=key)).ok
+            assert made.run.request(keys.fault_key(sender), FaultRequest(kind="drop", target=key)).ok
             wait_until(lambda what=what: blind(made, what), f"observations without a {what}")
             reported = made.wait_for_reason(f"{key} is ")
             words = f"at most {limits[key.partition('/')[2] + '_s']:.3g} s"
             assert reported.state == "NotLocomoting"
             assert words in reported.reason
             since = len(made.observations)
-            assert made.run.ask(keys.fault_key(sender), FaultRequest(kind="drop", target=key, end=True)).ok
+            assert made.run.request(keys.fault_key(sender), FaultRequest(kind="drop", target=key, end=True)).ok
             wait_until(lambda since=since: sighted(made, since), "observations with everything again")
-            wait_until(lambda key=key: f"{key} is " not in known(made.state()).reason, "another reason")
+            wait_until(
+                lambda key=key: f"{key} is " not in require_value(made.read_newest_state()).reason, "another reason"
+            )
         for observation in made.observations:  # nothing too old was ever handed over
             if observation.world is not None:
                 assert observation.tick * PERIOD_NS - (observation.world.pose_timestamp_ns or 0) <= 300_000_000
@@ -106,9 +108,9 @@ def test_control_without_streams_withholds_them_until_they_return() -> None:
 
 
 def test_control_after_intent_expired_rests_and_says_why() -> None:
-    with stage() as made:
-        clocks, operator = made.run.session.reader(keys.CLOCK, Clock), made.run.session
-        intents = operator.publisher(keys.INTENT, Intent)
+    with running_services() as made:
+        clocks, operator = made.run.session.declare_reader(keys.CLOCK, Clock), made.run.session
+        intents = operator.declare_publisher(keys.INTENT, Intent)
         made.run.arm()
         wait_until(lambda: sighted(made), "observations with everything in them")
         assert speed(made) == 0.2  # the mission's
@@ -130,16 +132,16 @@ def test_control_after_intent_expired_rests_and_says_why() -> None:
 
 
 def test_control_update_longer_than_lease_is_reported_after_stop() -> None:
-    def slow(self: Showing, observation: Observation) -> ControllerCommand:
+    def slow(self: ObservationRecorder, observation: Observation) -> ControllerCommand:
         time.sleep(0.3)
-        return ControllerCommand(positions(self.robot, observation.joints.angle_rad))
+        return ControllerCommand(make_position_setpoints(self.robot, observation.joints.angle_rad))
 
-    with stage() as made:
-        Showing.answers.append(slow)
+    with running_services() as made:
+        ObservationRecorder.answers.append(slow)
         made.run.arm()
-        made.run.reaches("fault")
-        wait_until(lambda: known(made.state()).too_slow, "a state that names the slow update")
-        assert re.match(r"update\(\) took 3\d\d ms of 20 ms$", known(made.state()).too_slow)
+        made.run.wait_for_lifecycle("fault")
+        wait_until(lambda: require_value(made.read_newest_state()).too_slow, "a state that names the slow update")
+        assert re.match(r"update\(\) took 3\d\d ms of 20 ms$", require_value(made.read_newest_state()).too_slow)
 
 
 @pytest.mark.parametrize(
@@ -150,15 +152,17 @@ def test_control_update_longer_than_lease_is_reported_after_stop() -> None:
             "update() raised ZeroDivisionError: division by zero (test_control_service.py",
         ),
         (
-            lambda self, observation: ControllerCommand(positions(self.robot, [0.0] * 3), Telemetry(path_s_m=math.nan)),
+            lambda self, observation: ControllerCommand(
+                make_position_setpoints(self.robot, [0.0] * 3), Telemetry(path_s_m=math.nan)
+            ),
             "Telemetry.path_s_m is nan",
         ),
     ],
     ids=["raises", "report"],
 )
 def test_a_controller_that_answers_wrongly_ends_control_with_its_name(answer, words: str) -> None:
-    with stage() as made:
-        Showing.answers.append(answer)
+    with running_services() as made:
+        ObservationRecorder.answers.append(answer)
         made.run.arm()
         control = made.services["control"]
         wait_until(lambda: not control.thread.is_alive(), "the end of control")
@@ -166,4 +170,4 @@ def test_a_controller_that_answers_wrongly_ends_control_with_its_name(answer, wo
         for text in (str(control.error), made.wait_for_reason(words).reason):
             assert "controller showing (class Showing): " in text
             assert words in text
-        made.run.reaches("fault")
+        made.run.wait_for_lifecycle("fault")

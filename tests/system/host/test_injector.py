@@ -14,21 +14,27 @@ from snakesim_hal.host.host import Host
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
-from snakesim_testing.hal.local_network import LagBackend, Running, commanded, meeting, running
-from snakesim_testing.hal.small_robots import clock, description, run_config, state
+from snakesim_testing.hal.local_network import (
+    LagBackend,
+    RunningHost,
+    connected_sessions,
+    running_commanded_host,
+    running_host,
+)
+from snakesim_testing.hal.small_robots import make_clock, make_description, make_joint_state, make_run_config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 ALLOWED: dict[str, Any] = {"clock_mode": "realtime", "rate_hz": 100, "allow_fault_injection": True}
 
 
-def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
-    return run.ask(keys.fault_key("hal"), FaultRequest(kind=kind, target=target, **more))
+def ask(run: RunningHost, kind: str, target: str, **more: Any) -> Answer:
+    return run.request(keys.fault_key("hal"), FaultRequest(kind=kind, target=target, **more))
 
 
 @pytest.mark.quiet  # a lease of 50 ms
 def test_injected_fault_lasts_until_ended_and_impossible_one_is_refused() -> None:
-    with commanded(run_config(**ALLOWED)) as (run, _):
+    with running_commanded_host(make_run_config(**ALLOWED)) as (run, _):
         for asked, refusal, words in (
             (FaultRequest(kind="mote", target="joint_1"), "cannot", "knows no 'mote'"),
             (FaultRequest(kind="mute", target="joint_9"), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
@@ -37,34 +43,34 @@ def test_injected_fault_lasts_until_ended_and_impossible_one_is_refused() -> Non
             (FaultRequest(kind="drop", target="actuator/joints"), "wrong_part", "is carried out by control"),
             (FaultRequest(kind="mute", target="joint_1", end=True), "wrong_state", "is not active; active: nothing"),
         ):
-            answer = run.ask(keys.fault_key("hal"), asked)
+            answer = run.request(keys.fault_key("hal"), asked)
             assert not answer.ok and answer.refusal == refusal and words in answer.reason, asked
         assert run.host.faults.notes == []
         answer = ask(run, "mute", "joint_2")
         assert answer.ok
         assert answer.reason.startswith("mute of joint_2 has begun, at ")
         assert answer.lifecycle == "armed"
-        run.reaches("fault")
+        run.wait_for_lifecycle("fault")
         assert "joint_2" in run.status.reason
         (on,) = run.status.injected
         assert on.startswith("mute:joint_2@")
         assert ask(run, "mute", "joint_2", end=True).ok
         wait_until(lambda: run.status.injected == [], "an end of it")
-        assert run.lifecycle("reset").ok
+        assert run.request_lifecycle("reset").ok
         run.arm()
         assert [text.split()[-1] for text in run.host.faults.notes] == ["begins", "ends"]
         assert all(text.startswith("tick ") for text in run.host.faults.notes)
 
 
 def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
-    with running(run_config(clock_mode="realtime")) as run:
+    with running_host(make_run_config(clock_mode="realtime")) as run:
         answer = ask(run, "mute", "joint_1")
         assert not answer.ok
         assert answer.refusal == "not_allowed"
         assert "allow_fault_injection = true" in answer.reason
-    config = run_config(faults=["mute:joint_1@1"])
+    config = make_run_config(faults=["mute:joint_1@1"])
     with (
-        meeting("worm") as (own,),
+        connected_sessions("worm") as (own,),
         raises_error(ConfigError, code="injection/not-allowed"),
     ):
         Host(config, GuardedBackend(LagBackend(config)), own)
@@ -72,14 +78,14 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
 
 @pytest.mark.quiet  # a lease of 50 ms
 def test_injected_plan_that_fails_is_a_fault_of_the_run() -> None:
-    with commanded(run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
+    with running_commanded_host(make_run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
         told = run.host.authority.faults_since_start
-        wait_until(lambda: any(fault.what == "injection_refused" for fault in told.stored), "a word about it")
+        wait_until(lambda: any(fault.what == "injection_refused" for fault in told.faults), "a word about it")
         assert "is refused: backend 'lag' cannot do leak" in run.host.faults.notes[0]
 
 
 def test_a_hanging_host_does_nothing_and_goes_on_afterwards() -> None:
-    with running(run_config(**ALLOWED)) as run:
+    with running_host(make_run_config(**ALLOWED)) as run:
         assert ask(run, "hang", "host").ok
         before = run.backend.advanced
         time.sleep(0.3)
@@ -92,8 +98,8 @@ def test_a_hanging_host_does_nothing_and_goes_on_afterwards() -> None:
 
 
 def test_sensors_that_are_dropped_do_not_arrive_and_come_back() -> None:
-    with running(run_config(**ALLOWED)) as run:
-        reader = run.session.reader(keys.JOINTS, JointState)
+    with running_host(make_run_config(**ALLOWED)) as run:
+        reader = run.session.declare_reader(keys.JOINTS, JointState)
         wait_until(reader.drain, "sensor samples")
         assert ask(run, "drop", keys.JOINTS, for_s=0.2).ok
         wait_until(lambda: run.host.faults.notes, "its begin")
@@ -113,10 +119,10 @@ def turn(injector: Injector, tick: int, arm_session: int) -> None:
 
 
 def test_injected_plan_is_not_repeated_for_restarted_service() -> None:
-    config = run_config(faults=["drop:actuator/joints@0.1"], allow_fault_injection=True)
-    with meeting("worm") as (session,):
+    config = make_run_config(faults=["drop:actuator/joints@0.1"], allow_fault_injection=True)
+    with connected_sessions("worm") as (session,):
         for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
-            injector = Injector("control", config, session, note=lambda _text, _now_s: None)
+            injector = Injector("control", config, session, report_event=lambda _text, _now_s: None)
             turn(injector, 0, first_arming)
             for tick in range(1, 15):
                 turn(injector, tick, 1)
@@ -125,10 +131,12 @@ def test_injected_plan_is_not_repeated_for_restarted_service() -> None:
 
 
 def test_injected_newer_fault_replaces_one_of_its_kind() -> None:
-    config = run_config(faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"])
+    config = make_run_config(faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"])
     notes: list[str] = []
-    with meeting("worm") as (session,):
-        injector = Injector("control", config, session, note=lambda text, now_s: notes.append(f"{now_s:g} {text}"))
+    with connected_sessions("worm") as (session,):
+        injector = Injector(
+            "control", config, session, report_event=lambda text, now_s: notes.append(f"{now_s:g} {text}")
+        )
         for tick in range(50):
             turn(injector, tick, int(tick > 0))
         injector.close()
@@ -143,10 +151,10 @@ def test_injected_newer_fault_replaces_one_of_its_kind() -> None:
 
 
 def test_injected_delay_ends_with_its_sending_thread() -> None:
-    with meeting(None, None) as (here, there):
+    with connected_sessions(None, None) as (here, there):
         arrived: list[float] = []
         there.on_arrival(keys.CLOCK, lambda arrival: arrived.append(arrival.monotonic_ns * 1e-9))
-        publisher = here.publisher(keys.CLOCK, Clock)
+        publisher = here.declare_publisher(keys.CLOCK, Clock)
         wait_until(publisher.has_subscriber, "a subscriber")
         straight = publisher._put
         faults, delay = MessageFaults(here, 1), parse_injection("delay:hal/clock@0=0.1")
@@ -154,7 +162,7 @@ def test_injected_delay_ends_with_its_sending_thread() -> None:
         sent_at = []
         for _ in range(5):
             sent_at.append(time.monotonic())
-            publisher.put(clock(1))
+            publisher.put(make_clock(1))
             time.sleep(0.02)
         assert any(thread.name == "late messages" for thread in threading.enumerate())
         faults.end(delay)
@@ -166,15 +174,15 @@ def test_injected_delay_ends_with_its_sending_thread() -> None:
 
 
 def test_injected_disturbance_covers_later_publishers_and_flood_ends() -> None:
-    with meeting(None, None) as (here, there):
+    with connected_sessions(None, None) as (here, there):
         arrived: list[bytes] = []
         there.on_arrival(keys.JOINTS, lambda arrival: arrived.append(arrival.payload))
         faults = MessageFaults(here, 1)
         faults.begin(parse_injection("flood:sensor/joints@0=2000"))
         faults.begin(parse_injection("corrupt:sensor/joints@0=0.5"))
-        publisher = here.publisher(keys.JOINTS, JointState)
+        publisher = here.declare_publisher(keys.JOINTS, JointState)
         wait_until(publisher.has_subscriber, "a subscriber")
-        publisher.put(state(description()))
+        publisher.put(make_joint_state(make_description()))
         wait_until(lambda: len(arrived) > 500, "a flood")
         assert 100 < len(set(arrived)) < len(arrived)
         faults.close()

@@ -13,8 +13,8 @@ from snakesim_hal.host import latch as under_test
 from snakesim_hal.host.latch import ESTOP, EstopLatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest
-from snakesim_testing.hal.local_network import running
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.local_network import running_host
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.harness.wait import wait_until
 
 
@@ -105,11 +105,11 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
 
 
 def test_latch_on_hanging_disk_stops_at_once_and_ends(tmp_path: Path, hanging: Event) -> None:
-    with running(run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
+    with running_host(make_run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
         began = time.monotonic()
-        answer = run.ask(keys.ESTOP, EstopRequest(requester="anna"))
+        answer = run.request(keys.ESTOP, EstopRequest(requester="anna"))
         assert answer.ok
         assert answer.lifecycle == "estop"
         assert "not stored yet" in answer.reason
         assert time.monotonic() - began < 2.0
-        run.reaches("estop")
+        run.wait_for_lifecycle("estop")

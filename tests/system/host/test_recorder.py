@@ -18,14 +18,14 @@ from snakesim_hal.run_log import writer as under_test
 from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
-from snakesim_hal.safety.authority import TickDecision
+from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire.messages import Description, Mode
-from snakesim_testing.hal.local_network import Follower, following, running
-from snakesim_testing.hal.small_robots import description, run_config, state
+from snakesim_testing.hal.local_network import Follower, running_follower, running_host
+from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_run_config
 from snakesim_testing.harness.wait import wait_until
 
-ROBOT = description()
-TOLD = TickDecision(SafeSetpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
+ROBOT = make_description()
+TOLD = TickOutput(SafeSetpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
 ROW = BlackBox(ROBOT).layout.row_bytes
 
 
@@ -37,12 +37,12 @@ class Numbers(msgspec.Struct):
 
 def fill(box: BlackBox, *ticks: int) -> None:
     for tick in ticks:
-        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, 0.001 * tick)), TOLD)
+        box.record_tick(tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.001 * tick)), TOLD)
 
 
 def recorder(box: BlackBox, folder: Path | None, memory: int | None = None) -> HostRecordWriter:
     def numbers(*, lost_ticks: int, failure: str) -> Numbers:
-        return Numbers(box.ticks, lost_ticks, failure)
+        return Numbers(box.row_count, lost_ticks, failure)
 
     return HostRecordWriter(box, ROBOT, numbers, folder, memory)
 
@@ -104,7 +104,7 @@ class Disk:
         self.is_hanging = Event()
         self._memory, self._pwrite = memory, os.pwrite
         monkeypatch.setattr(under_test.os, "pwrite", self.pwrite)
-        monkeypatch.setattr(under_test, "PERIOD_S", 0.02)
+        monkeypatch.setattr(under_test, "WRITE_PERIOD_S", 0.02)
 
     def pwrite(self, handle: int, content: bytes, offset: int) -> int:
         if handle == self._memory:
@@ -127,7 +127,7 @@ def test_recorder_writes_what_full_disk_refused_when_space_returns(
     tmp_path: Path, memory: int, disk: Disk, capfd: pytest.CaptureFixture[str]
 ) -> None:
     box = BlackBox(ROBOT)
-    disk.space = len(box.layout.header()) + 7 * ROW + 11  # the eighth row is torn
+    disk.space = len(box.layout.encode_header()) + 7 * ROW + 11  # the eighth row is torn
     with recorder(box, tmp_path, memory):
         fill(box, *range(20))
         wait_until(lambda: len(os.pread(memory, 9, 0)) and remembered(memory).failure, "a word about it")
@@ -142,7 +142,7 @@ def test_recorder_writes_what_full_disk_refused_when_space_returns(
 
 def test_recorder_counts_unwritten_rows_and_gaps_show_in_ticks(tmp_path: Path, memory: int, disk: Disk) -> None:
     box = BlackBox(ROBOT, memory_bytes=10 * ROW)
-    begins = len(box.layout.header())
+    begins = len(box.layout.encode_header())
     disk.space = begins + 3 * ROW
     with recorder(box, tmp_path, memory):
         fill(box, *range(5))
@@ -169,21 +169,21 @@ def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memo
 def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
     tmp_path: Path, memory: int, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(under_test, "CLOSE_LIMIT_S", 0.3)
+    monkeypatch.setattr(under_test, "CLOSE_TIMEOUT_S", 0.3)
     with (
-        running(run_config(clock_mode="lockstep"), max_ticks=75) as run,
-        following(run.link, Follower()),
+        running_host(make_run_config(clock_mode="lockstep"), max_ticks=75) as run,
+        running_follower(run.link, Follower()),
     ):
         with HostRecordWriter(
             run.host.black_box, run.host.description, partial(create_host_record, run.host), tmp_path, memory
         ):
             layout = run.host.black_box.layout
-            disk.space, disk.hangs = len(layout.header()) + 6 * layout.row_bytes, True
+            disk.space, disk.hangs = len(layout.encode_header()) + 6 * layout.row_bytes, True
             run.arm()
-            wait_until(run.ended, "the end of the run")
+            wait_until(run.has_ended, "the end of the run")
             assert disk.is_hanging.wait(5.0)
         assert not disk.should_continue.is_set()  # neither the run nor its recorder's end waited for it
-        assert run.host.ended == "complete"
+        assert run.host.ending_status == "complete"
         assert not run.host.authority.faults
     last = msgspec.json.decode(os.pread(memory, 2**20, 0), type=HostRecord)
     assert last.ended == "complete"
@@ -208,7 +208,7 @@ def test_numbers_are_written_although_the_disk_never_catches_up(
 
     def slow(handle: int, content: bytes, offset: int) -> int:
         if handle != memory:
-            fill(box, box.ticks)  # the host goes on meanwhile
+            fill(box, box.row_count)  # the host goes on meanwhile
         return taken(handle, content, offset)
 
     monkeypatch.setattr(under_test.os, "pwrite", slow)

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scenario import Override, load
+from snakesim_hal.model.scenario import Override, load_scenario
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import DepthImage, Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 HEAD = keys.depth_key("head")
 CAMERA = {"name": "head", "width": 40, "height": 30, "rate_hz": 20.0}
@@ -42,17 +42,17 @@ class Plain:
 
 
 def run_with(camera=None, **top):
-    return Run(make_config({"sensors": {"depth": [{**CAMERA, **(camera or {})}]}}, WALL, **top))
+    return SimulatorRig(make_config({"sensors": {"depth": [{**CAMERA, **(camera or {})}]}}, WALL, **top))
 
 
 def arrivals(run, ticks):
     """(tick, image) of everything that came."""
     found = []
     for _ in range(ticks):
-        others = run.sample().others
+        others = run.sample().by_key
         if HEAD in others:
             found.append((run.tick, others[HEAD]))
-        run.go()
+        run.advance()
     run.sim.close()
     return found
 
@@ -77,15 +77,15 @@ def test_snapshot_shows_past_scene_and_arrives_after_delay(delay_s, ticks):
 
 
 def bytes_of_a_run(robot, seed=3):
-    config = load("peg_row", [Override("robot", robot, "--robot")]).config
-    run = Run(msgspec.structs.replace(config, seed=seed))
+    config = load_scenario("peg_row", [Override("robot", robot, "--robot")]).config
+    run = SimulatorRig(msgspec.structs.replace(config, seed=seed))
     reported = {}
     for tick in range(40):
         samples = run.sample()
-        for key, message in (("joints", samples.joints), *samples.others.items()):
+        for key, message in (("joints", samples.joints), *samples.by_key.items()):
             reported[key] = reported.get(key, b"") + encode(message)
         run.command([Mode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
-        run.go()
+        run.advance()
     run.sim.close()
     return reported
 
@@ -105,7 +105,7 @@ def test_snapshot_thread_is_absent_without_cameras():
         return [thread.name for thread in threading.enumerate() if thread.name.startswith("sensors")]
 
     before = looking()
-    plain = Run(make_config())
+    plain = SimulatorRig(make_config())
     assert looking() == before
     seeing = run_with()
     assert len(looking()) == len(before) + 1
@@ -124,11 +124,11 @@ def test_snapshot_late_in_real_time_is_dropped_and_reported_rarely(tmp_path):
     run = run_with({**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, clock_mode="realtime")
     reported = []
     for _ in range(40):
-        assert HEAD not in run.sample().others
+        assert HEAD not in run.sample().by_key
         reported += [*run.sim.faults(), *run.sim.faults()]  # once for the same number
-        run.go()
+        run.advance()
     run.sim.close()
-    assert run.sim._sensors.late == {HEAD: 39}  # pyright: ignore[reportPrivateUsage]
+    assert run.sim._sensors.dropped_counts == {HEAD: 39}  # pyright: ignore[reportPrivateUsage]
     assert {(fault.what, fault.reach) for fault in reported} == {("sample_late", "none")}
     assert [int(fault.cause.split()[1]) for fault in reported] == [1, 2, 4, 8, 16, 32]
 

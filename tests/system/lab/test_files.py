@@ -11,8 +11,8 @@ import yaml
 import zenoh
 
 from snakesim_operator.cli import main
-from snakesim_operator.features.lab.lab_file import EXAMPLE
-from snakesim_testing.harness.command import call
+from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH
+from snakesim_testing.harness.command import run_to_end
 
 ROBOTS = {
     "emulator": 'can = ["vcan0"]',
@@ -33,7 +33,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The example, with two routers, a robot of every drive type, and the program where it is here."""
     folder = tmp_path_factory.mktemp("rendered")
     program = Path(sys.executable).with_name("snakesim")
-    text = MACHINE.sub(rf'\g<0>\nprogram = "{program}"', EXAMPLE.read_text())
+    text = MACHINE.sub(rf'\g<0>\nprogram = "{program}"', EXAMPLE_PATH.read_text())
     text = text.replace('backend = "sim"', 'backend = "can"')
     text += '\n[routers.second]\nmachine = "hub"\nport = 7448\n'
     for name, robot in ROBOTS.items():
@@ -57,11 +57,11 @@ def test_zenoh_parses_every_file(rendered: Path) -> None:
 def test_systemd_accepts_every_unit_and_finds_it_closed(rendered: Path) -> None:
     units = sorted(rendered.rglob("*.service"))
     assert len(units) == 7 + len(ROBOTS) + 6  # of programs, robots, and CAN interfaces
-    done = call(["systemd-analyze", "verify", "--man=no", *units], rendered)
+    done = run_to_end(["systemd-analyze", "verify", "--man=no", *units], rendered)
     assert done.code == 0
     assert done.err == ""
     for unit in units:
-        rated = call(["systemd-analyze", "security", "--offline=true", "--no-pager", unit], rendered)
+        rated = run_to_end(["systemd-analyze", "security", "--offline=true", "--no-pager", unit], rendered)
         score = re.search(r"exposure level for \S+: ([\d.]+)", rated.out)
         assert score is not None and float(score[1]) <= MAX_EXPOSED, f"{unit.name}: {rated.printed[-200:]}"
 
@@ -77,10 +77,10 @@ def test_containers_run_what_the_units_run(rendered: Path) -> None:
 
 def test_lab_files_of_removed_roles_are_deleted_others_kept(tmp_path: Path) -> None:
     lab = tmp_path / "lab.toml"
-    lab.write_text(EXAMPLE.read_text())
+    lab.write_text(EXAMPLE_PATH.read_text())
     assert main(["lab", "render", str(lab), "--out", str(tmp_path)]) == 0
     (tmp_path / "laptop" / "notes.txt").write_text("mine")
-    lab.write_text(EXAMPLE.read_text().replace('role = "viewer"', 'role = "administrator"'))
+    lab.write_text(EXAMPLE_PATH.read_text().replace('role = "viewer"', 'role = "administrator"'))
     assert main(["lab", "render", str(lab), "--out", str(tmp_path)]) == 0
     left = {path.name for path in (tmp_path / "laptop").iterdir()}
     assert left == {"notes.txt", "rendered.txt", "operator.planar13.json5", "administrator.planar13.json5"}

@@ -10,9 +10,9 @@ import msgspec
 import pytest
 
 from snakesim_hal.run_log.host_record import HostRecord
-from snakesim_operator.features.lab.lab_file import EXAMPLE
-from snakesim_testing.lab.machines import NET, connected
-from snakesim_testing.runs.command import SNAKESIM, summary_of
+from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH
+from snakesim_testing.lab.machines import NET, connect_machines
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, read_summary
 
 pytestmark = [
     pytest.mark.e2e,
@@ -28,7 +28,7 @@ class Lab:
 
     def __init__(self, folder: Path, backend: str, stack: ExitStack) -> None:
         self.folder = folder
-        self.machines = connected(["hub", "robot1", "ws1", "laptop"], stack)
+        self.machines = connect_machines(["hub", "robot1", "ws1", "laptop"], stack)
         (folder / "lab.toml").write_text(example(folder, backend))
         for step in ("certs", "render"):
             self.at("hub", "lab", step, "lab.toml", "--out", ".")
@@ -42,12 +42,12 @@ class Lab:
     def at(self, machine: str, *arguments: str, check: bool = True) -> str:
         """A `snakesim` command on one machine; what it says."""
         state = {"XDG_STATE_HOME": str(self.folder / "state" / machine)}
-        return self.machines[machine].run(*SNAKESIM, *arguments, check=check, cwd=self.folder, env=state)
+        return self.machines[machine].run(*SNAKESIM_COMMAND, *arguments, check=check, cwd=self.folder, env=state)
 
     def start(self, machine: str, name: str, *arguments: str) -> None:
         """A program of ours on one machine."""
         state = {"XDG_STATE_HOME": str(self.folder / "state" / machine), "OMP_NUM_THREADS": "1"}
-        self.machines[machine].start(*SNAKESIM, *arguments, log=self.folder / f"{name}.log", env=state)
+        self.machines[machine].start(*SNAKESIM_COMMAND, *arguments, log=self.folder / f"{name}.log", env=state)
 
     def session(self, machine: str, label: str) -> tuple[str, str]:
         return "--session", str(self.folder / machine / f"{label}.json5")
@@ -58,7 +58,7 @@ class Lab:
 
 def example(folder: Path, backend: str) -> str:
     """The example with its folders here, without the recorder."""
-    text = re.sub(r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/\1"', EXAMPLE.read_text(), flags=re.M)
+    text = re.sub(r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/\1"', EXAMPLE_PATH.read_text(), flags=re.M)
     text = text.replace("10.0.0.1", f"{NET}.1").replace('backend = "sim"', f'backend = "{backend}"')
     return re.sub(r'\[\[roles\]\]\nmachine = "ws1"\nrole = "recorder"\nrobot = "planar13"\n', "", text)
 
@@ -84,14 +84,14 @@ def test_lockstep_across_four_machines_has_digest_of_one(tmp_path: Path, backend
         until(lab, "next: `snakesim robot arm planar13", "status", *viewer)
         checked = lab.at("hub", "lab", "check", "lab.toml", "--out", ".")
         assert "all is as it should be" in checked, checked
-        lab.machines["laptop"].module("snakesim_testing.lab.intruder", viewer[1], log=tmp_path / "intruder.log")
+        lab.machines["laptop"].start_module("snakesim_testing.lab.intruder", viewer[1], log=tmp_path / "intruder.log")
         refused = lab.at("laptop", "robot", "arm", "planar13", backend, *viewer, check=False)
         assert "exit code 1" in refused, refused
         until(lab, "planar13: armed", "robot", "arm", "planar13", backend, *operator)
         record = finished(lab)
         more = ("--in-process",) if backend == "sim" else ()
         lab.at("robot1", "run", *SCENARIO, "--backend", backend, "--out", "alone", *more)  # by this machine alone
-    assert record.command_digest == summary_of(tmp_path / "alone").command_digest, lab.logs()
+    assert record.command_digest == read_summary(tmp_path / "alone").command_digest, lab.logs()
     did = (tmp_path / "intruder.log").read_text().splitlines()[-1]
     assert re.fullmatch(r"\{'repeated': \d{3,}, 'commanded': \d{2,}\}", did), did
 

@@ -8,10 +8,10 @@ import pytest
 from snakesim_hal.network.private_keys import _warn
 from snakesim_hal.network.session_file import read_session
 from snakesim_operator.cli import main
-from snakesim_operator.features.lab.check import Findings, _check_certificate
-from snakesim_operator.features.lab.identities import identities
-from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
-from snakesim_testing.harness.command import SNAKESIM, call, environment
+from snakesim_operator.features.lab.check import CheckResults, _check_certificate
+from snakesim_operator.features.lab.identities import iterate_identities
+from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH, load_lab
+from snakesim_testing.harness.command import SNAKESIM_COMMAND, make_environment, run_to_end
 
 
 def mode(path: Path) -> int:
@@ -19,7 +19,7 @@ def mode(path: Path) -> int:
 
 
 def certs(out: Path, *more: str) -> int:
-    return main(["lab", "certs", str(EXAMPLE), "--out", str(out), *more])
+    return main(["lab", "certs", str(EXAMPLE_PATH), "--out", str(out), *more])
 
 
 def test_a_folder_that_is_there_keeps_its_mode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,8 +72,8 @@ def test_private_key_readable_by_all_is_named_in_warning(tmp_path: Path, capsys:
 
 def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
     assert certs(tmp_path) == 0
-    said, identity = list[str](), next(identities(load_lab(EXAMPLE)))
-    found = Findings(said.append)
+    said, identity = list[str](), next(iterate_identities(load_lab(EXAMPLE_PATH)))
+    found = CheckResults(said.append)
     _check_certificate(identity, tmp_path, found)
     assert not found.wrong
     (tmp_path / identity.machine / "tls" / f"{identity.label}.key").chmod(0o604)
@@ -84,9 +84,9 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("max_mb", [20, 30, 40, 100])
 def test_too_little_memory_is_one_line(tmp_path: Path, max_mb: int) -> None:
-    typed = [*SNAKESIM, "lab", "certs", str(EXAMPLE), "--out", str(tmp_path / "lab")]
+    typed = [*SNAKESIM_COMMAND, "lab", "certs", str(EXAMPLE_PATH), "--out", str(tmp_path / "lab")]
     limited = ["sh", "-c", f'ulimit -v {max_mb * 1024}; exec "$@"', "sh", *typed]
-    ended = call(limited, tmp_path, environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0)
+    ended = run_to_end(limited, tmp_path, make_environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0)
     assert ended.code in (0, 1) and "Traceback" not in ended.err, ended.err
     if ended.code == 1:
         assert len(ended.err.splitlines()) == 1

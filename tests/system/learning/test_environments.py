@@ -19,12 +19,12 @@ from gymnasium.utils.env_checker import check_env
 import snakesim
 import snakesim.environments
 from snakesim.environments import SCENARIOS, SnakeEnv, SnakeVectorEnv
-from snakesim.environments.rewards import TERMS
+from snakesim.environments.rewards import REWARD_TERMS
 from snakesim_hal.model.randomization import Randomization
 from snakesim_hal.model.scenario import write_config
-from snakesim_operator.base.extras import BRINGS
+from snakesim_operator.base.extras import PACKAGES_BY_EXTRA
 from snakesim_testing.messages import raises_error
-from snakesim_testing.runs.documents import REPOSITORY, sections
+from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 IDS = [f"SnakeSIM/{name}-v0" for name in SCENARIOS]
 LAG_RAD = 0.9 * np.arange(13)[::-1]
@@ -141,7 +141,7 @@ def test_environment_unspecified_choices_are_drawn_per_seed() -> None:
     assert found[0] == found[2] != found[1]
     assert all(0.1 <= one <= 0.4 for one in found)
     of_suite = Randomization(set=["scene.ground.friction"], low=0.1, high=0.4)
-    assert found[0] == of_suite.overrides_for_scene(7)[0].value
+    assert found[0] == of_suite.sample_overrides(7)[0].value
     for wrong, code in (
         ({"scene.ground.frictoin": (0.1, 0.4)}, "config/unknown-key"),
         ({"scene.ground.friction": (0.4, 0.1)}, "command/invalid-option"),
@@ -194,7 +194,7 @@ def test_reward_terms_have_names_and_sum_to_the_reward() -> None:
     advance_m = 0.0
     for _ in range(10):
         _, reward, _, _, info = env.step(wave(info["time_s"]))
-        assert list(info["reward_terms"]) == list(TERMS)
+        assert list(info["reward_terms"]) == list(REWARD_TERMS)
         assert reward == sum(info["reward_terms"].values())
         advance_m += info["reward_terms"]["advance"] / 3.0
         assert info["reward_terms"]["energy"] == 0.0
@@ -388,7 +388,9 @@ def test_an_episode_that_is_over_wants_a_reset() -> None:
 
 
 def test_the_extra_brings_all_that_it_needs() -> None:
-    others = {package for extra, packages in BRINGS.items() if extra not in ("gym", "sim") for package in packages}
+    others = {
+        package for extra, packages in PACKAGES_BY_EXTRA.items() if extra not in ("gym", "sim") for package in packages
+    }
     code = f"import sys\nsys.modules |= dict.fromkeys({others})\n" + STEP
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -402,5 +404,7 @@ def test_without_the_extra_the_import_says_how_to_get_it() -> None:
 @pytest.mark.slow
 def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    found = next(of for of in sections(REPOSITORY / "docs" / "how-to" / "environments.md") if "search.py" in of.files)
+    found = next(
+        of for of in parse_sections(REPOSITORY / "docs" / "how-to" / "environments.md") if "search.py" in of.files
+    )
     exec(compile(found.files["search.py"], "search.py", "exec"), {"__name__": "__main__"})

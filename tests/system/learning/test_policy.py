@@ -16,9 +16,9 @@ from onnx import TensorProto, helper
 
 import snakesim
 from snakesim.environments import SnakeEnv
-from snakesim_gnc.control.policy import Model
+from snakesim_gnc.control.policy import PolicyModel
 from snakesim_testing.messages import raises_error
-from snakesim_testing.runs.documents import REPOSITORY, sections
+from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 from snakesim_testing.runs.in_process_command import snakesim as command_line
 
 JOINTS, FRAME_SKIP = 13, 5
@@ -77,7 +77,7 @@ class Same(snakesim.Controller):
             bend = np.abs(np.float32(observation.time_s) - SHIFT_S) * np.float32(0.25)
             self.target = (bend + np.array(observation.joints.angle_rad, np.float32) * np.float32(0.5)).tolist()
         self.ticks += 1
-        return snakesim.ControllerCommand(snakesim.positions(self.robot, self.target))
+        return snakesim.ControllerCommand(snakesim.make_position_setpoints(self.robot, self.target))
 
 
 def driven(model: Path, scenario: str = "triplet", duration: float = 0.1) -> snakesim.Result:
@@ -113,7 +113,7 @@ def test_policy_controller_gets_observations_of_its_environment(tmp_path: Path, 
     )
     width = len(env.observation_names)
     file = linear(tmp_path / "model.onnx", width)
-    model = Model(env.description, str(file))
+    model = PolicyModel(env.description, str(file))
     seen, _ = env.reset(seed=1)
     varied, over, info = [seen], False, {}
     while not over:
@@ -196,7 +196,7 @@ def test_policy_model_mismatch_names_file_field_and_expectation(tmp_path: Path, 
 def test_the_snippet_of_the_documentation_makes_a_model_that_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    blocks = [code for one in sections(REPOSITORY / "docs" / "how-to" / "policies.md") for _, code in one.blocks]
+    blocks = [code for one in parse_sections(REPOSITORY / "docs" / "how-to" / "policies.md") for _, code in one.blocks]
     (tmp_path / "named.py").write_text(next(code for code in blocks if "set_model_props" in code))
     monkeypatch.chdir(tmp_path)
     linear(Path("trained.onnx"), 3 * JOINTS)

@@ -17,13 +17,13 @@ import pytest
 
 import snakesim
 from snakesim.environments import SnakeEnv
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.results.signals import UNITS
 from snakesim_operator.run.in_process import simulate
-from snakesim_testing.harness.command import call
+from snakesim_testing.harness.command import run_to_end
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
-from snakesim_testing.runs.documents import REPOSITORY, sections
+from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 needs_pandas = pytest.mark.skipif(importlib.util.find_spec("pandas") is None, reason="pandas is not installed")
 
@@ -40,7 +40,7 @@ class Nod(snakesim.Controller):
 
     def update(self, observation):
         angles_rad = [self.parameters.by_rad] * len(self.robot.joints)
-        return snakesim.ControllerCommand(snakesim.positions(self.robot, angles_rad))
+        return snakesim.ControllerCommand(snakesim.make_position_setpoints(self.robot, angles_rad))
 
 
 FAILING = """\
@@ -60,7 +60,7 @@ def result() -> snakesim.Result:
 
 
 def test_a_run_is_that_of_the_command(result: snakesim.Result) -> None:
-    same = simulate(load("triplet", [parse_set("duration_s=1")]).config)
+    same = simulate(load_scenario("triplet", [parse_set_option("duration_s=1")]).config)
     assert result.digest == same.summary.command_digest
     assert result.complete
     assert result.metrics["path_distance_m"] == same.summary.path_distance_m
@@ -128,8 +128,8 @@ def test_load_returns_the_run_of_a_folder(tmp_path: Path) -> None:
         snakesim.load(tmp_path / "nothing")
 
 
-def test_find_nodes_w_ends_at_the_head(result: snakesim.Result) -> None:
-    nodes_w = snakesim.find_nodes_w(
+def test_compute_body_points_w_ends_at_the_head(result: snakesim.Result) -> None:
+    nodes_w = snakesim.compute_body_points_w(
         result.record.description, result["position_w_m"][0], result["orientation_wxyz"][0], result["angle_rad"][0]
     )
     assert nodes_w.shape == (len(result.joints) + 2, 3)
@@ -194,7 +194,7 @@ def test_python_controller_failure_in_child_process_is_a_cause(tmp_path: Path) -
     """As when NumPy was imported first."""
     (tmp_path / "failing.py").write_text(FAILING)
     code = "import numpy, snakesim\nsnakesim.run('triplet', controller='./failing.py:Failing', duration=0.1)"
-    done = call([sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
+    done = run_to_end([sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
     assert "raised LinAlgError: Singular matrix (failing.py line 7)" in done.err.splitlines()[-1]
     assert "np.linalg.solve(np.zeros((2, 2)), np.ones(2))" in done.err
 
@@ -267,8 +267,8 @@ def test_importing_it_changes_no_environment_variable() -> None:
 def test_python_process_computes_like_snakesim_run_after_one_call() -> None:
     code = (
         "import snakesim; snakesim.use_common_arithmetic()\n"
-        "from snakesim_hal.base.arithmetic import common_environment, is_pinned\n"
-        "import os, numpy; print(common_environment().items() <= os.environ.items(), is_pinned())\n"
+        "from snakesim_hal.base.arithmetic import make_common_arithmetic_env, is_pinned\n"
+        "import os, numpy; print(make_common_arithmetic_env().items() <= os.environ.items(), is_pinned())\n"
         "snakesim.use_common_arithmetic()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
@@ -292,7 +292,7 @@ FIRST_EXAMPLES = [
 
 @pytest.mark.parametrize(("page", "name"), FIRST_EXAMPLES, ids=lambda one: one)
 def test_a_first_example_starts_gently_from_the_measured_pose(page: str, name: str) -> None:
-    blocks = [content for section in sections(REPOSITORY / "docs" / page) for _, content in section.blocks]
+    blocks = [content for section in parse_sections(REPOSITORY / "docs" / page) for _, content in section.blocks]
     defined = next(block for block in blocks if f"class {name}" in block or f"def {name}" in block)
     names: dict[str, Any] = {"__name__": "example", "snakesim": snakesim}
     exec(re.split(r"first = |snakesim.run\(", defined)[0], names)
@@ -349,9 +349,9 @@ def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> No
 def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
     """Run, plot, sweep a gain, take the best, run it on emulated modules, compare."""
     page = REPOSITORY / "docs" / "how-to" / "python.md"
-    study = next(section for section in sections(page) if "study.py" in section.files).files["study.py"]
+    study = next(section for section in parse_sections(page) if "study.py" in section.files).files["study.py"]
     (tmp_path / "study.py").write_text(study)
-    done = call([sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
+    done = run_to_end([sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
     assert done.code == 0, done.err
     assert (tmp_path / "first.html").is_file()
     assert "incomplete" not in done.out

@@ -11,9 +11,9 @@ import pytest
 
 import snakesim
 from snakesim.environments import SnakeEnv
-from snakesim.training.exported import export, learned_by
+from snakesim.training.exported import read_learned_parameters, write_onnx_file
 from snakesim.training.form import FORMS, OBSERVE, Policy
-from snakesim_gnc.control.policy import POLICIES, Model
+from snakesim_gnc.control.policy import POLICY_FOLDER, PolicyModel
 from snakesim_operator.cli import main, make_parser
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY
@@ -60,7 +60,7 @@ def test_training_search_resumed_reaches_the_same_policy(trained: Path, tmp_path
 
 @pytest.mark.slow
 def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) -> None:
-    began = learned_by(str(trained / "policy.onnx"))
+    began = read_learned_parameters(str(trained / "policy.onnx"))
     nothing = ("--generations", "1", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.1")
     typed = [
         "policy",
@@ -73,7 +73,7 @@ def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) 
         "0.01",
     ]
     assert main([*typed, "--workers", "1", "--out", str(tmp_path / "on")]) == 0
-    ended = learned_by(str(tmp_path / "on" / "policy.onnx"))
+    ended = read_learned_parameters(str(tmp_path / "on" / "policy.onnx"))
     assert ended.keys() == began.keys()
     for name, one in FORMS["feeling"].items():
         assert abs(ended[name] - began[name]) < 0.1 * one.sigma
@@ -93,13 +93,13 @@ def test_the_file_computes_what_was_searched_with(tmp_path: Path) -> None:
     env = SnakeEnv("surveyed_clutter", observe=OBSERVE, duration=1)
     values = {name: one.start + one.sigma for name, one in FORMS["feeling"].items()}
     sizes = {name: len(part.names) for name, part in env.parts.items()}
-    policy = Policy.of(values, [joint.axis for joint in env.description.joints], sizes)
-    export(tmp_path / "policy.onnx", policy, values, 5, ["snakesim", "policy", "train"])
-    model = Model(env.description, str(tmp_path / "policy.onnx"))
+    policy = Policy.make_from_parameters(values, [joint.axis for joint in env.description.joints], sizes)
+    write_onnx_file(tmp_path / "policy.onnx", policy, values, 5, ["snakesim", "policy", "train"])
+    model = PolicyModel(env.description, str(tmp_path / "policy.onnx"))
     random = np.random.default_rng(1)
     for _ in range(20):
         seen = random.normal(size=len(env.observation_names)).astype(np.float32)
-        assert np.allclose(model(seen), policy.targets(seen), atol=1e-5)
+        assert np.allclose(model(seen), policy.compute_targets(seen), atol=1e-5)
 
 
 @pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
@@ -112,7 +112,7 @@ def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, b
 
 @pytest.mark.parametrize(("name", "out"), [("clutter", "trained"), ("free", "free"), ("lab", "lab")])
 def test_training_shipped_policy_names_its_documented_command(name: str, out: str) -> None:
-    told = {one.key: one.value for one in onnx.load(POLICIES / f"{name}.onnx").metadata_props}
+    told = {one.key: one.value for one in onnx.load(POLICY_FOLDER / f"{name}.onnx").metadata_props}
     page = (REPOSITORY / "docs" / "development" / "shipped-policies.md").read_text().replace("\\\n", " ")
     (given,) = [
         line for line in page.splitlines() if line.startswith("snakesim policy train") and line.endswith(f"--out {out}")

@@ -136,8 +136,20 @@ def test_arrays_have_the_bits_of_a_robot_behind_the_limiter_of_the_hal(
         assert_equal(one, other, f"{number}")
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=lambda mode: mode.name)
-@pytest.mark.parametrize("name", EVERY_CASE)
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [
+        ("angles that jump", AutoresetMode.SAME_STEP),
+        ("positions among obstacles", AutoresetMode.SAME_STEP),
+        ("hot motors that are isolated", AutoresetMode.NEXT_STEP),
+        ("delayed sensors", AutoresetMode.NEXT_STEP),
+    ]
+    + [
+        pytest.param(name, mode, marks=pytest.mark.slow)
+        for name in CASES
+        for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+    ],
+)
 def test_rows_have_the_bits_of_single_environments(name: str, mode: AutoresetMode) -> None:
     """Gymnasium steps single environments one after the other, and merges their infos."""
     case = CASES[name]
@@ -206,7 +218,7 @@ def test_a_loop_has_the_bits_of_a_batch(monkeypatch: pytest.MonkeyPatch) -> None
         envs.reset(seed=1)
         actions = draw_actions(make(CASES["delayed sensors"]), seed=1)
         returned = [envs.step(np.tile(next(actions), (3, 1))) for _ in range(16)]
-        simulations = envs._episodes.robots._armed.simulated._simulations  # pyright: ignore
+        simulations = envs._episodes.robots._batch.simulated._simulations  # pyright: ignore
         envs.close()
         return returned, type(simulations)
 
@@ -227,7 +239,7 @@ def test_a_simulation_that_diverges_stops_only_its_environment() -> None:
         action = still if isinstance(envs, SnakeEnv) else np.tile(still, (3, 1))
         envs.step(action)
         episodes = envs._episodes
-        simulations = episodes.robots._armed.simulated._simulations  # pyright: ignore
+        simulations = episodes.robots._batch.simulated._simulations  # pyright: ignore
         simulations.base_velocity[0, 0] = 1e4
         _, _, terminated, _, infos = envs.step(action)
         if isinstance(envs, SnakeEnv):

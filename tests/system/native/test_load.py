@@ -26,14 +26,14 @@ def small_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[P
         monkeypatch.setattr(module, "SHIPPED_FOLDER", package / "compiled")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("SNAKESIM_NATIVE", raising=False)
-    load._load.cache_clear()
+    load._load_once.cache_clear()
     yield package
-    load._load.cache_clear()
+    load._load_once.cache_clear()
 
 
-def load_again() -> load.Loaded:
-    load._load.cache_clear()
-    return load.load(NUMBERS)
+def load_again() -> load.LoadedLibrary:
+    load._load_once.cache_clear()
+    return load.load_shared_library(NUMBERS)
 
 
 @pytest.fixture
@@ -45,8 +45,8 @@ def compiler() -> None:
 @pytest.mark.usefixtures("compiler")
 def test_a_library_is_compiled_when_it_is_first_needed(small_package: Path) -> None:
     loaded = load_again()
-    assert loaded.handle is not None, loaded.problem
-    assert loaded.handle.three() == 3
+    assert loaded.library is not None, loaded.problem
+    assert loaded.library.three() == 3
     assert loaded.path is not None
     assert loaded.path.parent == small_package / "compiled"
 
@@ -56,8 +56,8 @@ def test_a_changed_source_is_compiled_again_and_the_older_build_removed(small_pa
     old = load_again()
     (small_package / "numbers" / "three.c").write_text(SOURCE % 4)
     new = load_again()
-    assert new.handle is not None
-    assert new.handle.three() == 4
+    assert new.library is not None
+    assert new.library.three() == 4
     assert new.path != old.path
     assert list((small_package / "compiled").iterdir()) == [new.path]
 
@@ -70,7 +70,7 @@ def test_a_file_of_other_sources_under_the_expected_name_is_not_used(small_packa
     key = libraries.compute_build_key(NUMBERS, "")
     old.rename(old.with_name(libraries.make_file_name(NUMBERS, key)))
     loaded = load_again()
-    assert loaded.handle is None
+    assert loaded.library is None
     assert "was compiled from other sources" in loaded.problem
 
 
@@ -78,7 +78,7 @@ def test_a_file_of_other_sources_under_the_expected_name_is_not_used(small_packa
 def test_a_read_only_package_uses_the_cache_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(load, "_is_writable", lambda _folder: False)
     loaded = load_again()
-    assert loaded.handle is not None, loaded.problem
+    assert loaded.library is not None, loaded.problem
     assert loaded.path is not None
     assert loaded.path.is_relative_to(tmp_path / "cache")
 
@@ -86,8 +86,8 @@ def test_a_read_only_package_uses_the_cache_of_the_user(tmp_path: Path, monkeypa
 @pytest.mark.usefixtures("compiler")
 def test_two_processes_may_compile_at_the_same_time(tmp_path: Path) -> None:
     program = (
-        "from snakesim_native.compile import compile_library; from snakesim_native.libraries import LAWS; "
-        "from pathlib import Path; import sys; compile_library(LAWS, Path(sys.argv[1]))"
+        "from snakesim_native.compile import compile_library; from snakesim_native.libraries import LAWS_LIBRARY; "
+        "from pathlib import Path; import sys; compile_library(LAWS_LIBRARY, Path(sys.argv[1]))"
     )
     command = [sys.executable, "-c", program, str(tmp_path / "both")]
     processes = [subprocess.Popen(command) for _ in range(2)]
@@ -98,7 +98,7 @@ def test_two_processes_may_compile_at_the_same_time(tmp_path: Path) -> None:
 def test_no_compiler_is_a_reason_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native_compile, "list_compilers", lambda _target=None: [])
     loaded = load_again()
-    assert loaded.handle is None
+    assert loaded.library is None
     assert loaded.problem == native_compile.NO_COMPILER
 
 

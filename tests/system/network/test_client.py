@@ -8,8 +8,8 @@ from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Done, Pose
-from snakesim_testing.hal.local_network import received
-from snakesim_testing.hal.small_robots import clock, pose
+from snakesim_testing.hal.local_network import wait_for_messages
+from snakesim_testing.hal.small_robots import make_clock, make_pose
 from snakesim_testing.harness.wait import wait_until
 
 
@@ -17,19 +17,21 @@ def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Cl
     """The ticks of a service that was busy while all these clocks came."""
     host, service = sessions
     client = Client(service, "control")
-    publisher = host.publisher(keys.CLOCK, Clock, lossless=True)
+    publisher = host.declare_publisher(keys.CLOCK, Clock, lossless=True)
     wait_until(publisher.has_subscriber, "the service listens", 5.0)
     for each in clocks:
         publisher.put(each)
     wait_until(lambda: client._clocks.qsize() == len(clocks), "all clocks there", 5.0)
-    return client.ticks(0.05)
+    return client.iterate_ticks(0.05)
 
 
 def test_client_in_lockstep_answers_repeated_tick_once(
     sessions: tuple[Session, Session],
 ) -> None:
     ticks = shown(
-        sessions, [clock(0)] * 50 + [clock(0, arm_session=1), clock(1, arm_session=1), clock(2, arm_session=1)]
+        sessions,
+        [make_clock(0)] * 50
+        + [make_clock(0, arm_session=1), make_clock(1, arm_session=1), make_clock(2, arm_session=1)],
     )
     assert [(c.tick, c.arm_session) if c is not None else None for c in (next(ticks) for _ in range(4))] == [
         *((0, 1), (1, 1), (2, 1)),
@@ -43,12 +45,17 @@ def test_client_in_lockstep_ignores_sample_of_a_later_tick(
     """A delayed sensor has nothing at the first ticks, and a host that is ahead has already sent what comes then."""
     host, service = sessions
     client = Client(service, "guidance")
-    feed, ticks = client.subscribe(keys.POSE, Pose), client.ticks(5.0)
-    poses, clocks = (host.publisher(key, kind, lossless=True) for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock)))
+    feed, ticks = client.subscribe(keys.POSE, Pose), client.iterate_ticks(5.0)
+    poses, clocks = (
+        host.declare_publisher(key, kind, lossless=True) for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock))
+    )
     wait_until(lambda: poses.has_subscriber() and clocks.has_subscriber(), "the service listens", 5.0)
-    poses.put(pose(3))
+    poses.put(make_pose(3))
     seen: list[int | None] = []
-    for at in (clock(2, arm_session=1), msgspec.structs.replace(clock(3, arm_session=1), newest={keys.POSE: 3})):
+    for at in (
+        make_clock(2, arm_session=1),
+        msgspec.structs.replace(make_clock(3, arm_session=1), newest={keys.POSE: 3}),
+    ):
         clocks.put(at)
         assert next(ticks) is not None
         found = client.read(feed)
@@ -57,7 +64,7 @@ def test_client_in_lockstep_ignores_sample_of_a_later_tick(
 
 
 def test_in_real_time_only_the_newest_counts(sessions: tuple[Session, Session]) -> None:
-    ticks = shown(sessions, [clock(tick, clock_mode="realtime") for tick in range(5)])
+    ticks = shown(sessions, [make_clock(tick, clock_mode="realtime") for tick in range(5)])
     newest, nothing = next(ticks), next(ticks)
     assert newest is not None
     assert newest.tick == 4
@@ -69,14 +76,14 @@ def test_client_reports_done_for_a_tick_shown_again(
 ) -> None:
     host, service = sessions
     client = Client(service, "control")
-    reports = host.reader(keys.done_key("control"), Done)
-    publisher = host.publisher(keys.CLOCK, Clock, lossless=True)
+    reports = host.declare_reader(keys.done_key("control"), Done)
+    publisher = host.declare_publisher(keys.CLOCK, Clock, lossless=True)
     wait_until(publisher.has_subscriber, "the service listens", 5.0)
-    ticks = client.ticks(5.0)
+    ticks = client.iterate_ticks(5.0)
     for arm_session in (0, 1):
-        publisher.put(clock(0, arm_session=arm_session))
+        publisher.put(make_clock(0, arm_session=arm_session))
         assert next(ticks) is not None
         if arm_session == 0:
             client.commanded_tick = 0
         client.report_done(0)
-    assert received(reports, "the tick reported done") == [Done(tick=0)]
+    assert wait_for_messages(reports, "the tick reported done") == [Done(tick=0)]

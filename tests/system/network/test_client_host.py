@@ -29,8 +29,16 @@ from snakesim_hal.wire.messages import (
     Mode,
     Pose,
 )
-from snakesim_testing.hal.local_network import Follower, LagBackend, commanded, following, meeting, received, running
-from snakesim_testing.hal.small_robots import command, description, run_config, state
+from snakesim_testing.hal.local_network import (
+    Follower,
+    LagBackend,
+    connected_sessions,
+    running_commanded_host,
+    running_follower,
+    running_host,
+    wait_for_messages,
+)
+from snakesim_testing.hal.small_robots import make_description, make_joint_command, make_joint_state, make_run_config
 from snakesim_testing.harness.wait import wait_until
 
 pytestmark = [
@@ -47,18 +55,21 @@ def passive(points: SafeSetpoints) -> bool:
 
 
 def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]:
-    with running(run_config(), max_ticks=ticks) as run, following(run.link, Follower(amplitude_rad)) as control:
+    with (
+        running_host(make_run_config(), max_ticks=ticks) as run,
+        running_follower(run.link, Follower(amplitude_rad)) as control,
+    ):
         run.arm()
-        wait_until(run.ended, "the end of the run")
+        wait_until(run.has_ended, "the end of the run")
         statistics, box = run.host.statistics, run.host.black_box
-        assert (statistics.ticks, statistics.answered_ticks, box.ticks, run.backend.advanced) == (ticks,) * 4
+        assert (statistics.ticks, statistics.answered_ticks, box.row_count, run.backend.advanced) == (ticks,) * 4
         assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(range(1, ticks))
         assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {(t, t + 1) for t in range(ticks)}
         assert not run.host.authority.faults
         assert not run.host.authority.rejected_counts
         assert run.host.authority.state == "disarmed"
         assert passive(run.backend.enacted[-1])
-        return box.command_digest, box.layout.arrays(box.read_rows(0)[1])
+        return box.command_digest, box.layout.decode_rows(box.read_rows(0)[1])
 
 
 def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
@@ -75,13 +86,17 @@ def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
 
 def test_a_slow_participant_is_waited_for() -> None:
     """Guidance owes tick t only at the end of tick t + lag - 1, and no tick passes without it."""
-    config = run_config(services={"control": {}, "guidance": {"decimation": 5, "latency_ticks": 5}})
-    with running(config, max_ticks=40) as run, following(run.link, Follower()), open_session(run.link) as session:
+    config = make_run_config(services={"control": {}, "guidance": {"decimation": 5, "latency_ticks": 5}})
+    with (
+        running_host(config, max_ticks=40) as run,
+        running_follower(run.link, Follower()),
+        open_session(run.link) as session,
+    ):
         client = Client(session, "guidance")
-        client.description()
+        client.wait_for_description()
         client.announce()
         newest: dict[int, int] = {}
-        wait = iter(client.ticks(silence_s=0.05))
+        wait = iter(client.iterate_ticks(silence_timeout_s=0.05))
         client.report_done(next(clock.tick for clock in wait if clock is not None))
         run.arm()
         due = 5
@@ -89,21 +104,21 @@ def test_a_slow_participant_is_waited_for() -> None:
             if clock is not None:
                 newest[clock.tick] = clock.newest["guidance"]
                 if clock.tick == due + 4:  # at the last moment
-                    assert run.host.black_box.ticks <= due + 4
+                    assert run.host.black_box.row_count <= due + 4
                     client.report_done(due)
                     due += 5
-            if run.ended():
+            if run.has_ended():
                 break
-        assert run.host.black_box.ticks == 40
+        assert run.host.black_box.row_count == 40
         assert not run.host.authority.faults
         assert all(counted == max(tick - 5, 0) // 5 * 5 for tick, counted in newest.items())
 
 
 def test_client_that_stalls_loses_lease_and_joints_are_damped() -> None:
-    config = run_config(stall_limit_s=0.2)
-    with commanded(config, 20, end_after_fault_s=0.1) as (run, control):
+    config = make_run_config(stall_limit_s=0.2)
+    with running_commanded_host(config, 20, end_after_fault_s=0.1) as (run, control):
         control.silent.set()
-        wait_until(run.ended, "the end of the run")
+        wait_until(run.has_ended, "the end of the run")
         stalled, expired = run.host.authority.faults
         assert stalled.what == "service_stalled"
         assert "control is" in stalled.cause
@@ -116,17 +131,17 @@ def test_client_that_stalls_loses_lease_and_joints_are_damped() -> None:
 
 
 def test_client_that_leaves_is_named_and_robot_arms_again() -> None:
-    with running(run_config()) as run:
-        with following(run.link, Follower()) as control:
+    with running_host(make_run_config()) as run:
+        with running_follower(run.link, Follower()) as control:
             run.arm()
             wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
-        run.reaches("fault")
+        run.wait_for_lifecycle("fault")
         faults = {fault.what: fault.cause for fault in run.status.faults}
         assert "control is gone" in faults["service_lost"]
         assert "lease of control" in faults["lease_expired"]
-        assert not run.lifecycle("arm").ok
-        assert run.lifecycle("reset").ok
-        with following(run.link, Follower()) as control:
+        assert not run.request_lifecycle("arm").ok
+        assert run.request_lifecycle("reset").ok
+        with running_follower(run.link, Follower()) as control:
             run.arm()
             wait_until(lambda: len(control.armed_ticks) > 5, "five more ticks")
             assert run.status.lifecycle == "armed"
@@ -137,8 +152,8 @@ def test_client_that_leaves_is_named_and_robot_arms_again() -> None:
 
 
 def test_client_estop_by_anyone_lasts_until_reset_and_arming() -> None:
-    with commanded(run_config(clock_mode="realtime")) as (run, _):
-        answer = run.ask(keys.ESTOP, EstopRequest(requester="passer-by"))
+    with running_commanded_host(make_run_config(clock_mode="realtime")) as (run, _):
+        answer = run.request(keys.ESTOP, EstopRequest(requester="passer-by"))
         assert answer.ok
         assert answer.lifecycle == "estop"
         at = len(run.backend.enacted)
@@ -146,19 +161,19 @@ def test_client_estop_by_anyone_lasts_until_reset_and_arming() -> None:
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
         assert "passer-by" in run.status.reason
         assert run.status.faults[-1].what == "estop"
-        assert "must be disarmed" in run.lifecycle("arm").reason
-        assert run.lifecycle("reset").lifecycle == "disarmed"
+        assert "must be disarmed" in run.request_lifecycle("arm").reason
+        assert run.request_lifecycle("reset").lifecycle == "disarmed"
         run.arm()
-        assert run.lifecycle("finish").ok
-        wait_until(run.ended, "the end of the run")
+        assert run.request_lifecycle("finish").ok
+        wait_until(run.has_ended, "the end of the run")
         assert passive(run.backend.enacted[-1])
 
 
 def test_client_second_holder_needs_higher_priority() -> None:
-    with running(run_config(clock_mode="realtime")) as run, following(run.link, Follower()) as control:
+    with running_host(make_run_config(clock_mode="realtime")) as run, running_follower(run.link, Follower()) as control:
         run.arm()
         request = LeaseRequest(action="acquire", holder="teleop")
-        answer = run.ask(keys.LEASE, request)
+        answer = run.request(keys.LEASE, request)
         assert not answer.ok
         assert answer.reason.startswith("held by control (epoch ")
         assert "priority 100" in answer.reason
@@ -166,12 +181,14 @@ def test_client_second_holder_needs_higher_priority() -> None:
         assert answer.lifecycle == "armed"
         assert answer.host == run.host.description.host
         wait_until(lambda: len(control.armed_ticks) > 5, "the robot going on undisturbed")
-        answer = run.ask(keys.LEASE, LeaseRequest(action="acquire", holder="teleop", priority=200))
+        answer = run.request(keys.LEASE, LeaseRequest(action="acquire", holder="teleop", priority=200))
         assert answer.ok
         assert answer.lifecycle == "disarmed"
         at = len(run.backend.enacted)
-        late = command(run.host.description, 0.2, lease_epoch=held, sequence=10**6)  # the old holder has not heard yet
-        run.session.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True).put(late)
+        late = make_joint_command(
+            run.host.description, 0.2, lease_epoch=held, sequence=10**6
+        )  # the old holder has not heard yet
+        run.session.declare_publisher(keys.JOINT_COMMAND, JointCommand, lossless=True).put(late)
         refused = run.host.authority.rejected_counts
         wait_until(lambda: refused["wrong_epoch"] + refused["no_lease"] > 0, "the old holder's command refused")
         wait_until(lambda: len(run.backend.enacted) > at + 3, "three ticks")
@@ -179,19 +196,19 @@ def test_client_second_holder_needs_higher_priority() -> None:
 
 
 def test_arming_waits_for_all_services_with_time_paused() -> None:
-    with running(run_config()) as run:
+    with running_host(make_run_config()) as run:
         assert run.status.waiting_for == ["control"]
         assert "waiting for control" in run.status.reason
-        answer = run.lifecycle("arm")
+        answer = run.request_lifecycle("arm")
         assert not answer.ok
         assert answer.reason == "waiting for control"
-        with following(run.link, Follower()) as control:
+        with running_follower(run.link, Follower()) as control:
             wait_until(lambda: len(control.ticks_seen) >= 3, "three showings of tick 0")
             assert set(control.ticks_seen) == {0}
             assert run.backend.advanced == 0
             assert not run.backend.enacted
             assert run.status.tick == 0
-            assert run.host.black_box.ticks == 0
+            assert run.host.black_box.row_count == 0
             run.arm()
         assert run.status.alive == ["control"] or run.host.authority.faults
 
@@ -200,7 +217,7 @@ def test_arming_waits_for_all_services_with_time_paused() -> None:
 
 
 def test_host_counts_and_survives_everything_sent_to_it() -> None:
-    garbage = [b"", b"\xff" * 50, b"\x91" * 100_000, encode(description())]
+    garbage = [b"", b"\xff" * 50, b"\x91" * 100_000, encode(make_description())]
     foreign = [
         "zenoh/bytes",
         ENCODING_PREFIX + "Gone/1",
@@ -221,7 +238,7 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
         "hal/done/*",
         "**",
     ]
-    with running(run_config()) as run, following(run.link, Follower()) as control:
+    with running_host(make_run_config()) as run, running_follower(run.link, Follower()) as control:
         run.arm()
         put, get = run.session._zenoh.put, run.session._zenoh.get  # a stranger does not keep to our session
         for key, payload, encoding in itertools.product(samples, garbage, own + foreign):
@@ -248,13 +265,13 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
 
 def test_host_ignores_commands_and_answers_of_a_stranger() -> None:
     """In lockstep a tick ends when the holder has answered; a refused command of somebody else is no answer."""
-    with meeting("worm") as (session,):
-        host = Host(run_config(), GuardedBackend(LagBackend(run_config())), session)
-        host.authority.observe(state(host.description))
-        host.authority.on_lease(LeaseRequest(action="acquire", holder="control"), 0)
+    with connected_sessions("worm") as (session,):
+        host = Host(make_run_config(), GuardedBackend(LagBackend(make_run_config())), session)
+        host.authority.observe_joints(make_joint_state(host.description))
+        host.authority.handle_lease_request(LeaseRequest(action="acquire", holder="control"), 0)
         own = host.authority.lease.epoch
         for epoch, done_tick in ((0, -1), (own + 6, -1), (own, 0)):
-            sent = command(host.description, 0.1, lease_epoch=epoch)
+            sent = make_joint_command(host.description, 0.1, lease_epoch=epoch)
             arrival = Arrival(keys.JOINT_COMMAND, encode(sent), format_encoding(JointCommand), time.monotonic_ns())
             host._inbox.handle(CommandArrival(arrival, Decoder(JointCommand)))
             assert host.participants["control"].done_tick == done_tick
@@ -263,26 +280,26 @@ def test_host_ignores_commands_and_answers_of_a_stranger() -> None:
 
 def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
     limit = LIMITS[SAMPLES] or 0
-    config = run_config(clock_mode="realtime")
-    with meeting("worm", "worm") as (own, stranger):
+    config = make_run_config(clock_mode="realtime")
+    with connected_sessions("worm", "worm") as (own, stranger):
         host = Host(config, GuardedBackend(LagBackend(config)), own)
-        publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
+        publisher = stranger.declare_publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
         for sequence in range(limit + 500):
-            publisher.put(command(host.description, sequence=sequence))
+            publisher.put(make_joint_command(host.description, sequence=sequence))
         wait_until(lambda: host._inbox.dropped >= 400, "a full inbox")
         answers: list[Any] = []
         request = EstopRequest(requester="a person")
-        asking = threading.Thread(target=lambda: answers.append(stranger.request(keys.ESTOP, request, 10.0)))
+        asking = threading.Thread(target=lambda: answers.append(stranger.send_request(keys.ESTOP, request, 10.0)))
         asking.start()
         wait_until(lambda: host._inbox.waiting() > limit, "the estop in the inbox")
         thread = threading.Thread(target=host.run)
         thread.start()
         asking.join(15.0)
-        host.stop()
+        host.request_stop()
         thread.join(15.0)
         assert answers[0].ok
         assert answers[0].lifecycle == "estop"
-        assert host.requests[0].startswith("tick 0: estop by 'a person', done")
+        assert host.request_log[0].startswith("tick 0: estop by 'a person', done")
 
 
 # --- realtime and free -----------------------------------------------------------------------------------------
@@ -290,11 +307,11 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
 
 def test_realtime_keeps_its_deadlines_on_average() -> None:
     """As many periods pass as there is time for, and are answered; how many are late is for the computer to say."""
-    config = run_config(clock_mode="realtime", rate_hz=50.0)
-    with running(config, max_ticks=50) as run, following(run.link, Follower()):
+    config = make_run_config(clock_mode="realtime", rate_hz=50.0)
+    with running_host(config, max_ticks=50) as run, running_follower(run.link, Follower()):
         run.arm()
-        wait_until(run.ended, "the end of the run")
-        assert run.host.wall_s == pytest.approx(1.0, rel=0.1)
+        wait_until(run.has_ended, "the end of the run")
+        assert run.host.armed_wall_time_s == pytest.approx(1.0, rel=0.1)
         assert not run.host.authority.faults
         found = run.host.statistics
         assert found.answered_ticks + found.overruns >= 0.7 * found.ticks
@@ -307,7 +324,7 @@ def test_realtime_keeps_its_deadlines_on_average() -> None:
 
 def test_host_names_backend_too_slow_and_a_rate_that_holds() -> None:
     """Also where nothing is armed: arming may be what its old samples prevent."""
-    with running(run_config(clock_mode="realtime", rate_hz=50.0)) as run:
+    with running_host(make_run_config(clock_mode="realtime", rate_hz=50.0)) as run:
         run.backend.read_s = 0.03
         slow = "backend 'lag' takes 3"
         wait_until(lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning")
@@ -318,7 +335,7 @@ def test_host_names_backend_too_slow_and_a_rate_that_holds() -> None:
 
 
 def test_free_waits_for_nobody() -> None:
-    with running(run_config(clock_mode="free")) as run:
+    with running_host(make_run_config(clock_mode="free")) as run:
         wait_until(lambda: run.backend.advanced > 200, "two hundred ticks without anybody")
         assert run.host.authority.state == "disarmed"
         assert all(passive(points) for points in run.backend.enacted)
@@ -328,10 +345,10 @@ def test_free_waits_for_nobody() -> None:
 
 
 def test_client_that_joins_late_receives_description_status_and_setpoints() -> None:
-    with commanded(run_config()) as (run, _), open_session(run.link) as late:
-        descriptions = late.latched_reader(keys.DESCRIPTION, Description)
-        assert received(descriptions, "the description") == [run.host.description]
-        applied, poses = late.reader(keys.APPLIED, AppliedCommand), late.reader(keys.POSE, Pose)
-        commands = received(applied, "applied commands", 4)
+    with running_commanded_host(make_run_config()) as (run, _), open_session(run.link) as late:
+        descriptions = late.declare_latched_reader(keys.DESCRIPTION, Description)
+        assert wait_for_messages(descriptions, "the description") == [run.host.description]
+        applied, poses = late.declare_reader(keys.APPLIED, AppliedCommand), late.declare_reader(keys.POSE, Pose)
+        commands = wait_for_messages(applied, "applied commands", 4)
         assert all(c.sequence is not None and c.mode == [Mode.POSITION] * 3 for c in commands)
-        assert all(pose.tick % 5 == 0 for pose in received(poses, "a pose"))
+        assert all(pose.tick % 5 == 0 for pose in wait_for_messages(poses, "a pose"))

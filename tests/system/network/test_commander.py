@@ -10,29 +10,29 @@ from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, JointState, LeaseRequest
-from snakesim_testing.hal.local_network import meeting, running
-from snakesim_testing.hal.small_robots import clock, description, run_config, state
+from snakesim_testing.hal.local_network import connected_sessions, running_host
+from snakesim_testing.hal.small_robots import make_clock, make_description, make_joint_state, make_run_config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 
 def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
-    robot, network = description(), LocalNetwork()
-    feed = Feed(network.session().reader(keys.JOINTS, JointState), keys.JOINTS)
-    joints = network.session().publisher(keys.JOINTS, JointState)
+    robot, network = make_description(), LocalNetwork()
+    feed = Feed(network.create_session().declare_reader(keys.JOINTS, JointState), keys.JOINTS)
+    joints = network.create_session().declare_publisher(keys.JOINTS, JointState)
     assert feed.newest() is None
-    assert feed.at(0) is None
+    assert feed.get_at_tick(0) is None
     for tick in range(100):
-        joints.put(state(robot, 0.1 * tick, tick=tick))
-        feed.store_arrived()
-    newest, kept = feed.newest(), feed.at(99)
+        joints.put(make_joint_state(robot, 0.1 * tick, tick=tick))
+        feed.store_arrived_samples()
+    newest, kept = feed.newest(), feed.get_at_tick(99)
     assert newest is not None
     assert newest.tick == 99
     assert kept is newest
-    assert feed.at(50) is None
-    assert feed.at(90) is not None
-    joints.put(state(robot, 0.0, tick=90))  # shown again: it came last
-    feed.store_arrived()
+    assert feed.get_at_tick(50) is None
+    assert feed.get_at_tick(90) is not None
+    joints.put(make_joint_state(robot, 0.0, tick=90))  # shown again: it came last
+    feed.store_arrived_samples()
     newest = feed.newest()
     assert newest is not None
     assert newest.tick == 90
@@ -41,23 +41,23 @@ def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
 
 
 def naming(tick: int, joints_tick: int, arm_session: int = 1) -> Clock:
-    return clock(tick, arm_session=arm_session, newest={keys.JOINTS: joints_tick})
+    return make_clock(tick, arm_session=arm_session, newest={keys.JOINTS: joints_tick})
 
 
 def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    robot = description()
+    robot = make_description()
     monkeypatch.setattr("snakesim_hal.network.client.MISSING_SAMPLE_TIMEOUT_S", 0.1)
-    with meeting("worm", "worm") as (hal, session):
+    with connected_sessions("worm", "worm") as (hal, session):
         client = Client(session, "control")
         feed = client.subscribe(keys.JOINTS, JointState)
-        clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
-        joints = hal.publisher(keys.JOINTS, JointState, lossless=True)
+        clocks = hal.declare_publisher(keys.CLOCK, Clock, lossless=True)
+        joints = hal.declare_publisher(keys.JOINTS, JointState, lossless=True)
         wait_until(lambda: clocks.has_subscriber() and joints.has_subscriber(), "the client's subscriptions")
-        ticks = iter(client.ticks(silence_s=5.0))
+        ticks = iter(client.iterate_ticks(silence_timeout_s=5.0))
         for tick in (3, 4):
-            joints.put(state(robot, tick=tick))
+            joints.put(make_joint_state(robot, tick=tick))
         clocks.put(naming(5, 3))
         assert client.read(feed) is None  # no clock yet
         assert next(ticks) == naming(5, 3)
@@ -66,7 +66,7 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
         assert found.tick == 3  # what is named, not what is newest
         clocks.put(naming(6, 6))
         next(ticks)
-        late = threading.Timer(0.03, lambda: joints.put(state(robot, tick=6)))
+        late = threading.Timer(0.03, lambda: joints.put(make_joint_state(robot, tick=6)))
         late.start()
         found = client.read(feed)
         assert found is not None
@@ -85,18 +85,18 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
 
 
 def test_commander_requests_free_lease_and_releases_passed_one() -> None:
-    with running(run_config(clock_mode="realtime", services={})) as run, open_session(run.link) as session:
+    with running_host(make_run_config(clock_mode="realtime", services={})) as run, open_session(run.link) as session:
         client = Client(session, "pilot")
-        commander = Commander(client, client.description())
+        commander = Commander(client, client.wait_for_description())
         other = LeaseRequest(action="acquire", holder="teleop", priority=200)
-        assert run.ask(keys.LEASE, other).ok
-        ticks = (found for found in client.ticks(silence_s=1.0) if found is not None)
+        assert run.request(keys.LEASE, other).ok
+        ticks = (found for found in client.iterate_ticks(silence_timeout_s=1.0) if found is not None)
         held = [commander.ensure_lease(next(ticks)) for _ in range(2)]
         assert held[0] is False
-        assert commander.refusal is not None
-        assert "held by teleop" in commander.refusal
+        assert commander.lease_refusal is not None
+        assert "held by teleop" in commander.lease_refusal
         wait_until(lambda: commander.ensure_lease(next(ticks)), "the end of teleop's lease", 10.0)
-        assert commander.refusal is None
+        assert commander.lease_refusal is None
         assert run.host.authority.lease.holder == "pilot"
-        assert run.ask(keys.LEASE, other).ok
+        assert run.request(keys.LEASE, other).ok
         wait_until(lambda: not commander.ensure_lease(next(ticks)), "the lease seen to have passed on")

@@ -7,8 +7,13 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import child_environment, python_command
-from snakesim_hal.network.endpoint import check_endpoint, check_guarded, check_loopback, check_namespace
+from snakesim_hal.base.process import make_child_environment, make_python_command
+from snakesim_hal.network.endpoint import (
+    check_endpoint,
+    check_namespace,
+    require_loopback_up,
+    require_safe_listening_endpoint,
+)
 from snakesim_testing.messages import raises_error
 
 GOOD = [
@@ -59,13 +64,13 @@ def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
     ],
 )
 def test_endpoint_for_other_machines_needs_access_control_or_a_request(endpoint: str, exposed: bool) -> None:
-    check_guarded(endpoint, "--endpoint", insecure=True)
-    check_guarded(endpoint, "--endpoint", access_control=True)
+    require_safe_listening_endpoint(endpoint, "--endpoint", insecure=True)
+    require_safe_listening_endpoint(endpoint, "--endpoint", access_control=True)
     if exposed:
         with raises_error(ConfigError, code="network/insecure-endpoint", field="--endpoint"):
-            check_guarded(endpoint, "--endpoint")
+            require_safe_listening_endpoint(endpoint, "--endpoint")
     else:
-        check_guarded(endpoint, "--endpoint")
+        require_safe_listening_endpoint(endpoint, "--endpoint")
 
 
 def test_namespaces() -> None:
@@ -82,13 +87,13 @@ LOOKS = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.a
 def test_endpoint_on_loopback_that_is_down_is_named(tmp_path: Path) -> None:
     if shutil.which("unshare") is None or subprocess.run([*APART, "true"], check=False, capture_output=True).returncode:
         pytest.skip("no network namespace can be made here")
-    command = [*APART, *python_command("-c", LOOKS), "run", "triplet", "--out", "run"]
+    command = [*APART, *make_python_command("-c", LOOKS), "run", "triplet", "--out", "run"]
     ended = subprocess.run(
-        command, cwd=tmp_path, env=child_environment(), capture_output=True, text=True, timeout=60, check=False
+        command, cwd=tmp_path, env=make_child_environment(), capture_output=True, text=True, timeout=60, check=False
     )
     assert ended.returncode == 1
     assert "loopback interface" in ended.stderr
     assert "ip link set lo up" in ended.stderr
     assert not (tmp_path / "run").exists()
-    check_loopback("tcp/127.0.0.1:7447")
-    check_loopback("tcp/192.0.2.1:7447")  # not on loopback: whether it answers is another question
+    require_loopback_up("tcp/127.0.0.1:7447")
+    require_loopback_up("tcp/192.0.2.1:7447")  # not on loopback: whether it answers is another question

@@ -7,7 +7,7 @@ import subprocess
 import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.network import free_ports
 from snakesim_hal.network.free_ports import BLOCK_PORTS, FIRST_PORT, LOOPBACK, find_free_port
 from snakesim_testing.messages import raises_error
@@ -25,8 +25,8 @@ def test_processes_that_choose_ports_at_the_same_time_get_different_ones() -> No
     """All of them choose before any of them has bound a port."""
     choosing = [
         subprocess.Popen(
-            python_command("-c", CHOOSE),
-            env=child_environment(),
+            make_python_command("-c", CHOOSE),
+            env=make_child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -10,7 +10,7 @@ from snakesim_hal.network.streams import Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Answer, Done, JointCommand, LeaseRequest
-from snakesim_testing.hal.small_robots import command, description
+from snakesim_testing.hal.small_robots import make_description, make_joint_command
 from snakesim_testing.messages import raises_error
 
 REQUEST = LeaseRequest(action="acquire", holder="control")
@@ -18,32 +18,32 @@ REQUEST = LeaseRequest(action="acquire", holder="control")
 
 def test_local_network_delivers_matching_keys_and_latched_values_later() -> None:
     network = LocalNetwork()
-    one, other = network.session(), network.session()
-    every, reader = other.reader(keys.DONE_ALL, Done), other.reader(keys.done_key("control"), Done)
-    publisher = one.latched_publisher(keys.done_key("control"), Done)
+    one, other = network.create_session(), network.create_session()
+    every, reader = other.declare_reader(keys.DONE_ALL, Done), other.declare_reader(keys.done_key("control"), Done)
+    publisher = one.declare_latched_publisher(keys.done_key("control"), Done)
     assert publisher.has_subscriber()
     publisher.put(Done(tick=1))
     publisher.put(Done(tick=2))
-    one.publisher(keys.done_key("guidance"), Done).put(Done(tick=3))
+    one.declare_publisher(keys.done_key("guidance"), Done).put(Done(tick=3))
     assert [done.tick for done in reader.drain()] == [1, 2]
     assert [done.tick for done in every.drain()] == [1, 2, 3]
-    assert other.latest(keys.done_key("control"), Done, 0.0) == Done(tick=2)
+    assert other.wait_for_latched(keys.done_key("control"), Done, 0.0) == Done(tick=2)
     other.close()
     assert not publisher.has_subscriber()
 
 
 def test_tokens_come_and_go_with_their_session() -> None:
     network, seen = LocalNetwork(), list[tuple[str, bool]]()
-    one, other = network.session(), network.session()
+    one, other = network.create_session(), network.create_session()
     one.declare_alive("control")
-    other.on_alive(lambda key, present: seen.append((keys.parse_service(key), present)))
+    other.on_token_change(lambda key, present: seen.append((keys.parse_service(key), present)))
     one.close()
     assert seen == [("control", True), ("control", False)]
 
 
 def test_who_is_asked_answers_before_the_question_returns() -> None:
     network, asked = LocalNetwork(), list[Query]()
-    host, client = network.session(), network.session()
+    host, client = network.create_session(), network.create_session()
     host.on_query(keys.LEASE, asked.append)
     answer = Answer(ok=True, reason="", epoch=7, lifecycle="disarmed", host="a")
 
@@ -51,20 +51,20 @@ def test_who_is_asked_answers_before_the_question_returns() -> None:
         for question in asked:
             question.reply(answer)
 
-    network.answer = reply
-    assert client.request(keys.LEASE, REQUEST, host="a").epoch == 7
+    network.run_responders = reply
+    assert client.send_request(keys.LEASE, REQUEST, host="a").epoch == 7
     with raises_error(NotConnectedError, code="network/no-answer"):
-        client.request(keys.LEASE, REQUEST, timeout_s=0.01, host="b")
+        client.send_request(keys.LEASE, REQUEST, timeout_s=0.01, host="b")
     with raises_error(NotConnectedError, code="network/no-answer"):
-        client.request(keys.ESTOP, REQUEST)
+        client.send_request(keys.ESTOP, REQUEST)
 
 
 def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -> None:
     network = LocalNetwork()
-    sender, one, other = network.session(), network.session(), network.session()
-    readers = [session.reader(keys.done_key("control"), Done) for session in (one, other)]
+    sender, one, other = network.create_session(), network.create_session(), network.create_session()
+    readers = [session.declare_reader(keys.done_key("control"), Done) for session in (one, other)]
     sent = Done(tick=4)
-    sender.publisher(keys.done_key("control"), Done).put(sent)
+    sender.declare_publisher(keys.done_key("control"), Done).put(sent)
     (first,), (second,) = (reader.drain() for reader in readers)
     assert first is second
     assert first == sent
@@ -73,10 +73,10 @@ def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -
 
 def test_each_reader_checks_what_no_reader_could_decode() -> None:
     network = LocalNetwork()
-    sender, one, other = network.session(), network.session(), network.session()
+    sender, one, other = network.create_session(), network.create_session(), network.create_session()
     key = keys.done_key("control")
-    readers = [one.reader(key, Done), other.reader(key, Done), other.reader(key, Answer)]
-    publisher = sender.publisher(key, Done)
+    readers = [one.declare_reader(key, Done), other.declare_reader(key, Done), other.declare_reader(key, Answer)]
+    publisher = sender.declare_publisher(key, Done)
     publisher.put(Done(tick=4), encode(Done(tick=-4)))
     assert [reader.drain() for reader in readers] == [[], [], []]
     assert one.rejected == {"malformed": 1}
@@ -85,11 +85,11 @@ def test_each_reader_checks_what_no_reader_could_decode() -> None:
 
 def test_host_shares_no_command_with_the_readers_of_its_process() -> None:
     network = LocalNetwork()
-    sender, reading, host = network.session(), network.session(), network.session()
-    reader = reading.reader(keys.JOINT_COMMAND, JointCommand)
+    sender, reading, host = network.create_session(), network.create_session(), network.create_session()
+    reader = reading.declare_reader(keys.JOINT_COMMAND, JointCommand)
     receiver = mock.Mock()
     inbox = Inbox(host, receiver, [], lambda _query, _answer: None)
-    sender.publisher(keys.JOINT_COMMAND, JointCommand).put(command(description(), 0.1))
+    sender.declare_publisher(keys.JOINT_COMMAND, JointCommand).put(make_joint_command(make_description(), 0.1))
     (read,) = reader.drain()
     read.target[0] = 3.0  # as a careless service might
     inbox.handle_queued(math.inf)

@@ -3,17 +3,22 @@
 import msgspec
 import pytest
 
-from snakesim_hal.model.scenario import RunConfig, load, parse_set
-from snakesim_hal.network.process_entries import ProcessEntries, find_differences, own_entry, show_process
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
+from snakesim_hal.network.process_entries import (
+    ProcessEntries,
+    describe_differences,
+    make_own_entry,
+    publish_process_entry,
+)
 from snakesim_hal.network.session import Session
-from snakesim_hal.programs.preflight import check_backend
+from snakesim_hal.programs.preflight import validate_backend_config
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Process
 from snakesim_testing.harness.wait import wait_until
 
 
 def config(*sets: str) -> RunConfig:
-    return load("triplet", [parse_set(text) for text in sets]).config
+    return load_scenario("triplet", [parse_set_option(text) for text in sets]).config
 
 
 @pytest.mark.parametrize(
@@ -33,8 +38,8 @@ def test_a_difference_is_reported_with_its_key_and_both_values(
     change: str, named: str, sessions: tuple[Session, Session]
 ) -> None:
     here, there = sessions
-    entries, own = ProcessEntries(here), own_entry("host", config())
-    show_process(there, own_entry("control", config(change)))
+    entries, own = ProcessEntries(here), make_own_entry("host", config())
+    publish_process_entry(there, make_own_entry("control", config(change)))
     wait_until(lambda: bool(entries.find_problems(own, ["control"])), "an entry", 5.0)
     wait_until(lambda: named in entries.find_problems(own, ["control"])[0], named, 5.0)
     (reported,) = entries.find_problems(own, ["control"])
@@ -50,19 +55,19 @@ def test_modes_that_a_backend_does_not_have_are_no_difference(backend: str, driv
     """The host leaves them out of its configuration, and a service does not know the backend."""
     both = ("clock_mode=realtime", f'robot.drive.driver="{driver}"')
     of_service = config(*both)
-    of_host = check_backend(config(*both, f"backend={backend}"))
-    assert find_differences(own_entry("control", of_service), own_entry("host", of_host)) == []
+    of_host = validate_backend_config(config(*both, f"backend={backend}"))
+    assert describe_differences(make_own_entry("control", of_service), make_own_entry("host", of_host)) == []
 
 
 def test_what_only_one_of_them_uses_may_differ(sessions: tuple[Session, Session]) -> None:
     here, there = sessions
-    entries, own = ProcessEntries(here), own_entry("host", config())
-    service = own_entry(
+    entries, own = ProcessEntries(here), make_own_entry("host", config())
+    service = make_own_entry(
         "control", config("backend=can", "duration_s=3", "title=another", "services.control.restart=false")
     )
-    show_process(there, service)
-    show_process(there, msgspec.structs.replace(service, name="recorder", settings={}, messages={}))
-    wait_until(lambda: len(here.present(keys.PROCESS_ALL)) == 2, "both", 5.0)
+    publish_process_entry(there, service)
+    publish_process_entry(there, msgspec.structs.replace(service, name="recorder", settings={}, messages={}))
+    wait_until(lambda: len(here.list_tokens(keys.PROCESS_ALL)) == 2, "both", 5.0)
     wait_until(lambda: entries.find_problems(own, ["control", "recorder"]) == [], "no difference", 5.0)
 
 
@@ -70,7 +75,7 @@ def test_process_entry_with_other_version_is_reported_while_alive(
     sessions: tuple[Session, Session],
 ) -> None:
     here, there = sessions
-    entries, own = ProcessEntries(here), own_entry("host", config())
+    entries, own = ProcessEntries(here), make_own_entry("host", config())
     key = keys.process_key("control", "1")
     there.declare_token(key)
     wait_until(
@@ -79,7 +84,7 @@ def test_process_entry_with_other_version_is_reported_while_alive(
         5.0,
     )
     newer = msgspec.structs.replace(own, name="control", messages={**own.messages, "JointCommand": 2, "Leap": 1})
-    shown = there.latched_publisher(key, Process)
+    shown = there.declare_latched_publisher(key, Process)
     shown.put(newer)
     wait_until(
         lambda: "message JointCommand version 2 (here " in "".join(entries.find_problems(own, ["control"])),

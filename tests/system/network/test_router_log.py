@@ -109,8 +109,8 @@ def test_a_flood_of_different_lines_is_bounded() -> None:
 
 ROUTER = """
 import os
-from snakesim_hal.network.router_log import short_log
-with short_log():
+from snakesim_hal.network.router_log import shortened_zenoh_log
+with shortened_zenoh_log():
     print("ours", flush=True)
     for number in range(20_000):
         text = f"f1 is {what} to Put (egress) on {number}"

@@ -16,65 +16,65 @@ from snakesim_hal.network.streams import Arrival, Publisher, Query
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
-from snakesim_testing.hal.local_network import meeting, received, threads_switching
-from snakesim_testing.hal.small_robots import description, state
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.hal.local_network import connected_sessions, fast_thread_switching, wait_for_messages
+from snakesim_testing.hal.small_robots import make_description, make_joint_state
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
-ROBOT = description()
+ROBOT = make_description()
 
 
 def test_session_latched_value_reaches_later_readers_once() -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal:
-        publisher = hal.latched_publisher(keys.JOINTS, JointState)
+        publisher = hal.declare_latched_publisher(keys.JOINTS, JointState)
         for tick in range(3):
-            publisher.put(state(ROBOT, tick=tick))
+            publisher.put(make_joint_state(ROBOT, tick=tick))
         with open_session(Link(endpoint, "worm")) as late:
-            reader, arrived = late.latched_reader(keys.JOINTS, JointState), list[Arrival]()
+            reader, arrived = late.declare_latched_reader(keys.JOINTS, JointState), list[Arrival]()
             late.on_latched_arrival(keys.JOINTS, arrived.append)
-            found = received(reader, "the latched value")
+            found = wait_for_messages(reader, "the latched value")
             wait_until(lambda: arrived, "the latched arrival")
             assert [joints.tick for joints in found] == [2]
             assert arrived[0].key == keys.JOINTS
-            publisher.put(state(ROBOT, tick=3))
-            assert [joints.tick for joints in received(reader, "the next value")] == [3]
+            publisher.put(make_joint_state(ROBOT, tick=3))
+            assert [joints.tick for joints in wait_for_messages(reader, "the next value")] == [3]
 
 
 def test_session_early_reader_gets_value_when_publisher_joins() -> None:
-    with meeting("worm", "worm", "worm") as (_, early, hal):
-        reader = early.latched_reader(keys.JOINTS, JointState)
-        hal.latched_publisher(keys.JOINTS, JointState).put(state(ROBOT, tick=7))
-        assert received(reader, "the value")[0].tick == 7
+    with connected_sessions("worm", "worm", "worm") as (_, early, hal):
+        reader = early.declare_latched_reader(keys.JOINTS, JointState)
+        hal.declare_latched_publisher(keys.JOINTS, JointState).put(make_joint_state(ROBOT, tick=7))
+        assert wait_for_messages(reader, "the value")[0].tick == 7
 
 
 def test_a_stream_is_not_given_to_those_who_come_late() -> None:
-    with meeting("worm", "worm") as (hal, session):
-        publisher = hal.publisher(keys.JOINTS, JointState)
-        publisher.put(state(ROBOT, tick=1))
-        reader = session.reader(keys.JOINTS, JointState)
+    with connected_sessions("worm", "worm") as (hal, session):
+        publisher = hal.declare_publisher(keys.JOINTS, JointState)
+        publisher.put(make_joint_state(ROBOT, tick=1))
+        reader = session.declare_reader(keys.JOINTS, JointState)
         wait_until(publisher.has_subscriber, "the subscription")
-        publisher.put(state(ROBOT, tick=2))
-        assert [joints.tick for joints in received(reader, "the sample")] == [2]
+        publisher.put(make_joint_state(ROBOT, tick=2))
+        assert [joints.tick for joints in wait_for_messages(reader, "the sample")] == [2]
 
 
 def test_session_reader_keeps_newest_and_counts_dropped_samples() -> None:
-    with meeting("worm", "worm") as (hal, session):
-        reader = session.reader(keys.JOINTS, JointState, depth=4)
-        publisher = hal.publisher(keys.JOINTS, JointState, lossless=True)
+    with connected_sessions("worm", "worm") as (hal, session):
+        reader = session.declare_reader(keys.JOINTS, JointState, depth=4)
+        publisher = hal.declare_publisher(keys.JOINTS, JointState, lossless=True)
         wait_until(publisher.has_subscriber, "the subscription")
         arrived: list[Arrival] = []
         session.on_arrival(keys.done_key("end"), arrived.append)
-        end = hal.publisher(keys.done_key("end"), Done, lossless=True)
+        end = hal.declare_publisher(keys.done_key("end"), Done, lossless=True)
         wait_until(end.has_subscriber, "the second subscription")
         for tick in range(20):
-            publisher.put(state(ROBOT, tick=tick))
+            publisher.put(make_joint_state(ROBOT, tick=tick))
         end.put(Done(tick=0))
         wait_until(lambda: arrived, "the last sample")
         assert [joints.tick for joints in reader.drain()] == [16, 17, 18, 19]
         assert reader.drain() == []
-        good = encode(state(ROBOT, tick=20))
+        good = encode(make_joint_state(ROBOT, tick=20))
         bad = [
             (good, ENCODING_PREFIX + "JointState/2"),
             (good, "zenoh/bytes"),
@@ -82,20 +82,20 @@ def test_session_reader_keeps_newest_and_counts_dropped_samples() -> None:
         ]
         for payload, encoding in [*bad, (good, ENCODING_PREFIX + "JointState/1")]:
             hal._zenoh.put(keys.JOINTS, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
-        assert [joints.tick for joints in received(reader, "the good one")] == [20]
+        assert [joints.tick for joints in wait_for_messages(reader, "the good one")] == [20]
         assert session.rejected == {"unknown_version": 1, "unknown_message": 1, "malformed": 1}
 
 
 def test_a_session_closes_while_urgent_samples_arrive() -> None:
     """They are taken in Zenoh's own threads, which wait for the interpreter that closes the session."""
-    endpoint, stopped = free_endpoint(), threading.Event()
+    endpoint, stopped = find_free_endpoint(), threading.Event()
 
     def talk(publisher: Publisher[Done]) -> None:
         while not stopped.is_set():
             publisher.put(Done(tick=0))
 
     with open_session(Link(endpoint, "a", listen=True)) as hal:
-        talker = threading.Thread(target=talk, args=(hal.publisher(keys.done_key("one"), Done),), daemon=True)
+        talker = threading.Thread(target=talk, args=(hal.declare_publisher(keys.done_key("one"), Done),), daemon=True)
         talker.start()
         for _ in range(5):
             arrived: list[Arrival] = []
@@ -107,12 +107,12 @@ def test_a_session_closes_while_urgent_samples_arrive() -> None:
 
 
 def test_session_namespaces_are_separate_except_for_a_tool() -> None:
-    with meeting("lab/a", "lab/b", None) as (a, b, tool):
+    with connected_sessions("lab/a", "lab/b", None) as (a, b, tool):
         heard: dict[str, list[Arrival]] = {"a": [], "b": [], "tool": []}
         a.on_arrival(keys.DONE_ALL, heard["a"].append)
         b.on_arrival(keys.DONE_ALL, heard["b"].append)
         tool.on_arrival(f"**/{keys.DONE_ALL}", heard["tool"].append)
-        publishers = [session.publisher(keys.done_key(name), Done) for session, name in ((a, "a"), (b, "b"))]
+        publishers = [session.declare_publisher(keys.done_key(name), Done) for session, name in ((a, "a"), (b, "b"))]
 
         def heard_everywhere() -> bool:
             for publisher in publishers:
@@ -128,7 +128,7 @@ def test_session_namespaces_are_separate_except_for_a_tool() -> None:
 
 def test_session_query_by_pattern_concerns_the_declared_key() -> None:
     questions: list[Query] = []
-    with meeting("worm", None) as (hal, tool):
+    with connected_sessions("worm", None) as (hal, tool):
         hal.on_query(keys.ESTOP, questions.append)
         for pattern in ("**", "worm/hal/*"):
             replies = tool._zenoh.get(pattern, timeout=5.0)
@@ -142,18 +142,18 @@ def test_session_query_by_pattern_concerns_the_declared_key() -> None:
 
 
 def test_an_answer_to_somebody_who_has_gone_hurts_nobody() -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     questions: list[Query] = []
     with open_session(Link(endpoint, "worm", listen=True)) as hal:
         hal.on_query(keys.ESTOP, questions.append)
         with open_session(Link(endpoint, "worm")) as session, pytest.raises(NotConnectedError):
-            session.request(keys.ESTOP, EstopRequest(requester="a person"), timeout_s=0.1)
+            session.send_request(keys.ESTOP, EstopRequest(requester="a person"), timeout_s=0.1)
         wait_until(lambda: questions, "the question")
         questions[0].reply(Answer(ok=True, reason=""))
 
 
 def test_nobody_there_is_told_soon() -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     began = time.monotonic()
     with (
         raises_error(NotConnectedError, code="network/nothing-listens"),
@@ -165,7 +165,7 @@ def test_nobody_there_is_told_soon() -> None:
         open_session(Link(endpoint, "worm")) as session,
         raises_error(NotConnectedError, code="network/no-answer"),
     ):
-        session.request(keys.LEASE, LeaseRequest(action="acquire", holder="control"), timeout_s=0.2)
+        session.send_request(keys.LEASE, LeaseRequest(action="acquire", holder="control"), timeout_s=0.2)
     assert time.monotonic() - began < 5.0
     with pytest.raises(ConnectionError):
         raise NotConnectedError("it is the matching builtin, too")
@@ -184,14 +184,14 @@ def test_a_port_that_is_taken_is_named() -> None:
 
 
 def test_liveliness_shows_who_comes_who_was_there_and_who_goes() -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     seen: list[tuple[str, bool]] = []
     with open_session(Link(endpoint, "worm", listen=True)) as hal:
         with open_session(Link(endpoint, "worm")) as first:
             first.declare_alive("guidance")
             with open_session(Link(endpoint, "worm")) as second:
                 second.declare_alive("control")
-                hal.on_alive(lambda key, present: seen.append((keys.parse_service(key), present)))
+                hal.on_token_change(lambda key, present: seen.append((keys.parse_service(key), present)))
                 wait_until(lambda: len(seen) >= 2, "both tokens")
                 assert set(seen) == {("guidance", True), ("control", True)}
             wait_until(lambda: ("control", False) in seen, "control's going")
@@ -208,21 +208,21 @@ def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
     path.write_text('{mode: "router"}')  # Zenoh's default is every interface
     with raises_error(ConfigError, code="network/insecure-endpoint"), open_router(path):
         pass
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     path.write_text(
         f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
     )
     with open_router(path), open_session(Link(endpoint, "a")) as one, open_session(Link(endpoint, "a")) as two:
         arrived: list[Arrival] = []
         two.on_arrival(keys.DONE_ALL, arrived.append)
-        publisher = one.publisher(keys.done_key("x"), Done)
+        publisher = one.declare_publisher(keys.done_key("x"), Done)
         wait_until(publisher.has_subscriber, "the subscription")
         publisher.put(Done(tick=1))
         wait_until(lambda: arrived, "the sample through the router")
 
 
 def test_session_may_be_opened_by_threads_without_changing_environment() -> None:
-    endpoint, before, failed = free_endpoint(), dict(os.environ), list[BaseException]()
+    endpoint, before, failed = find_free_endpoint(), dict(os.environ), list[BaseException]()
 
     def open_often(start: threading.Barrier) -> None:
         try:
@@ -234,7 +234,7 @@ def test_session_may_be_opened_by_threads_without_changing_environment() -> None
             failed.append(error)
             start.abort()
 
-    with threads_switching(1e-6), open_session(Link(endpoint, "worm", listen=True)):
+    with fast_thread_switching(1e-6), open_session(Link(endpoint, "worm", listen=True)):
         together = threading.Barrier(8)
         threads = [threading.Thread(target=open_often, args=(together,)) for _ in range(8)]
         for thread in threads:

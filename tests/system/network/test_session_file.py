@@ -10,7 +10,7 @@ from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.session_file import read_session
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
@@ -24,7 +24,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_session_file_connects_sessions_and_stock_zenoh_at_router(tmp_path: Path) -> None:
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     router = tmp_path / "router.json5"
     router.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
     path = written(tmp_path, f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')

@@ -9,13 +9,13 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.stop_port import (
-    ANSWER,
-    REQUEST,
+    ANSWER_HEADER,
+    REQUEST_HEADER,
     Reply,
+    find_stop_address,
     open_stop_port,
     request_stop,
-    serve_stops,
-    stop_address,
+    start_stop_server,
 )
 from snakesim_testing.messages import raises_error
 
@@ -32,7 +32,7 @@ def served() -> Iterator[tuple[int, list[str]]]:
         reply("done")
 
     with open_stop_port(LOOPBACK, 0) as opened:
-        serve_stops(opened, "lab/worm", take)
+        start_stop_server(opened, "lab/worm", take)
         yield opened.getsockname()[1], asked
 
 
@@ -46,7 +46,8 @@ def test_a_stop_is_taken_and_answered_in_the_robots_name() -> None:
 
 
 @pytest.mark.parametrize(
-    "datagram", [b"", b"x", REQUEST[:4], REQUEST, REQUEST + b"short", b"SNAKSTOQ" + bytes(16), bytes(60_000)]
+    "datagram",
+    [b"", b"x", REQUEST_HEADER[:4], REQUEST_HEADER, REQUEST_HEADER + b"short", b"SNAKSTOQ" + bytes(16), bytes(60_000)],
 )
 def test_what_is_no_stop_is_not_taken(datagram: bytes) -> None:
     with served() as (port, asked), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -57,9 +58,9 @@ def test_what_is_no_stop_is_not_taken(datagram: bytes) -> None:
 
 def test_a_stop_that_is_too_long_is_a_stop() -> None:
     with served() as (port, asked), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as long_winded:
-        long_winded.sendto(REQUEST + bytes(16) + b"a" * 5000, (LOOPBACK, port))
+        long_winded.sendto(REQUEST_HEADER + bytes(16) + b"a" * 5000, (LOOPBACK, port))
         long_winded.settimeout(5.0)
-        assert long_winded.recv(2048).startswith(ANSWER + bytes(16))
+        assert long_winded.recv(2048).startswith(ANSWER_HEADER + bytes(16))
         assert asked == ["a" * 64]
 
 
@@ -70,8 +71,8 @@ def test_stop_port_ignores_answers_from_elsewhere() -> None:
         asking = threading.Thread(target=lambda: answers.append(request_stop(LOOPBACK, port, "anna", 0.5)))
         asking.start()
         request, sender = silent.recvfrom(200)
-        liar.sendto(ANSWER + request[8:24] + b"lab/worm\ndone", sender)
-        silent.sendto(ANSWER + bytes(16) + b"lab/worm\ndone", sender)
+        liar.sendto(ANSWER_HEADER + request[8:24] + b"lab/worm\ndone", sender)
+        silent.sendto(ANSWER_HEADER + bytes(16) + b"lab/worm\ndone", sender)
         asking.join()
         assert answers == [None]
 
@@ -96,4 +97,4 @@ def test_nobody_has_the_port() -> None:
     ],
 )
 def test_where_it_belongs(endpoint: str, listens: bool, address: tuple[str, int]) -> None:
-    assert stop_address(endpoint, listens=listens) == address
+    assert find_stop_address(endpoint, listens=listens) == address

@@ -32,10 +32,16 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.quantities import Quaternion
 from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
-from snakesim_testing.hal.local_network import LagBackend, meeting
-from snakesim_testing.hal.small_robots import contact, pose, power, run_config, state
-from snakesim_testing.hal.strategies import plain_example
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.hal.local_network import LagBackend, connected_sessions
+from snakesim_testing.hal.small_robots import (
+    make_joint_state,
+    make_link_contact,
+    make_pose,
+    make_power,
+    make_run_config,
+)
+from snakesim_testing.hal.strategies import make_plain_example
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
@@ -43,11 +49,11 @@ X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
 
 
 def contacts(link: int) -> Contacts:
-    return Contacts(tick=0, timestamp_ns=0, contacts=[contact(link)])
+    return Contacts(tick=0, timestamp_ns=0, contacts=[make_link_contact(link)])
 
 
 def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> World:
-    example = plain_example(World)
+    example = make_plain_example(World)
     example["contacts"][0]["link"] = link
     return msgspec.convert({**example, "base_orientation_wxyz": orientation}, World)
 
@@ -64,17 +70,17 @@ def trajectory(*path: tuple[float, float]) -> Trajectory:
 
 def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthImage:
     values = {"link": link, "orientation_l_wxyz": turned, "width": 3, "height": 2, "depth": depth}
-    return msgspec.convert({**plain_example(DepthImage), **values}, DepthImage)
+    return msgspec.convert({**make_plain_example(DepthImage), **values}, DepthImage)
 
 
 @pytest.mark.parametrize(
     ("message", "why"),
     [
-        (state(ROBOT, 0.1), None),
-        (msgspec.structs.replace(state(ROBOT, 0.1), angle_rad=[0.0] * 13), "wrong_length"),
-        (msgspec.structs.replace(state(ROBOT, 0.1), valid=[]), "wrong_length"),
-        (power(), None),
-        (power(joints=4), "wrong_length"),
+        (make_joint_state(ROBOT, 0.1), None),
+        (msgspec.structs.replace(make_joint_state(ROBOT, 0.1), angle_rad=[0.0] * 13), "wrong_length"),
+        (msgspec.structs.replace(make_joint_state(ROBOT, 0.1), valid=[]), "wrong_length"),
+        (make_power(), None),
+        (make_power(joints=4), "wrong_length"),
         (imu([0, 3], 2), None),
         (imu([], 0), None),
         (imu([0, 4], 2), "wrong_length"),
@@ -84,9 +90,9 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
         (world(3), None),
         (world(4), "wrong_length"),
         (world(0, (0.0, 0.0, 0.0, 0.0)), "no_rotation"),
-        (pose(orientation_wxyz=(0.6, 0.0, 0.0, 0.8)), None),
-        (pose(orientation_wxyz=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
-        (pose(orientation_wxyz=(1.0, 1.0, 1.0, 1.0)), "no_rotation"),
+        (make_pose(orientation_wxyz=(0.6, 0.0, 0.0, 0.8)), None),
+        (make_pose(orientation_wxyz=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
+        (make_pose(orientation_wxyz=(1.0, 1.0, 1.0, 1.0)), "no_rotation"),
         (image(bytes(12)), None),
         (image(bytes(11)), "wrong_length"),
         (image(bytes(12), link=4), "wrong_length"),
@@ -110,25 +116,25 @@ def test_what_passes_as_a_path_makes_a_route() -> None:
 
 def served(hal: Session) -> None:
     """A HAL that shows its robot and nothing else."""
-    hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
+    hal.declare_latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
 
 
 def test_stranger_invalid_intent_is_counted_and_ignored() -> None:
-    with meeting("worm", "worm") as (hal, session):
+    with connected_sessions("worm", "worm") as (hal, session):
         served(hal)
         client = Client(session, "navigation")
         intents, joints = client.subscribe(keys.INTENT, Intent), client.subscribe(keys.JOINTS, JointState)
-        assert client.description() == client.description() == ROBOT  # asked again, it is remembered
-        clocks = hal.publisher(keys.CLOCK, Clock)
-        asked, felt = hal.publisher(keys.INTENT, Intent), hal.publisher(keys.JOINTS, JointState)
+        assert client.wait_for_description() == client.wait_for_description() == ROBOT  # asked again, it is remembered
+        clocks = hal.declare_publisher(keys.CLOCK, Clock)
+        asked, felt = hal.declare_publisher(keys.INTENT, Intent), hal.declare_publisher(keys.JOINTS, JointState)
         wait_until(
             lambda: clocks.has_subscriber() and asked.has_subscriber() and felt.has_subscriber(), "everybody heard"
         )
         for speed in (0.1, 0.2):
             asked.put(Intent(timestamp_ns=5, requester="operator", speed_m_s=speed))
-        felt.put(state(ROBOT, 0.1, tick=3))
-        felt.put(msgspec.structs.replace(state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
-        ticks = client.ticks()
+        felt.put(make_joint_state(ROBOT, 0.1, tick=3))
+        felt.put(msgspec.structs.replace(make_joint_state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
+        ticks = client.iterate_ticks()
 
         def all_there() -> bool:
             clocks.put(CLOCK)
@@ -144,29 +150,29 @@ def test_stranger_invalid_intent_is_counted_and_ignored() -> None:
 
 
 def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
-    with meeting("worm", "worm") as (rogue, session):
+    with connected_sessions("worm", "worm") as (rogue, session):
         served(rogue)
         network: Any = rogue._zenoh  # pyright: ignore[reportPrivateUsage] - a rogue does not keep to our session
         stranger = network.declare_queryable(
             keys.LEASE, lambda query: query.reply(keys.LEASE, b"\xc1", encoding="zenoh/bytes")
         )
         with raises_error(NotConnectedError, code="network/no-answer"):
-            session.request(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
+            session.send_request(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
         commander = Commander(Client(session, "control"), ROBOT)
         time.sleep(0.3)  # it asks at most so often
         assert not commander.ensure_lease(CLOCK)
-        assert commander.refusal is not None
-        assert "cannot be decoded" in commander.refusal
+        assert commander.lease_refusal is not None
+        assert "cannot be decoded" in commander.lease_refusal
         assert session.rejected == {"unknown_message": 2}
         stranger.undeclare()
 
 
 def test_stranger_oversized_message_never_arrives_and_link_survives() -> None:
-    with meeting("worm", "worm", "worm") as (hal, session, stranger):
+    with connected_sessions("worm", "worm", "worm") as (hal, session, stranger):
         heard: list[int] = []
         for listener in (hal, session):
             listener.on_arrival(keys.JOINTS, lambda arrival: heard.append(len(arrival.payload)))
-        publisher = stranger.publisher(keys.JOINTS, JointState, lossless=True)
+        publisher = stranger.declare_publisher(keys.JOINTS, JointState, lossless=True)
         wait_until(publisher.has_subscriber, "somebody listening")
         put: Any = stranger._zenoh.put  # pyright: ignore[reportPrivateUsage] - a stranger does not keep to our session
         for length in (MAX_PAYLOAD_BYTES, 10 * MAX_PAYLOAD_BYTES, 1):
@@ -177,14 +183,14 @@ def test_stranger_oversized_message_never_arrives_and_link_survives() -> None:
 
 def test_large_images_arrive_where_they_are_expected() -> None:
     """A robot's own processes know its cameras; to everybody else more than a MiB is too long."""
-    endpoint, largest = free_endpoint(), 2 * 1280 * 960
+    endpoint, largest = find_free_endpoint(), 2 * 1280 * 960
     with (
         open_session(Link(endpoint, "worm", listen=True, max_bytes=largest)) as hal,
         open_session(Link(endpoint, "worm", max_bytes=largest)) as session,
         open_session(Link(endpoint, "worm")) as small,
     ):
-        readers = [each.reader(keys.depth_key("head"), DepthImage) for each in (session, small)]
-        publisher = hal.publisher(keys.depth_key("head"), DepthImage, lossless=True)
+        readers = [each.declare_reader(keys.depth_key("head"), DepthImage) for each in (session, small)]
+        publisher = hal.declare_publisher(keys.depth_key("head"), DepthImage, lossless=True)
         wait_until(publisher.has_subscriber, "somebody listening")
         sent = msgspec.structs.replace(image(bytes(largest)), width=1280, height=960)
         publisher.put(sent)
@@ -193,11 +199,11 @@ def test_large_images_arrive_where_they_are_expected() -> None:
 
 
 def test_expired_lease_is_a_fault_despite_simultaneous_request() -> None:
-    config, answers = run_config(clock_mode="realtime", services={}), list[Answer]()
-    with meeting("worm") as (session,):
+    config, answers = make_run_config(clock_mode="realtime", services={}), list[Answer]()
+    with connected_sessions("worm") as (session,):
         host = Host(config, GuardedBackend(LagBackend(config)), session)  # between two ticks
         host.on_request(LeaseRequest(action="acquire", holder="control"), answers.append)
-        host.authority.observe(state(ROBOT))
+        host.authority.observe_joints(make_joint_state(ROBOT))
         host.authority.state = "armed"
         time.sleep(1.5e-9 * host.description.lease_ns)
         host.on_request(LeaseRequest(action="acquire", holder="stranger"), answers.append)
@@ -207,13 +213,16 @@ def test_expired_lease_is_a_fault_despite_simultaneous_request() -> None:
 
 
 def test_stranger_flood_is_dropped_except_newest_wanted_sample() -> None:
-    with meeting("worm", "worm") as (hal, session):
-        reader, asked = session.reader(keys.JOINTS, JointState), list[int]()
-        joints, after = hal.publisher(keys.JOINTS, JointState, lossless=True), session.reader(keys.CLOCK, Clock)
-        clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
+    with connected_sessions("worm", "worm") as (hal, session):
+        reader, asked = session.declare_reader(keys.JOINTS, JointState), list[int]()
+        joints, after = (
+            hal.declare_publisher(keys.JOINTS, JointState, lossless=True),
+            session.declare_reader(keys.CLOCK, Clock),
+        )
+        clocks = hal.declare_publisher(keys.CLOCK, Clock, lossless=True)
         wait_until(lambda: joints.has_subscriber() and clocks.has_subscriber(), "both readers")
         for tick in range(101):
-            joints.put(state(ROBOT, tick=tick))
+            joints.put(make_joint_state(ROBOT, tick=tick))
         clocks.put(CLOCK)
         wait_until(after.drain, "what was sent last")
 
@@ -221,9 +230,9 @@ def test_stranger_flood_is_dropped_except_newest_wanted_sample() -> None:
             asked.append(message.tick)
             return message.tick < 100
 
-        newest = reader.newest(wanted)
+        newest = reader.pop_newest(wanted)
         assert newest is not None
         assert newest.tick == 99
         assert asked == [100, 99]
-        assert reader.newest(wanted) is None
+        assert reader.pop_newest(wanted) is None
         assert reader.drain() == []

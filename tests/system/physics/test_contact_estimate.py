@@ -12,9 +12,9 @@ import pytest
 
 from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.backend import Samples
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.model.plugins import BACKENDS, offer_plugin
-from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.plugins import BACKENDS, register_plugin_temporarily
+from snakesim_hal.model.scenario import Override, load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Imu, Pose
@@ -54,7 +54,7 @@ def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
     result, (robot, seen) = Score(), watched(scenario, *settings)
     nothing = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
     for samples, true in seen:
-        imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
+        imu, pose, reported = samples.by_key.get(keys.IMU, nothing), samples.by_key.get(keys.POSE), samples.joints
         assert isinstance(imu, Imu)
         assert isinstance(pose, Pose | None)
         felt = estimate_pushes(
@@ -67,8 +67,8 @@ def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
 @lru_cache(maxsize=1)
 def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samples, list[Push]]]]:
     """A run's robot, and its samples with what was true; the last run is kept, to be judged in another way."""
-    sets = (Override(text[1:], None, text) if text.startswith("-") else parse_set(text) for text in settings)
-    config = load(scenario, [parse_set("duration_s=3"), *sets]).config
+    sets = (Override(text[1:], None, text) if text.startswith("-") else parse_set_option(text) for text in settings)
+    config = load_scenario(scenario, [parse_set_option("duration_s=3"), *sets]).config
     seen: list[tuple[Samples, list[Push]]] = []
 
     class Watched(SimBackend):
@@ -80,7 +80,7 @@ def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samp
                 seen.append((samples, true_pushes(self.describe(), self.true_state())))
             return samples
 
-    with offer_plugin(BACKENDS, "sim", Watched), InProcessRun(config) as run:
+    with register_plugin_temporarily(BACKENDS, "sim", Watched), InProcessRun(config) as run:
         for _ in run.iterate_ticks():
             pass
         return run.host.description, seen
@@ -89,7 +89,7 @@ def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samp
 def pushes(robot: Description, felt: list[EstimatedPush]) -> list[Push]:
     """Where along the body."""
     starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
-    return [(starts[c.link] + c.along_m, -int(np.sign(c.normal_l[1])), c.force_n) for c in felt]
+    return [(starts[c.link] + c.distance_from_rear_joint_m, -int(np.sign(c.normal_l[1])), c.force_n) for c in felt]
 
 
 def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
@@ -98,7 +98,7 @@ def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
     starts = np.append(0.0, np.cumsum(lengths))
     base = rotation_from_quaternion(truth.base_orientation_wxyz)
     axes = [joint.axis for joint in robot.joints]
-    rear_w, frames = link_frames(truth.base_position_w, base, truth.angles_rad, axes, lengths)
+    rear_w, frames = compute_link_frames(truth.base_position_w, base, truth.angles_rad, axes, lengths)
     found: list[Push] = []
     for contact in truth.contacts:
         force_n = float(np.linalg.norm(contact.force_w))

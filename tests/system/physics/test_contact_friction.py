@@ -9,8 +9,8 @@ import pytest
 from snakesim_hal.base.arrays import Floats
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.state.contacts import TouchReader
-from snakesim_testing.sim.simulator_rig import G, lie_down, make_config
+from snakesim_sim_backend.state.contacts import ObstacleContactReader
+from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body
 
 MU, PRESS_N = 0.3, 2.0  # of the wall; on each link
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -22,9 +22,9 @@ class Pressed:
     def __init__(self, *, step_s: float = 0.002, **wall: Any) -> None:
         wall = {"position_m": [1.0, -0.09], "size_m": [8.0, 0.1, 0.2], "friction": MU, "name": "it"} | wall
         config = make_config(scene={"ground": {"friction": 0.0}, "box": [wall]})
-        self.sim, self.data, self.physics = lie_down(config, SimSettings(timestep_s=step_s))
+        self.sim, self.data, self.physics = make_resting_body(config, SimSettings(timestep_s=step_s))
         self.model = self.sim.model
-        self._touches = TouchReader(self.sim, self.data, self.physics.contacts)
+        self._touches = ObstacleContactReader(self.sim, self.data, self.physics.contacts)
         self.links = len(self.sim.link_geoms)
         first = self.sim.first_link_body
         self.forces_w = self.data.xfrc_applied[first : first + self.links]
@@ -118,7 +118,7 @@ def test_friction_of_body_moved_after_restore_is_zero() -> None:
 @pytest.mark.parametrize("friction", [0.3, 1.0])
 def test_rolled_up_a_snake_whose_links_rub_comes_to_rest(friction: float) -> None:
     config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}}, {"ground": {"friction": 0.0}})
-    _, data, physics = lie_down(config, SimSettings(self_friction=friction), 0.75)
+    _, data, physics = make_resting_body(config, SimSettings(self_friction=friction), 0.75)
     data.qfrc_applied[6:] = 1.0
     physics.step(3000)
     assert len(data.contact) > 0
@@ -130,7 +130,7 @@ def test_slope_body_slides_only_above_ground_friction(slope: float, slides_m_s2:
     """The ground is level but for 10 um, and gravity is turned."""
     uneven = {"height_m": 1e-5, "wavelength_m": 0.8, "area_m": 6.0}
     config = make_config(scene={"ground": {"friction": 0.4, "heightfield": uneven}})
-    sim, data, physics = lie_down(config, SimSettings())
+    sim, data, physics = make_resting_body(config, SimSettings())
     physics.step(250)
     sim.model.opt.gravity[0] = slope * G
     physics.step(250)

@@ -8,13 +8,13 @@ import pytest
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.run.in_process import simulate
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.gliding import SURFACES, Glider, glide_without_mujoco
-from snakesim_testing.sim.simulator_rig import G, lie_down, make_config
-from snakesim_testing.sim.waves import Wave, momentum_balance, swim
+from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body
+from snakesim_testing.sim.waves import Wave, integrate_momentum_balance, simulate_wave
 
 HU = DirectionalFriction(0.11, 0.14, 0.19)
 SCALES = {"skin": {"forward": 0.11, "backward": 0.14, "sideways": 0.19}}
@@ -82,16 +82,16 @@ def test_gliding_body_comes_to_rest_where_an_independent_integrator_says(
     ("robot", "ground", "coefficients", "viscous"),
     [
         (SCALES, CLOTH, HU, 0j),
-        (WHEELS, CLOTH, DirectionalFriction(0.01, 0.01, 0.6), 0j),
-        ({}, MUD, DirectionalFriction(0.0, 0.0, 0.0), 0.5 + 3.0j),
+        pytest.param(WHEELS, CLOTH, DirectionalFriction(0.01, 0.01, 0.6), 0j, marks=pytest.mark.slow),
+        pytest.param({}, MUD, DirectionalFriction(0.0, 0.0, 0.0), 0.5 + 3.0j, marks=pytest.mark.slow),
     ],
     ids=["scales", "wheels", "mud"],
 )
 def test_wave_drifts_as_a_momentum_balance_says(
     robot: dict[str, Any], ground: dict[str, Any], coefficients: DirectionalFriction, viscous: complex
 ) -> None:
-    ours = swim(WAVE, ground, robot).drift_mm_s
-    balance = momentum_balance(WAVE, coefficients, viscous).drift_mm_s
+    ours = simulate_wave(WAVE, ground, robot).drift_mm_s
+    balance = integrate_momentum_balance(WAVE, coefficients, viscous).drift_mm_s
     print(f"{ours:+.2f} mm/s, momentum balance {balance:+.2f} mm/s")
     assert ours == pytest.approx(balance, abs=GHOST_MM_S)
     assert abs(ours) > 5.0
@@ -100,14 +100,14 @@ def test_wave_drifts_as_a_momentum_balance_says(
 def test_mirrored_snake_moves_mirrored() -> None:
     wave = Wave(0.3, 0.7, 4.0, bend=0.04)
     mirrored = Wave(-0.3, 0.7, 4.0, bend=-0.04)
-    plain = swim(wave, CLOTH, SCALES).center[-1]
+    plain = simulate_wave(wave, CLOTH, SCALES).center[-1]
     assert np.linalg.norm(plain) > 0.02
-    assert swim(mirrored, CLOTH, SCALES).center[-1] == pytest.approx(plain * [1.0, -1.0], abs=1e-6)
+    assert simulate_wave(mirrored, CLOTH, SCALES).center[-1] == pytest.approx(plain * [1.0, -1.0], abs=1e-6)
 
 
 def test_reversed_wave_of_turned_scales_drifts_the_other_way_by_as_much() -> None:
-    there = swim(WAVE, CLOTH, SCALES).drift_mm_s
-    back = swim(WAVE.reversed, CLOTH, TURNED_SCALES).drift_mm_s
+    there = simulate_wave(WAVE, CLOTH, SCALES).drift_mm_s
+    back = simulate_wave(WAVE.reversed, CLOTH, TURNED_SCALES).drift_mm_s
     assert abs(there + back) < GHOST_MM_S
     assert there > 5.0
 
@@ -116,7 +116,7 @@ def test_reversed_wave_of_turned_scales_drifts_the_other_way_by_as_much() -> Non
 def test_ground_takes_all_the_energy_that_a_writhing_snake_loses(robot: dict[str, Any], ground: dict[str, Any]) -> None:
     """What the feet lose by the law of sliding, from their velocities, is what the body loses, within 3 %."""
     config = make_config(robot, {"ground": ground})
-    sim, data, physics = lie_down(config, SimSettings(timestep_s=0.0005), 0.05)
+    sim, data, physics = make_resting_body(config, SimSettings(timestep_s=0.0005), 0.05)
     model = sim.model
     model.dof_damping[:], model.dof_frictionloss[:] = 0.0, 0.0
     physics.step(500)
@@ -188,7 +188,7 @@ def test_side_of_a_link_rubs_on_a_wall_equally_in_both_directions() -> None:
     config = make_config(SCALES, {"ground": {"friction": 0.0}, "box": [wall]})
     decelerations = []
     for speed_m_s in (1.0, -1.0):
-        sim, data, physics = lie_down(config, SimSettings())
+        sim, data, physics = make_resting_body(config, SimSettings())
         first = sim.first_link_body
         links = len(sim.link_geoms)
         data.xfrc_applied[first : first + links, 1] = -2.0
@@ -204,7 +204,9 @@ def test_side_of_a_link_rubs_on_a_wall_equally_in_both_directions() -> None:
 
 def test_undulation_moves_forward_on_scales_without_obstacles() -> None:
     """The example of the documentation moves forward, along the first heading of its body."""
-    with_scales = simulate(load("scales", [parse_set("duration_s=5")]).config).summary
-    equal = simulate(load("scales", [parse_set("duration_s=5"), parse_set("robot=planar13")]).config).summary
+    with_scales = simulate(load_scenario("scales", [parse_set_option("duration_s=5")]).config).summary
+    equal = simulate(
+        load_scenario("scales", [parse_set_option("duration_s=5"), parse_set_option("robot=planar13")]).config
+    ).summary
     assert (with_scales.heading_advance_m or 0.0) > 0.25
     assert (with_scales.heading_advance_m or 0.0) > 2.0 * (equal.heading_advance_m or 0.0)

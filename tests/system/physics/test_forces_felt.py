@@ -7,7 +7,7 @@ import pytest
 
 import snakesim
 from snakesim_hal.wire.messages import Mode
-from snakesim_operator.results.metrics.force_tracking import force_tracking
+from snakesim_operator.results.metrics.force_tracking import measure_force_tracking
 
 ROUGH = {"scene.pegs_along_route.0.friction": 0.3, "mission.assumed_obstacle_friction": 0.3}
 FIELD: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
@@ -31,12 +31,12 @@ def test_requested_obstacle_forces_are_reached_while_moving(
     scenario: str, also: dict[str, Any], correlation: float, error: float, empty: float
 ):
     result = snakesim.run(scenario, controller="obstacle_aided", duration=6, set=also)
-    found = force_tracking(result.record.control)
+    found = measure_force_tracking(result.record.control_states)
     assert found is not None
     assert found.correlation is not None
     assert found.correlation > correlation
     assert found.median_error < error
-    assert found.empty < empty
+    assert found.no_contact_fraction < empty
 
 
 def test_drives_without_torque_mode_push_by_their_shape():

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from snakesim_testing.runs.solved_and_measured import STEP_S, causes, measured
+from snakesim_testing.runs.solved_and_measured import STEP_S, measure_difference_causes, run_and_measure_forces
 
 
 def test_step_forces_average_to_contact_sensor_samples():
-    result, forces = measured("triplet", "obstacle_aided", duration=2.0)
+    result, forces = run_and_measure_forces("triplet", "obstacle_aided", duration=2.0)
     steps = round(0.05 / STEP_S)
     at_end = [float(force[-steps:].mean()) for force in forces.values()]
     assert len(forces) >= 3
@@ -18,6 +18,8 @@ def test_step_forces_average_to_contact_sensor_samples():
 
 
 def test_shares_of_the_causes_make_up_all_of_the_difference():
-    cells = [cell.strip() for cell in causes("triplet", "obstacle_aided", duration=2.0).split("|")[1:-1]]
+    cells = [
+        cell.strip() for cell in measure_difference_causes("triplet", "obstacle_aided", duration=2.0).split("|")[1:-1]
+    ]
     assert sum(int(cell.rstrip("%")) for cell in cells[4:8]) == pytest.approx(100, abs=2)
     assert float(cells[2]) > 4.0  # asked for: more than the ground's drag, for contacts push across the way

@@ -2,24 +2,28 @@
 
 import pytest
 
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Intent, World
 
-DENSE = parse_set("scene.random_field.0.density_per_m2=12")
+DENSE = parse_set_option("scene.random_field.0.density_per_m2=12")
 
 
 def _moved_to_the_left_m(heading_w_rad: float, seconds: int, seed: int) -> float:
-    config = load("surveyed_clutter", [DENSE, parse_set(f"duration_s={seconds}"), parse_set(f"seed={seed}")]).config
+    config = load_scenario(
+        "surveyed_clutter", [DENSE, parse_set_option(f"duration_s={seconds}"), parse_set_option(f"seed={seed}")]
+    ).config
     with InProcessRun(config) as run:
-        session = run.network.session()
-        intents, worlds = session.publisher(keys.INTENT, Intent), session.reader(keys.WORLD, World)
+        session = run.network.create_session()
+        intents, worlds = session.declare_publisher(keys.INTENT, Intent), session.declare_reader(keys.WORLD, World)
         places: list[float] = []
         for turn, _ in enumerate(run.iterate_ticks()):
             if turn % 20 == 0:
                 intents.put(
-                    Intent(timestamp_ns=run.host.status().timestamp_ns, requester="ann", heading_w_rad=heading_w_rad)
+                    Intent(
+                        timestamp_ns=run.host.build_status().timestamp_ns, requester="ann", heading_w_rad=heading_w_rad
+                    )
                 )
             places += [world.center_w[1] for world in worlds.drain() if world.center_w is not None]
         session.close()

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.scene import Cylinder, make_route
-from snakesim_hal.safety.limiter import find_bumpless_target
+from snakesim_hal.safety.limiter import compute_bumpless_target
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.gnc.stage import known
-from snakesim_testing.runs.whole_run import Run, configure, run
+from snakesim_testing.gnc.stage import require_value
+from snakesim_testing.runs.whole_run import Run, load_run_config, run_controller
 
 TRIPLET = "controllers.obstacle_triplet"
 STARTED = 50  # ticks until the body has moved far enough to be seen moving
@@ -21,7 +21,7 @@ FADE_MAX = 0.2  # period / blend_s + speed * period / blend_m at 0.9 m/s
 @cache
 def triplet(*sets: str) -> Run:
     """The case study, as shipped or changed; several tests look at the same run."""
-    return run(configure("triplet", *sets))
+    return run_controller(load_run_config("triplet", *sets))
 
 
 def propelled(whole: Run) -> list[int]:
@@ -55,7 +55,9 @@ def test_it_ends_when_the_obstacle_at_the_tail_is_lost():
 def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
     gap = range(200, 400)
     blind, lost = (gap, ()) if what == "blind" else ((), gap)
-    whole = run(configure("triplet"), duration_s=8.0, blind=blind, lost=lost)
+    whole = run_controller(
+        load_run_config("triplet"), duration_s=8.0, ticks_without_world=blind, ticks_without_trajectory=lost
+    )
     where, pushes = whole.path_s_m, (whole.record.mode == Mode.TORQUE).any(axis=1)
     assert pushes[150:200].all()
     assert not pushes[gap.start + 2 : gap.stop].any()
@@ -112,12 +114,12 @@ def test_no_command_jumps_at_a_hand_over():
     for i, j in zip(*np.nonzero(np.diff(record.mode, axis=0)), strict=True):
         tick, mode = i + 1, Mode(int(record.mode[i + 1, j]))
         angle, speed, torque = (float(x[tick, j]) for x in (record.angle_rad, record.velocity_rad_s, record.torque_nm))
-        steady = find_bumpless_target(record.description.joints[j], mode, angle, speed, torque)
+        steady = compute_bumpless_target(record.description.joints[j], mode, angle, speed, torque)
         report = whole.reports[tick]
         if mode == Mode.POSITION:
             way = abs(steady - report.reference_rad[j])
         else:
-            full_nm = record.description.joints[j].torque_limit_nm - known(report.torque_headroom_nm)
+            full_nm = record.description.joints[j].torque_limit_nm - require_value(report.torque_headroom_nm)
             way = full_nm + 0.5 * abs(speed) + abs(torque)
         assert abs(record.target[tick, j] - steady) <= FADE_MAX * way + 1e-9
         switches += 1
@@ -130,24 +132,24 @@ def test_no_command_jumps_at_a_hand_over():
 @pytest.mark.slow
 @pytest.mark.parametrize("clearance_m", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 def test_braking_obstacles_between_push_points_do_not_stop_pushing(clearance_m: float):
-    config = configure("triplet")
-    route = known(make_route(config.scene))
+    config = load_run_config("triplet")
+    route = require_value(make_route(config.scene))
     way_m = 0.04 + clearance_m + 0.05
-    behind, middle, ahead = route.inflections_s_m()[1:4]
+    behind, middle, ahead = route.find_inflections_s_m()[1:4]
     places = (0.3 * behind + 0.7 * middle, 0.7 * middle + 0.3 * ahead, 0.4 * middle + 0.6 * ahead)
     pegs: list[Cylinder] = []
     for s, side in zip(places, (1, 1, -1), strict=True):
-        (x, y), (along_x, along_y) = route.point_at(s), route.tangent_w(s).tolist()
+        (x, y), (along_x, along_y) = route.compute_point(s), route.tangent_w(s).tolist()
         pegs.append(Cylinder(position_m=(x - side * along_y * way_m, y + side * along_x * way_m), radius_m=0.05))
     scene = msgspec.structs.replace(config.scene, cylinder=pegs)
-    whole = run(msgspec.structs.replace(config, scene=scene), duration_s=8.0)
+    whole = run_controller(msgspec.structs.replace(config, scene=scene), duration_s=8.0)
     assert whole.moved_m > 0.5
     assert ["peg_0_1", "peg_0_2", "peg_0_3"] in [[p.obstacle for p in report.push_points] for report in whole.reports]
 
 
 @pytest.mark.slow
 def test_steep_wave_pushes_with_contacts_further_apart():
-    whole = run(configure("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0)  # 34.9 degrees
+    whole = run_controller(load_run_config("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0)  # 34.9 degrees
     assert whole.moved_m > 1.0
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     assert not any(report.jammed for report in whole.reports)
@@ -161,7 +163,7 @@ def test_steep_wave_pushes_with_contacts_further_apart():
 
 @pytest.mark.slow
 def test_two_newtons_are_too_little_and_said_to_be():
-    whole = run(configure("triplet", f"{TRIPLET}.propulsion_n=2"))
+    whole = run_controller(load_run_config("triplet", f"{TRIPLET}.propulsion_n=2"))
     assert abs(whole.moved_m) < 0.02
     assert whole.states[-1] == "NotLocomoting"
     assert "too little against the friction" in whole.reasons[-1]
@@ -170,7 +172,7 @@ def test_two_newtons_are_too_little_and_said_to_be():
 
 def test_push_report_contains_measured_not_requested_forces():
     """Of 8 N, twice the drag of 3.9 N: a push-point that is not touched keeps a part away."""
-    whole = run(configure("peg_row", f"{TRIPLET}.propulsion_n=8"), duration_s=5.0)
+    whole = run_controller(load_run_config("peg_row", f"{TRIPLET}.propulsion_n=8"), duration_s=5.0)
     assert whole.states[-1] == "NotLocomoting"
     assert not any(report.jammed for report in whole.reports)
     carried, missing = whole.reasons[-1].split("contacts push it on with ")[1].split(" N ", 1)
@@ -182,7 +184,7 @@ def test_push_report_contains_measured_not_requested_forces():
 def test_body_clear_of_every_peg_is_not_jammed():
     thin = ("robot.chain.modules=10", "robot.module.length_m=0.09", "robot.module.radius_m=0.025")
     row = "scene.reference_robot={spacing_m = 0.09, radius_m = 0.025}"  # as it is, not in proportion
-    whole = run(configure("peg_row", *thin, row), duration_s=4.0)
+    whole = run_controller(load_run_config("peg_row", *thin, row), duration_s=4.0)
     assert not any(report.jammed for report in whole.reports)
     assert whole.states[-1] == "NotLocomoting"
     assert "no obstacle touches the body" in whole.reasons[-1]
@@ -194,7 +196,7 @@ def test_body_clear_of_every_peg_is_not_jammed():
 
 @pytest.mark.slow
 def test_triplet_travels_three_body_lengths_with_backward_hand_overs():
-    whole = run(configure("peg_row"))
+    whole = run_controller(load_run_config("peg_row"))
     body_m = whole.record.config.robot.length_m
     assert whole.moved_m >= 3 * body_m >= 4.29
     assert set(whole.states[STARTED:]) == {"Locomoting"}
@@ -210,7 +212,7 @@ def test_triplet_travels_three_body_lengths_with_backward_hand_overs():
 
 @pytest.mark.parametrize(("modules", "min_advance_m"), [(8, 0.8), pytest.param(30, 0.5, marks=pytest.mark.slow)])
 def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
-    whole = run(configure("peg_row", f"robot.chain.modules={modules}"), duration_s=6.0)
+    whole = run_controller(load_run_config("peg_row", f"robot.chain.modules={modules}"), duration_s=6.0)
     assert whole.moved_m >= min_advance_m
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     assert not any(report.jammed for report in whole.reports)
@@ -218,14 +220,14 @@ def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
 
 @pytest.mark.slow
 def test_robot_with_pitch_joints_crosses_hills_among_pegs():
-    whole = run(configure("mamba_hills", "controller=obstacle_triplet"))
+    whole = run_controller(load_run_config("mamba_hills", "controller=obstacle_triplet"))
     assert whole.moved_m >= 0.3
     axes = [joint.axis for joint in whole.record.description.joints]
     assert {axes[turn] for turn in propelled(whole)} == {"yaw"}
 
 
 def test_path_following_moves_steadily_along_the_row():
-    whole = run(configure("peg_row", "controller=path_following"), duration_s=6.0)
+    whole = run_controller(load_run_config("peg_row", "controller=path_following"), duration_s=6.0)
     wanted = whole.record.config.mission.speed_m_s * 6.0
     assert 0.7 * wanted < whole.moved_m < 1.2 * wanted
     assert set(whole.states[STARTED:]) == {"Locomoting"}
@@ -235,7 +237,7 @@ def test_path_following_moves_steadily_along_the_row():
 
 
 def test_a_jam_is_reported_as_one():
-    whole = run(configure("jam"))
+    whole = run_controller(load_run_config("jam"))
     jammed = np.array([report.jammed for report in whole.reports])
     assert jammed[-1]
     start = int(np.argmax(jammed))
@@ -245,7 +247,7 @@ def test_a_jam_is_reported_as_one():
 
 
 def test_pegs_that_grip_are_a_jam_too():
-    whole = run(configure("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0)
+    whole = run_controller(load_run_config("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0)
     assert whole.moved_m < 0.15
     assert whole.reports[-1].jammed
 
@@ -257,7 +259,7 @@ def test_pegs_that_grip_are_a_jam_too():
 @pytest.mark.parametrize("seed", [10, 14])
 def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
     field = (f"scene.random_field.0.seed={seed}", "scene.random_field.0.density_per_m2=12")
-    whole = run(configure("surveyed_clutter", *field), duration_s=13.0)
+    whole = run_controller(load_run_config("surveyed_clutter", *field), duration_s=13.0)
     assert whole.moved_m > 1.5
 
 
@@ -267,6 +269,6 @@ def test_clutter_without_contact_search_moves_only_by_push(scale: float):
     """Neither the paths that are replanned, since it stands, nor a push of the wrong sign, which only shifts it."""
     field = ("scene.random_field.0.seed=10", "scene.random_field.0.density_per_m2=12")
     alone = (f"control.push_scale={scale}", "control.search_after_s=0")
-    whole = run(configure("surveyed_clutter", *field, *alone), duration_s=5.0)
+    whole = run_controller(load_run_config("surveyed_clutter", *field, *alone), duration_s=5.0)
     assert len(whole.record.trajectories) >= 2
     assert whole.moved_m < 0.1  # pushed as shipped: 1.16 m

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_native.libraries import LAWS
-from snakesim_native.load import load
+from snakesim_native.libraries import LAWS_LIBRARY
+from snakesim_native.load import load_shared_library
 from snakesim_sim_backend.model.mjcf import export_mjcf
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
@@ -36,7 +36,7 @@ print(json.dumps(result))
 @pytest.fixture
 def library() -> Path:
     """Return the compiled laws."""
-    loaded = load(LAWS)
+    loaded = load_shared_library(LAWS_LIBRARY)
     if loaded.path is None:
         pytest.skip(loaded.problem)
     return loaded.path

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.obstacle_triplet import TripletSolution, compute_bending_torque_nm, solve_triplet
-from snakesim_gnc.control.obstacle_triplet.statics import add_tether
+from snakesim_gnc.control.obstacle_triplet.statics import add_tether_force
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Limits, Motor
-from snakesim_hal.model.route import Route, lay_chain, sine_points
+from snakesim_hal.model.route import Route, place_chain_on_route, sample_sine_curve
 from snakesim_hal.model.scenario import RunConfig, Start
 from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, WaypointRoute
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings, Tether
-from snakesim_testing.runs.whole_run import configure
+from snakesim_testing.runs.whole_run import load_run_config
 
 PROPULSION_N = 35.0
 PEG_RADIUS_M = 0.05
@@ -47,21 +47,23 @@ def make_bench(seed: int) -> Bench | None:
     """A random wave and random pegs; None when they make no feasible triplet."""
     random = np.random.default_rng(seed)
     wavelength, slope = random.uniform(0.5, 1.0), np.radians(random.uniform(12, 27))
-    points = sine_points(np.tan(slope) * wavelength / (2 * np.pi), wavelength, 4.0, 0.002)
+    points = sample_sine_curve(np.tan(slope) * wavelength / (2 * np.pi), wavelength, 4.0, 0.002)
     route = Route(points)
-    robot = configure("triplet").robot
+    robot = load_run_config("triplet").robot
     lengths = np.array(robot.link_lengths_m)
     starts = np.concatenate(([0.0], np.cumsum(lengths)))
-    inflections = route.inflections_s_m()
+    inflections = route.find_inflections_s_m()
     tail_s = inflections[int(random.integers(0, 2))] - random.uniform(0.1, 0.25)
-    lay = lay_chain(route, tail_s, lengths.tolist())
+    lay = place_chain_on_route(route, tail_s, lengths.tolist())
     headings = lay.heading_rad + np.concatenate(([0.0], np.cumsum(lay.angles_rad)))
     along = np.column_stack([np.cos(headings), np.sin(headings)])
     nodes = np.array(lay.tail_w) + np.concatenate(([[0.0, 0.0]], np.cumsum(lengths[:, None] * along, axis=0)))
     first = next(k for k, s in enumerate(inflections) if s > tail_s)
     touched, normals, tangents, places, links = [], [], [], [], []
     for k in range(3):
-        wished = route.position_w(inflections[first + k]) + random.uniform(-0.03, 0.03) * wavelength * np.array([1, 0])
+        wished = route.compute_positions_w(inflections[first + k]) + random.uniform(
+            -0.03, 0.03
+        ) * wavelength * np.array([1, 0])
         link = int(np.argmin(np.abs(nodes[:-1, 0] + along[:, 0] * lengths / 2 - wished[0])))
         on_link = float((wished - nodes[link]) @ along[link])
         if not 0.015 < on_link < lengths[link] - 0.015 or starts[link] + on_link > starts[-1] - 0.03:
@@ -76,13 +78,13 @@ def make_bench(seed: int) -> Bench | None:
     if starts[joint + 1] >= places[2]:
         return None
     solved = solve_triplet(touched, normals, tangents[0], PROPULSION_N, nodes[joint + 1])
-    if not solved.feasible or solved.forces_n.min() < 0.05 * PROPULSION_N:
+    if not solved.is_feasible or solved.forces_n.min() < 0.05 * PROPULSION_N:
         return None
     pegs = [
         Cylinder(position_m=(float(x), float(y)), radius_m=PEG_RADIUS_M, friction=0.0)
         for x, y in np.array(touched) - (robot.module.radius_m + PEG_RADIUS_M) * np.array(normals)
     ]
-    pushes = add_tether(solved.forces_n, normals, -PROPULSION_N * tangents[0])
+    pushes = add_tether_force(solved.forces_n, normals, -PROPULSION_N * tangents[0])
     return Bench(
         config=make_config(points, pegs, tail_s),
         tether=Tether(
@@ -98,7 +100,7 @@ def make_bench(seed: int) -> Bench | None:
 
 def make_config(points: np.ndarray, pegs: list[Cylinder], tail_s_m: float) -> RunConfig:
     """A robot of stiff joints and endless torque, on ice."""
-    base = configure("triplet")
+    base = load_run_config("triplet")
     motor = Motor(
         stiffness_nm_per_rad=4000,
         damping_nm_s_per_rad=40,
@@ -145,7 +147,7 @@ def settle(bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0) ->
 
 def with_shipped(bench: Bench, **more: object) -> Bench:
     """The bench with the motors of the shipped robot, and more of it."""
-    robot = msgspec.structs.replace(bench.config.robot, motor=configure("triplet").robot.motor, **more)
+    robot = msgspec.structs.replace(bench.config.robot, motor=load_run_config("triplet").robot.motor, **more)
     return dataclasses.replace(bench, config=msgspec.structs.replace(bench.config, robot=robot))
 
 
@@ -181,7 +183,7 @@ def test_statics_holds_with_servo_targets_that_lead_by_load(bench: Bench):
 @pytest.mark.slow  # a share of the push above
 @each_bench
 def test_and_within_the_torque_that_the_shipped_robot_has(bench: Bench):
-    shipped = with_shipped(bench, limits=configure("triplet").robot.limits)
+    shipped = with_shipped(bench, limits=load_run_config("triplet").robot.limits)
     robot = shipped.config.robot
     share = min(1.0, 0.98 * robot.limits.torque_nm / float(np.abs(bench.loads_nm).max()))
     tension, force = settle(shipped, share, bench.loads_nm / robot.motor.stiffness_nm_per_rad)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.friction import DirectionalFriction
-from snakesim_testing.sim.waves import Track, Wave, momentum_balance
-from snakesim_testing.sim.waves import swim as swim_on
+from snakesim_testing.sim.waves import BodyTrack, Wave, integrate_momentum_balance
+from snakesim_testing.sim.waves import simulate_wave as swim_on
 
 MU = 0.1
 GHOST_MM_S = 1.0
 SEED = 20261123
 
 
-def swim(wave: Wave, step_s: float = 0.002, *, yaw_rad: float = 0.0) -> Track:
+def swim(wave: Wave, step_s: float = 0.002, *, yaw_rad: float = 0.0) -> BodyTrack:
     """The shipped robot on flat ground."""
     return swim_on(wave, {"friction": MU}, step_s=step_s, yaw_rad=yaw_rad)
 
@@ -78,6 +78,6 @@ def test_reflected_or_rotated_snake_moves_reflected_or_rotated() -> None:
     ],
 )
 def test_it_drifts_as_a_momentum_balance_with_coulomb_friction_says(wave: Wave) -> None:
-    ours, balance = swim(wave).drift_mm_s, momentum_balance(wave, DirectionalFriction(MU, MU, MU)).drift_mm_s
+    ours, balance = swim(wave).drift_mm_s, integrate_momentum_balance(wave, DirectionalFriction(MU, MU, MU)).drift_mm_s
     print(f"{wave}: {ours:+.2f} mm/s, momentum balance {balance:+.2f} mm/s")
     assert ours == pytest.approx(balance, abs=GHOST_MM_S)

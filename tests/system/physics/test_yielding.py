@@ -9,12 +9,12 @@ import pytest
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_sim_backend.model.build import build
+from snakesim_sim_backend.model.build import build_sim_model
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
 from snakesim_testing.messages import raises_error
-from snakesim_testing.runs.whole_run import configure, run
-from snakesim_testing.sim.simulator_rig import G, lie_down, make_config
+from snakesim_testing.runs.whole_run import load_run_config, run_controller
+from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body
 
 AT = [3.0, 1.0]
 PEG: dict[str, Any] = {"position_m": AT, "radius_m": 0.05, "name": "it"}
@@ -30,7 +30,7 @@ class Pushed:
 
     def __init__(self, kind: str, obstacle: dict[str, Any], step_s: float = 0.002) -> None:
         config = make_config(scene={kind: [obstacle]})
-        sim, self._data, self._physics = lie_down(config, SimSettings(timestep_s=step_s))
+        sim, self._data, self._physics = make_resting_body(config, SimSettings(timestep_s=step_s))
         self._body, self._step_s = sim.model.body("obstacle:it").id, sim.model.opt.timestep
 
     def for_s(self, time_s: float, force_w: tuple[float, float] = (0.0, 0.0), moment_nm: float = 0.0) -> Floats:
@@ -117,7 +117,7 @@ def test_yielding_obstacles_under_emulated_modules_are_no_joints() -> None:
 
 def test_leaning_peg_has_its_foot_position_and_angle() -> None:
     config = make_config(scene={"cylinder": [PEG | {"lean_rad": 0.3, "lean_towards_rad": 2.0}]})
-    sim = build(config, SimSettings(), motors=False)
+    sim = build_sim_model(config, SimSettings(), motors=False)
     data, found = mujoco.MjData(sim.model), np.zeros(1, dtype=np.int32)
     mujoco.mj_kinematics(sim.model, data)
     towards, across = np.array([math.cos(2.0), math.sin(2.0)]), np.array([-math.sin(2.0), math.cos(2.0)])
@@ -133,7 +133,7 @@ def test_leaning_peg_has_its_foot_position_and_angle() -> None:
 def test_snake_advances_at_fixed_obstacles_and_displaces_loose_ones() -> None:
     peg = "scene.pegs_along_route.0."
     fixed, held, pushed = (
-        run(configure("peg_row", *(peg + text for text in made)), duration_s=6.0).moved_m
+        run_controller(load_run_config("peg_row", *(peg + text for text in made)), duration_s=6.0).moved_m
         for made in ((), ("mass_kg=20", "base_friction=1.0"), ("mass_kg=0.5",))
     )
     assert held == pytest.approx(fixed, rel=0.1)

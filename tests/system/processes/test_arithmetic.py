@@ -19,15 +19,15 @@ INTEL = "processor : 0\nflags\t\t: fpu sse2 fma avx2 avx512f\n"
 def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """What the kernel says of another processor."""
     monkeypatch.setattr(arithmetic, "CPUINFO", tmp_path / "cpuinfo")
-    arithmetic.common_environment.cache_clear()
+    arithmetic.make_common_arithmetic_env.cache_clear()
     yield tmp_path / "cpuinfo"
-    arithmetic.common_environment.cache_clear()
+    arithmetic.make_common_arithmetic_env.cache_clear()
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
 def test_a_wide_processor_computes_as_a_usual_one(computer: Path) -> None:
     computer.write_text(INTEL)
-    wanted = arithmetic.common_environment()
+    wanted = arithmetic.make_common_arithmetic_env()
     assert wanted["OPENBLAS_CORETYPE"] == "Haswell"
     assert "X86_V4" in wanted["NPY_DISABLE_CPU_FEATURES"]
 
@@ -35,7 +35,7 @@ def test_a_wide_processor_computes_as_a_usual_one(computer: Path) -> None:
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
 def test_what_was_set_before_has_no_effect(computer: Path) -> None:
     computer.write_text(INTEL.replace(" avx512f", ""))
-    wanted = arithmetic.common_environment()
+    wanted = arithmetic.make_common_arithmetic_env()
     assert wanted["NPY_DISABLE_CPU_FEATURES"] == wanted["NPY_ENABLE_CPU_FEATURES"] == ""
 
 
@@ -44,7 +44,7 @@ def test_arithmetic_of_unknown_processor_is_not_pinned(computer: Path, flags: st
     """Code for AVX2 would crash there."""
     if flags is not None:
         computer.write_text(flags)
-    assert arithmetic.common_environment() == {}
+    assert arithmetic.make_common_arithmetic_env() == {}
     assert arithmetic.is_pinned()
 
 
@@ -52,7 +52,7 @@ def measured_with(code: str, **more: str) -> dict[str, str]:
     show = (
         "import json; from snakesim_hal.base import arithmetic; {}; print(json.dumps(arithmetic.measure_arithmetic()))"
     )
-    unset = {name: value for name, value in os.environ.items() if name not in arithmetic.common_environment()}
+    unset = {name: value for name, value in os.environ.items() if name not in arithmetic.make_common_arithmetic_env()}
     done = subprocess.run(
         [sys.executable, "-c", show.format(code)], env={**unset, **more}, capture_output=True, check=True
     )
@@ -60,12 +60,12 @@ def measured_with(code: str, **more: str) -> dict[str, str]:
 
 
 def test_what_a_process_computes_with_is_measured() -> None:
-    if not arithmetic.common_environment():
+    if not arithmetic.make_common_arithmetic_env():
         pytest.skip("this processor has no AVX2 and FMA, so nothing can be chosen")
     old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3"}
     assert arithmetic.find_differing_parts(measured_with("pass", **old)) == ["BLAS", "NumPy"]
-    assert measured_with("arithmetic.pin()", **old) == arithmetic.measure_arithmetic()
-    assert measured_with("import numpy; arithmetic.pin()", **old) == measured_with("pass", **old)
+    assert measured_with("arithmetic.pin_common_arithmetic()", **old) == arithmetic.measure_arithmetic()
+    assert measured_with("import numpy; arithmetic.pin_common_arithmetic()", **old) == measured_with("pass", **old)
 
 
 def test_arithmetic_digest_of_other_kernels_is_marked_as_local() -> None:
@@ -96,7 +96,7 @@ def test_numpy_is_given_only_names_that_its_version_knows(
         "importlib.util.find_spec", lambda _: ModuleSpec("numpy", None, origin=f"{tmp_path}/__init__.py")
     )
     computer.write_text(INTEL)
-    names = arithmetic.common_environment()["NPY_DISABLE_CPU_FEATURES"].split()
+    names = arithmetic.make_common_arithmetic_env()["NPY_DISABLE_CPU_FEATURES"].split()
     assert names[0] == first
     assert names[-1] == last
 

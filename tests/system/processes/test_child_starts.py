@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command
 
 ROOT = Path(__file__).parents[3]
 FOLDERS = (
@@ -83,7 +83,7 @@ def is_protected(call: ast.Call, around: ast.AST) -> bool:
     """Whether command line and environment come from the two functions that make them."""
     called = {dotted(node.func) for node in ast.walk(around) if isinstance(node, ast.Call)}
     has_environment = any(keyword.arg == "env" for keyword in call.keywords)
-    return has_environment and {"python_command", "child_environment"} <= called
+    return has_environment and {"make_python_command", "make_child_environment"} <= called
 
 
 def test_child_processes_all_start_with_prepared_command_and_environment() -> None:
@@ -96,7 +96,9 @@ def test_child_processes_all_start_with_prepared_command_and_environment() -> No
         for call, around in calls
         if not is_protected(call, around)
     }
-    assert not unprotected, "start it with python_command() and child_environment(), or add it to the table above"
+    assert not unprotected, (
+        "start it with make_python_command() and make_child_environment(), or add it to the table above"
+    )
     listed = OTHER_PROGRAMS.keys() | FORKS
     assert listed <= {path.relative_to(ROOT).as_posix() for path, calls in found.items() if calls}, "no longer needed"
 
@@ -122,8 +124,8 @@ def test_a_file_in_the_working_folder_replaces_no_module(
         (tmp_path / f"{name}.py").write_text("raise SystemExit(77)")
     again = "import subprocess, sys; sys.exit(subprocess.call([sys.executable, '-c', 'import random, calendar']))"
     if words == ("-c",):
-        command = python_command("-c", f"import random, queue, calendar; {again}")
-        variables = child_environment()
+        command = make_python_command("-c", f"import random, queue, calendar; {again}")
+        variables = make_child_environment()
     else:
         command = [sys.executable, *words, "--version"]  # as a user may type it
         variables = dict(os.environ)

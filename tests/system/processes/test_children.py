@@ -9,14 +9,14 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import Link
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.recorder_process import record_to_file
 from snakesim_operator.run import children
-from snakesim_operator.run.children import start_child, stop_all
-from snakesim_operator.run.ending import Ending
+from snakesim_operator.run.children import start_child, stop_children
+from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.supervisor import Supervisor
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
@@ -30,7 +30,7 @@ time.sleep(60)
 
 def recorder_arguments(out: Path) -> list[str]:
     """The command line of a recorder whose network is never opened."""
-    endpoint = free_endpoint()
+    endpoint = find_free_endpoint()
     return ["snakesim_operator.recording.recorder_process", "triplet", "--endpoint", endpoint, "--out", str(out)]
 
 
@@ -49,35 +49,35 @@ def test_recorder_that_waits_for_a_network_ends_at_once(tmp_path: Path) -> None:
     """The network of a run that ends at once is gone before a slow recorder has started."""
     recorder = start_child("recorder", recorder_arguments(tmp_path), lambda _output: None)
     time.sleep(3.0)  # it has started, and waits; if the computer is slow, it still starts
-    stop_all([recorder])
+    stop_children([recorder])
     assert recorder.process.returncode == -signal.SIGTERM
     assert not recorder.was_killed
-    assert not (tmp_path / RECORDING).exists(), "a file that nobody has closed"
+    assert not (tmp_path / RECORDING_FILENAME).exists(), "a file that nobody has closed"
 
 
 def test_recording_that_is_stopped_before_there_is_a_network_says_so(tmp_path: Path) -> None:
     with raises_error(NotConnectedError, code="network/nothing-listens"):
-        record_to_file(Link(free_endpoint(), "worm"), tmp_path / RECORDING, lambda: False)
-    assert not (tmp_path / RECORDING).exists()
+        record_to_file(Link(find_free_endpoint(), "worm"), tmp_path / RECORDING_FILENAME, lambda: False)
+    assert not (tmp_path / RECORDING_FILENAME).exists()
 
 
 def test_child_that_is_ended_while_it_starts_is_reported_as_such(tmp_path: Path) -> None:
     printed: list[str] = []
     files = RunFiles(tmp_path, printed.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stop_port:
-        supervisor = Supervisor(files, Ending(), printed.append, stop_port)
+        supervisor = Supervisor(files, RunEnding(), printed.append, stop_port)
         supervisor.start("recorder", recorder_arguments(tmp_path), vital=False)
-        supervisor.end()
+        supervisor.end_all_processes()
     files.close()
-    assert supervisor.lost == {"recorder": "recorder had not started when the run ended"}
+    assert supervisor.losses_by_process == {"recorder": "recorder had not started when the run ended"}
     assert printed == ["warning: recorder had not started when the run ended: there is nothing of it"]
 
 
 def test_child_that_does_not_end_is_killed_and_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "deaf.py").write_text(DEAF)
-    monkeypatch.setattr(children, "STOP_LIMIT_S", 0.2)
+    monkeypatch.setattr(children, "STOP_TIMEOUT_S", 0.2)
     said = bytearray()
-    child = start_child("control", ["deaf"], said.extend, more={"PYTHONPATH": str(tmp_path)})
+    child = start_child("control", ["deaf"], said.extend, extra_env={"PYTHONPATH": str(tmp_path)})
     wait_until(lambda: b"ready" in said, "a child that ignores SIGTERM")
-    stop_all([child])
+    stop_children([child])
     assert child.describe_end() == "control was killed: it had not ended 0.2 s after the request to end"

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.run.folder import LOCK, default_folder, locked_folder
+from snakesim_operator.run.folder import LOCK, choose_default_folder, lock_run_folder
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from snakesim_operator.run.folder import locked_folder
-with locked_folder(Path(sys.argv[1]), print):
+from snakesim_operator.run.folder import lock_run_folder
+with lock_run_folder(Path(sys.argv[1]), print):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -36,11 +36,11 @@ def leave(folder: Path, **files: str) -> None:
 
 def test_a_folder_is_held_and_let_go(tmp_path: Path) -> None:
     out, said = tmp_path / "deep" / "run", list[str]()
-    with locked_folder(out, said.append) as held:
+    with lock_run_folder(out, said.append) as held:
         assert held == out
         assert content(out) == {LOCK: str(os.getpid())}
         with raises_error(ConfigError, code="file/in-use"):
-            locked_folder(out, said.append).__enter__()
+            lock_run_folder(out, said.append).__enter__()
     assert content(out) == {}
     assert said == []
 
@@ -48,7 +48,7 @@ def test_a_folder_is_held_and_let_go(tmp_path: Path) -> None:
 def test_an_earlier_run_is_moved_aside_every_time(tmp_path: Path) -> None:
     out, said = tmp_path / "run", list[str]()
     for number in range(3):
-        with locked_folder(out, said.append):
+        with lock_run_folder(out, said.append):
             leave(out, config_json=f"{number}", notes_txt="mine")
             os.utime(out / "config.json", (1.8e9, 1.8e9))  # one after the other, within a second
     assert content(out)["config.json"] == "2"
@@ -64,18 +64,18 @@ OLD = ["host.json", "blackbox.rows", "recording.mcap", "telemetry.jsonl", "black
 @pytest.mark.parametrize("name", OLD)
 def test_a_run_that_was_killed_is_an_earlier_run_too(tmp_path: Path, name: str) -> None:
     leave(tmp_path / "run", **{name.replace(".", "_"): "x"})
-    with locked_folder(tmp_path / "run", lambda _: None) as out:
+    with lock_run_folder(tmp_path / "run", lambda _: None) as out:
         assert not (out / name).exists()
 
 
 def test_what_is_no_run_stays(tmp_path: Path) -> None:
     leave(tmp_path / "run", notes_txt="mine")
-    with locked_folder(tmp_path / "run", pytest.fail) as out:
+    with lock_run_folder(tmp_path / "run", pytest.fail) as out:
         assert content(out)["notes.txt"] == "mine"
 
 
 def test_half_written_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
-    with locked_folder(tmp_path / "run", pytest.fail) as out:
+    with lock_run_folder(tmp_path / "run", pytest.fail) as out:
         (out / "host.json.partial").write_text("")
     assert content(out) == {}
 
@@ -89,13 +89,13 @@ def test_run_folder_in_use_refuses_second_process_until_killed(tmp_path: Path) -
         leave(out, config_json="of the holder")
         before = content(out)
         with raises_error(ConfigError, code="file/in-use", field="--out"):
-            locked_folder(out, pytest.fail).__enter__()
+            lock_run_folder(out, pytest.fail).__enter__()
         assert content(out) == before
         assert list(tmp_path.iterdir()) == [out]
         holder.send_signal(signal.SIGKILL)
         holder.wait(10)
         said: list[str] = []
-        with locked_folder(out, said.append):
+        with lock_run_folder(out, said.append):
             assert len(said) == 1
     finally:
         holder.kill()
@@ -134,7 +134,7 @@ def test_run_folder_moved_aside_is_not_written_to(tmp_path: Path, monkeypatch: p
         return open_file(path, *args, dir_fd=dir_fd)
 
     monkeypatch.setattr(os, "open", late)
-    with locked_folder(out, pytest.fail):
+    with lock_run_folder(out, pytest.fail):
         assert content(out) == {LOCK: str(os.getpid())}
         assert content(aside) == {"notes.txt": "mine"}
 
@@ -143,7 +143,7 @@ def test_run_folder_moved_aside_is_not_written_to(tmp_path: Path, monkeypatch: p
 def test_what_cannot_be_a_folder_is_wrong_input(tmp_path: Path, out: str) -> None:
     (tmp_path / "file").write_text("mine")
     with raises_error(ConfigError, code="file/not-writable", field="--out"):
-        locked_folder(tmp_path / out, pytest.fail).__enter__()
+        lock_run_folder(tmp_path / out, pytest.fail).__enter__()
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -151,13 +151,13 @@ def test_the_folder_that_one_is_in_is_not_moved_away(tmp_path: Path, monkeypatch
     leave(tmp_path, config_json="x")
     monkeypatch.chdir(tmp_path)
     with raises_error(ConfigError, code="file/already-exists"):
-        locked_folder(Path(), pytest.fail).__enter__()
+        lock_run_folder(Path(), pytest.fail).__enter__()
     assert content(tmp_path) == {"config.json": "x"}
 
 
 def test_run_folder_is_new_when_none_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    first = default_folder("triplet")
+    first = choose_default_folder("triplet")
     first.mkdir(parents=True)
     assert re.fullmatch(r"runs/triplet-\d{8}-\d{6}", str(first))
-    assert not default_folder("triplet").exists()
+    assert not choose_default_folder("triplet").exists()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.features.evaluate.case import GAVE_UP, CaseOutcome, code_digest, run_case
+from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, CaseOutcome, compute_code_digest, run_case
 from snakesim_operator.features.evaluate.suite import Suite, make_cases
 
 ENDLESS = """
@@ -24,14 +24,14 @@ def ran(controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s
     goal = {"kind": "heading", "distance_m": 0.3}
     always = {"duration_s": duration_s, "mission.goal": goal}
     suite = Suite(scenario="peg_row", set=always, give_up_s=give_up_s, limit_s=limit_s)
-    case = make_cases(suite, "here", [controller], 1, seed=1)[0]
-    return run_case(case.config, code_digest(), case.give_up_s, case.limit_s)
+    case = make_cases(suite, "here", [controller], 1, first_field=1)[0]
+    return run_case(case.config, compute_code_digest(), case.stall_timeout_s, case.timeout_s)
 
 
 @pytest.mark.slow
 def test_who_comes_no_further_is_given_up() -> None:
     reported = ran("hold", give_up_s=1.0).numbers
-    assert reported[GAVE_UP] is True
+    assert reported[GAVE_UP_FIELD] is True
     assert reported["crossed"] is False
     assert isinstance(reported["duration_s"], float)
     assert 1.0 <= reported["duration_s"] < 2.0
@@ -40,7 +40,7 @@ def test_who_comes_no_further_is_given_up() -> None:
 @pytest.mark.slow
 def test_who_comes_on_is_not() -> None:
     reported = ran("path_following", give_up_s=1.0).numbers
-    assert reported[GAVE_UP] is False
+    assert reported[GAVE_UP_FIELD] is False
     assert reported["crossed"] is True
 
 

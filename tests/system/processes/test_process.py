@@ -71,7 +71,7 @@ print(os.sched_getscheduler(0) == os.SCHED_OTHER)
 
 
 def test_a_closed_terminal_is_a_stop_but_under_nohup() -> None:
-    code = PRINT.format("stop_signals", "")
+    code = PRINT.format("list_stop_signals", "")
     in_a_terminal = ["env", "--default-signal=HUP"]  # these tests may run under nohup
     words, under_nohup = (
         subprocess.run([*prefix, sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

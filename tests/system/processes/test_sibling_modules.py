@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.base.process import child_environment, python_command
+from snakesim_hal.base.process import make_child_environment, make_python_command
 
 FILE = """
 import random
@@ -22,8 +22,8 @@ class Wave:
 """
 LOADS = """
 import pathlib, sys
-from snakesim_hal.model.plugins import find_plugin
-wave = find_plugin("snakesim.controllers", f"{sys.argv[1]}/wave.py:Wave")
+from snakesim_hal.model.plugins import load_plugin
+wave = load_plugin("snakesim.controllers", f"{sys.argv[1]}/wave.py:Wave")
 assert wave.helped == (2, "arm") and pathlib.Path(wave().later()).stem == "at_work"
 assert not wave.random.startswith(sys.argv[1]), wave.random
 try:
@@ -48,8 +48,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_plugin_file_imports_neighbors_and_only_what_it_names(folder: Path) -> None:
-    command = python_command("-c", LOADS, str(folder))
+    command = make_python_command("-c", LOADS, str(folder))
     ended = subprocess.run(
-        command, env=child_environment(), cwd=folder, capture_output=True, text=True, timeout=60, check=False
+        command, env=make_child_environment(), cwd=folder, capture_output=True, text=True, timeout=60, check=False
     )
     assert (ended.returncode, ended.stdout) == (0, "as it must be\n"), ended.stderr

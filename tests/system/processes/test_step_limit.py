@@ -5,7 +5,7 @@ from contextlib import closing
 
 import pytest
 
-from snakesim_hal.base.step_limit import SharedStepTimes, StepLimit, StepTooLongError, describe_interrupted_line
+from snakesim_hal.base.step_limit import SharedStepTimes, StepTooLongError, StepWatchdog, describe_interrupted_line
 
 
 def endless() -> None:
@@ -18,7 +18,7 @@ def endless() -> None:
 
 
 def test_an_endless_step_is_interrupted_and_its_place_is_known() -> None:
-    with closing(StepLimit(0.1)) as limit:
+    with closing(StepWatchdog(0.1)) as limit:
         with pytest.raises(StepTooLongError) as caught, limit:
             endless()
         assert describe_interrupted_line(caught.value).startswith("endless() (test_step_limit.py line ")
@@ -28,14 +28,14 @@ def test_an_endless_step_is_interrupted_and_its_place_is_known() -> None:
 
 
 def test_a_hurry_ends_the_present_step_long_before_its_limit() -> None:
-    with closing(StepLimit(600.0)) as limit, pytest.raises(StepTooLongError), limit:
-        limit.hurry(0.1)
+    with closing(StepWatchdog(600.0)) as limit, pytest.raises(StepTooLongError), limit:
+        limit.request_shutdown(0.1)
         endless()
-    assert limit.is_hurried
+    assert limit.is_shutting_down
 
 
 def test_an_error_that_was_not_raised_yet_is_taken_back() -> None:
-    with closing(StepLimit(0.0)) as limit:
+    with closing(StepWatchdog(0.0)) as limit:
         for _ in range(20):
             try:
                 with limit:
@@ -47,7 +47,7 @@ def test_an_error_that_was_not_raised_yet_is_taken_back() -> None:
 
 def test_another_process_can_see_when_a_step_began() -> None:
     step_times = SharedStepTimes()
-    with closing(StepLimit(60.0, step_times)) as limit:
+    with closing(StepWatchdog(60.0, step_times)) as limit:
         assert step_times.read_step_times() is None
         with limit:
             step_s = step_times.read_step_times()

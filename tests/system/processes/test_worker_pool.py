@@ -11,9 +11,9 @@ import pytest
 from snakesim_operator.base import worker_pool
 from snakesim_operator.base.worker_pool import (
     FOLDER_PREFIX,
+    CallFailure,
+    CallResult,
     CallTookTooLongError,
-    Raised,
-    Returned,
     WorkerDiedError,
     WorkerPool,
 )
@@ -43,11 +43,11 @@ def test_calls_are_spread_over_processes_to_which_nothing_can_connect(
     monkeypatch.setattr(worker_pool, "MAX_UNLOCKED_S", 0.0)
     before = listening_sockets()
     with WorkerPool(2) as pool:
-        assert pool.map(math.sqrt, [(4.0,), (9.0,), (16.0,)]) == [2.0, 3.0, 4.0]
+        assert pool.run_and_collect(math.sqrt, [(4.0,), (9.0,), (16.0,)]) == [2.0, 3.0, 4.0]
         assert listening_sockets() == before
         (folder,) = tmp_path.glob(f"{FOLDER_PREFIX}*")
-        assert Path(pool.map(tempfile.mkdtemp, [()])[0]).is_relative_to(folder)
-        assert pool.map(os.nice, [(0,)]) == [max(os.nice(0), 10)], "others come first"
+        assert Path(pool.run_and_collect(tempfile.mkdtemp, [()])[0]).is_relative_to(folder)
+        assert pool.run_and_collect(os.nice, [(0,)]) == [max(os.nice(0), 10)], "others come first"
         children = psutil.Process().children()
         assert len(children) == 2
     assert not any(child.is_running() for child in children)
@@ -57,8 +57,8 @@ def test_calls_are_spread_over_processes_to_which_nothing_can_connect(
 def test_a_call_that_fails_costs_no_other(tmp_path: Path) -> None:
     calls = [("os._exit(3)",), ("1 / 0",), ("time.sleep(60)",), ("1 + 1",)]
     with WorkerPool(2) as pool:
-        outcomes = dict(pool.run(eval, calls, limit_s=5.0))
-        assert outcomes[3] == Returned(2)
-        errors = [outcome.error for outcome in map(outcomes.get, range(3)) if isinstance(outcome, Raised)]
+        outcomes = dict(pool.run_calls(eval, calls, timeout_s=5.0))
+        assert outcomes[3] == CallResult(2)
+        errors = [outcome.error for outcome in map(outcomes.get, range(3)) if isinstance(outcome, CallFailure)]
         assert [type(error) for error in errors] == [WorkerDiedError, ZeroDivisionError, CallTookTooLongError]
-        assert pool.map(exit_unless, [(str(tmp_path / "tried"),)]) == ["again"]
+        assert pool.run_and_collect(exit_unless, [(str(tmp_path / "tried"),)]) == ["again"]

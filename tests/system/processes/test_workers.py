@@ -9,10 +9,10 @@ from queue import SimpleQueue
 import msgspec
 import pytest
 
-from snakesim_hal.base.workers import Worker, start_worker
+from snakesim_hal.base.workers import Worker, start_restarting_thread
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.network.private_channel import HostEnd, socket_pair
-from snakesim_hal.network.stop_port import Reply, open_stop_port, request_stop, serve_stops
+from snakesim_hal.network.stop_port import Reply, open_stop_port, request_stop, start_stop_server
 from snakesim_hal.wire.messages import Answer, LifecycleRequest
 from snakesim_testing.harness.wait import wait_until
 
@@ -31,7 +31,7 @@ def test_worker_restarts_after_error_and_reports_it_once(capfd: pytest.CaptureFi
         if len(attempts) < 3:
             raise BrokenError("no file is left")
 
-    start_worker("bellows", work, on_error=dropped.append).join(10.0)
+    start_restarting_thread("bellows", work, on_error=dropped.append).join(10.0)
     assert len(attempts) == 3
     assert len(dropped) == 2
     assert capfd.readouterr().err.count("bellows: unexpected error, going on: BrokenError: no file is left") == 1
@@ -45,7 +45,7 @@ def test_a_worker_that_is_over_does_not_begin_again() -> None:
         over.set()
         raise BrokenError
 
-    start_worker("bellows", work, is_over=over.is_set).join(10.0)
+    start_restarting_thread("bellows", work, should_stop=over.is_set).join(10.0)
     assert attempts == [1]
 
 
@@ -71,7 +71,7 @@ def stop_port_serves() -> bool:
         reply("done")
 
     with open_stop_port(LOOPBACK, 0) as opened:
-        serve_stops(opened, "worm", take)
+        start_stop_server(opened, "worm", take)
         return request_stop(LOOPBACK, opened.getsockname()[1], "anna", 5.0) is not None
 
 
@@ -94,7 +94,7 @@ def private_channel_serves() -> bool:
         taken.set()
 
     with starter, host:
-        HostEnd(host).serve(take)
+        HostEnd(host).start_serving(take)
         starter.send(b"\xc1 no message")
         starter.send(_encoded(LifecycleRequest(action="disarm")))
         served = taken.wait(5.0)

@@ -18,11 +18,11 @@ from snakesim_operator.playback import video
 from snakesim_operator.playback.episodes import read_episodes
 from snakesim_operator.playback.export import write_parquet
 from snakesim_operator.playback.lerobot import write_lerobot
-from snakesim_operator.playback.pictures import Pictures
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.playback.pictures import CameraImages
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import summarise
+from snakesim_operator.results.summary import summarize_run
 from snakesim_testing.operator.damaged_recordings import chunks, flipped, packed, recorded, spans, written
 from snakesim_testing.runs.in_process_command import snakesim
 
@@ -36,7 +36,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(run: Path) -> bytes:
-    content = (run / RECORDING).read_bytes()
+    content = (run / RECORDING_FILENAME).read_bytes()
     assert len(chunks(content)) >= 5
     return content
 
@@ -52,16 +52,16 @@ def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(run: Path, whole: b
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     reader = RecordingReader(path)
     kept = list(reader.read_messages())
-    truth = lost(run / RECORDING, path)
+    truth = lost(run / RECORDING_FILENAME, path)
     assert truth[keys.JOINTS] >= 2
     assert len(kept) > 500
     assert {key: count for key, count in reader.losses.lost_by_key.items() if not key.startswith("/")} == truth
     (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
-    clocks = [one.time_ns for one in kept if one.key == keys.CLOCK]
+    clocks = [one.robot_time_ns for one in kept if one.key == keys.CLOCK]
     hole = next((a, b) for a, b in pairwise(clocks) if b - a > 20_000_000)
     assert gap.end_ns is not None
     assert hole[0] <= gap.begin_ns < gap.end_ns <= hole[1]
-    assert reader.finished
+    assert reader.is_complete
     assert following.begin  # what follows was read
 
 
@@ -73,7 +73,11 @@ def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Pa
             reader = RecordingReader(path)
             kept = list(reader.read_messages())
             ours = {key: n for key, n in reader.losses.lost_by_key.items() if not key.startswith("/")}
-            assert kept and reader.finished and ours == lost(run / RECORDING, path), (chunk, at, reader.missing)
+            assert kept and reader.is_complete and ours == lost(run / RECORDING_FILENAME, path), (
+                chunk,
+                at,
+                reader.missing,
+            )
 
 
 COMMANDS = [
@@ -140,7 +144,7 @@ def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(run: Path, who
     assert int(ended.out.split()[0]) > count > 500  # and those for Foxglove
     reader = RecordingReader(tmp_path / "copy.mcap")
     assert len(list(reader.read_messages())) == count
-    assert reader.finished
+    assert reader.is_complete
     told = snakesim("recording", "info", "copy.mcap", cwd=tmp_path)
     assert told.code == INCOMPLETE
     assert "before it was copied: damaged in 1 place" in told.err
@@ -187,15 +191,15 @@ def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: P
     assert intact.reward_m is not None
     for file, begin_s in zip(files, begins_s, strict=True):
         frames = parquet.read_table(file).to_pydict()
-        rows = [intact.record.row_at(begin_s + timestamp) for timestamp in frames["timestamp"]]
+        rows = [intact.record.find_nearest_row(begin_s + timestamp) for timestamp in frames["timestamp"]]
         angles = np.array(frames["observation.state"])[:, : intact.record.angle_rad.shape[1]]
         assert np.allclose(angles, intact.record.angle_rad[rows], atol=1e-6)  # they were measured at that time
         earned_m = float(intact.reward_m[rows[0] : rows[-1] + 1].sum())
         assert sum(frames["next.reward"]) == pytest.approx(earned_m, abs=0.002)
         assert max(frames["next.reward"]) < 4 * intact.reward_m.max()
         assert frames["next.done"] == [False] * (len(rows) - 1) + [True]
-    summary = summarise(record, "complete")
-    assert summary.mean_speed_m_s == pytest.approx(summarise(intact.record, "complete").mean_speed_m_s, rel=1e-6)
+    summary = summarize_run(record, "complete")
+    assert summary.mean_speed_m_s == pytest.approx(summarize_run(intact.record, "complete").mean_speed_m_s, rel=1e-6)
 
 
 def test_damaged_episode_after_a_gap_starts_with_an_image(whole: bytes, tmp_path: Path) -> None:
@@ -206,7 +210,7 @@ def test_damaged_episode_after_a_gap_starts_with_an_image(whole: bytes, tmp_path
     before, after = read_episodes([path], None, images=False)
     record = before.record
     first_tick, first_tick_after = int(record.ticks[0]), int(record.ticks[after.rows[0]])
-    pictures = Pictures(2, 1)
+    pictures = CameraImages(2, 1)
     for shade, tick in enumerate((first_tick, first_tick_after + 3)):
         pictures.add(tick, np.full((1, 2, 3), shade, np.uint8))
     parts = [dataclasses.replace(part, pictures={"head": pictures}) for part in (before, after)]
@@ -219,11 +223,11 @@ def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
     damaged = chunks(whole)[len(chunks(whole)) // 2]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     record = RunRecord.load(path)
-    before, after = (int(rows[end]) for rows, end in zip(record.stretches, (-1, 0), strict=True))
-    times_s = video.times_of_pictures(record, 100.0, 1.0, (0.0, np.inf))
+    before, after = (int(rows[end]) for rows, end in zip(record.contiguous_rows, (-1, 0), strict=True))
+    times_s = video.choose_frame_times_s(record, 100.0, 1.0, (0.0, np.inf))
     gap_s = record.time_s[after] - record.time_s[before]
     assert (times_s == record.time_s[before]).sum() == round(gap_s * 100)  # and never the pose that came later
-    (sentence,) = video.standstills_in_words(times_s, 0.01, 0.01)
+    (sentence,) = video.describe_frozen_spans(times_s, 0.01, 0.01)
     assert f"between {record.time_s[before]:.2f} and {record.time_s[after]:.2f} s" in sentence
 
 
@@ -258,7 +262,7 @@ def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_
     path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])
     reader = RecordingReader(path)
     assert list(reader.read_messages())
-    assert reader.finished
+    assert reader.is_complete
     assert not reader.missing
 
 
@@ -271,7 +275,7 @@ def test_damaged_lz4_chunk_and_impossible_time_are_reported(whole: bytes, tmp_pa
     (channel,) = struct.unpack("<H", b"\x01\x00")
     late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
     reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :]))
-    assert max(one.time_ns for one in reader.read_messages()) < 2**62
+    assert max(one.robot_time_ns for one in reader.read_messages()) < 2**62
     assert reader.missing
     assert snakesim("recording", "info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
 
@@ -282,7 +286,7 @@ def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> No
         absurd = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
         reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :]))
         list(reader.read_messages())
-        assert reader.finished
+        assert reader.is_complete
         assert not reader.losses.lost_by_key
         assert reader.losses.damage_count == 1
 
@@ -350,7 +354,7 @@ def test_damaged_recording_is_reported_for_its_run_folder(run: Path, whole: byte
     for path in run.iterdir():
         if path.is_file():
             written(tmp_path / path.name, path.read_bytes())
-    written(tmp_path / RECORDING, whole[: len(whole) // 2])
+    written(tmp_path / RECORDING_FILENAME, whole[: len(whole) // 2])
     ended = snakesim("recording", "report", ".", cwd=tmp_path)
     assert ended.code == INCOMPLETE
     assert "its end: it breaks off" in ended.err

@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import SNAKESIM, Running, armed_run, call, environment
+from snakesim_testing.runs.command import (
+    SNAKESIM_COMMAND,
+    Running,
+    make_environment,
+    run_to_end,
+    running_armed_snakesim,
+)
 from snakesim_testing.runs.documents import REPOSITORY, UV, needs_uv
 from snakesim_testing.runs.in_process_command import snakesim
 from snakesim_testing.runs.keyboard import UP, at_the_keyboard
@@ -42,9 +48,9 @@ class Recording:
     def __init__(self, run: Running, cwd: Path) -> None:
         command = ("record", "--endpoint", run.endpoint, "--episodes", "demos", "--task", "through the field")
         self.process = subprocess.Popen(
-            [*SNAKESIM, *command],
+            [*SNAKESIM_COMMAND, *command],
             cwd=cwd,
-            env=environment(cwd),
+            env=make_environment(cwd),
             text=True,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -68,7 +74,7 @@ class Recording:
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two episodes of four: one was dropped, and of one nobody said what became of it."""
     home = tmp_path_factory.mktemp("demos")
-    with armed_run(home / "run", *RUN) as run:
+    with running_armed_snakesim(home / "run", *RUN) as run:
         _demonstrate(run, home)
     return home
 
@@ -157,7 +163,7 @@ def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
     )
     assert "2 episodes" in snakesim(*given, cwd=tmp_path).out
     offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "PATH": "/usr/bin:/bin"}
-    loaded = call([python, "-c", LOADED], tmp_path, offline, 600.0)
+    loaded = run_to_end([python, "-c", LOADED], tmp_path, offline, 600.0)
     assert loaded.code == 0, loaded.err[-3000:]
     seen = json.loads(loaded.out.splitlines()[-1])
     assert seen["episodes"] == 2

@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.evaluate.store import write_tables
-from snakesim_testing.harness.file_size import max_file_size
+from snakesim_testing.harness.file_size import limited_file_size
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -42,7 +42,7 @@ def test_export_on_full_disk_is_named_and_leaves_nothing(
     run: Path, tmp_path: Path, command: list[str], name: str
 ) -> None:
     out = tmp_path / name
-    with max_file_size(FITS_BYTES):
+    with limited_file_size(FITS_BYTES):
         ended = snakesim(*command[:2], str(run), *command[2:], "--out", str(out), cwd=tmp_path)
     assert ended.code == 2 and f"{out}: cannot be written: " in ended.err, ended.out + ended.err
     assert list(tmp_path.iterdir()) == []
@@ -68,6 +68,6 @@ def test_what_searches_and_evaluations_leave_is_whole_or_as_before(
     tmp_path: Path, write: Callable[[Path], object], name: str
 ) -> None:
     (tmp_path / name).write_text("an earlier one")
-    with max_file_size(FITS_BYTES), raises_error(ConfigError, code="file/not-writable", field=name):
+    with limited_file_size(FITS_BYTES), raises_error(ConfigError, code="file/not-writable", field=name):
         write(tmp_path)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "an earlier one")]

@@ -7,14 +7,14 @@ import pytest
 
 from snakesim_hal.controller import load_controller
 from snakesim_hal.model.json_schema import make_schema
-from snakesim_hal.model.plugins import CONTROLLERS, list_installed
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed_plugins
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, ParametersRequest
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.writer import RecordingWriter
-from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
+from snakesim_operator.robot_commands.parameters import Parameter, parse_parameters
 from snakesim_testing.runs.in_process_command import snakesim
 
 CHANGED_AT = 30  # turns
@@ -23,10 +23,10 @@ CHANGED_AT = 30  # turns
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording in which ada changed two gains."""
-    path = tmp_path_factory.mktemp("tuned") / RECORDING
-    config = load("peg_row", [parse_set("duration_s=0.6")]).config
+    path = tmp_path_factory.mktemp("tuned") / RECORDING_FILENAME
+    config = load_scenario("peg_row", [parse_set_option("duration_s=0.6")]).config
     with InProcessRun(config) as run:
-        session, recording = run.network.session(), RecordingWriter(path)
+        session, recording = run.network.create_session(), RecordingWriter(path)
         for row in keys.SPACE:
             session.on_latched_arrival(row.key, recording.write_arrival)
         request = ParametersRequest(
@@ -63,7 +63,7 @@ def test_what_is_set_for_the_replay_stays(tuned: Path, tmp_path: Path) -> None:
 MUST_BE_SET = {"policy": {"model": "a.onnx"}}
 
 
-@pytest.mark.parametrize("name", list_installed(CONTROLLERS))
+@pytest.mark.parametrize("name", list_installed_plugins(CONTROLLERS))
 def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
     parameters_type = load_controller(name).Parameters
     in_force = ControlParameters(
@@ -73,15 +73,15 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
         parameters=msgspec.json.encode(parameters_type(**MUST_BE_SET.get(name, {}))).decode(),
         schema=msgspec.json.encode(make_schema(parameters_type)).decode(),
     )
-    found = read_parameters(in_force)
+    found = parse_parameters(in_force)
     assert len(found) == len(msgspec.structs.fields(parameters_type))
     for one in found:
-        assert one.description and one.range and (one.unit or one.name in ("push_scale", "model", "slides")), one
+        assert one.description and one.range_text and (one.unit or one.name in ("push_scale", "model", "slides")), one
 
 
 def test_ranges_are_told_in_words() -> None:
-    assert Parameter("a", 1.0, "s", minimum=0.0, maximum=5.0).range == ">= 0, <= 5"
-    assert Parameter("a", 1.0, "s", minimum=0.0, excludes_minimum=True).range == "> 0"
-    assert Parameter("a", "x", choices=("x", "y")).range == "x or y"
+    assert Parameter("a", 1.0, "s", minimum=0.0, maximum=5.0).range_text == ">= 0, <= 5"
+    assert Parameter("a", 1.0, "s", minimum=0.0, excludes_minimum=True).range_text == "> 0"
+    assert Parameter("a", "x", choices=("x", "y")).range_text == "x or y"
     assert Parameter("a", 0.3, "N").value_with_unit == "0.3 N"
     assert Parameter("a", 0.3, "1").value_with_unit == "0.3"

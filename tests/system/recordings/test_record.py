@@ -14,12 +14,21 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import REPORT
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.harness.processes import nothing_left
+from snakesim_operator.results.run_reader import REPORT_FILENAME
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.harness.processes import assert_no_process_left
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.command import LIMIT_S, SNAKESIM, Ended, armed_run, call, run_to_summary, running, summary_of
+from snakesim_testing.runs.command import (
+    SNAKESIM_COMMAND,
+    TIMEOUT_S,
+    CompletedRun,
+    read_summary,
+    run_to_end,
+    run_to_summary,
+    running_armed_snakesim,
+    running_snakesim,
+)
 
 pytestmark = pytest.mark.e2e
 
@@ -39,7 +48,7 @@ def handles(pid: int, number: signal.Signals) -> bool:
 
 
 def newest_status(session: Session) -> Status:
-    found = session.latest(keys.STATUS, Status, LIMIT_S)
+    found = session.wait_for_latched(keys.STATUS, Status, TIMEOUT_S)
     assert found is not None
     return found
 
@@ -48,7 +57,7 @@ def newest_status(session: Session) -> Status:
 
 
 def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG) as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             wait_until(lambda: newest_status(session).tick > 100, "two seconds")
             host, tick = run.part("host"), newest_status(session).tick
@@ -58,20 +67,20 @@ def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> No
     assert "host was ended by SIGKILL" in said
     assert "may lack the last second" in said
     assert "Traceback" not in said
-    record, summary = RunRecord.load(tmp_path / "run"), summary_of(tmp_path / "run")
+    record, summary = RunRecord.load(tmp_path / "run"), read_summary(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ
     assert summary.ticks == len(record.time_s)
     assert summary.duration_s == pytest.approx(len(record.time_s) / RATE_HZ)
     assert "host was ended by SIGKILL" in summary.ended
     assert any("last second" in lack for lack in summary.missing)
     assert summary.command_digest == record.host.command_digest
-    assert record.control
-    assert "last second" in (tmp_path / "run" / REPORT).read_text()
+    assert record.control_states
+    assert "last second" in (tmp_path / "run" / REPORT_FILENAME).read_text()
 
 
 @pytest.mark.slow
 def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG) as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             wait_until(lambda: newest_status(session).tick > 75, "one and a half seconds")
             tick = newest_status(session).tick
@@ -80,7 +89,7 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
     record = RunRecord.load(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ
     assert record.host.ended == "running"
-    assert record.control
+    assert record.control_states
     result = command.snakesim("study", "compare", "run", "run", cwd=tmp_path)
     assert result.code == 3
     assert "last second may be missing" in result.out
@@ -95,7 +104,7 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("when", [pytest.param("starting", marks=pytest.mark.slow), "armed"])
 def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) -> None:
-    with running(tmp_path / "run", *LONG) as run:
+    with running_snakesim(tmp_path / "run", *LONG) as run:
         run.wait_for("network:")
         if when == "armed":
             run.wait_for(" s  ")
@@ -103,19 +112,19 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
         wait_until(lambda: handles(host, signal.SIGTERM), "a host that takes signals")
         os.kill(host, signal.SIGTERM)
         assert run.end() == 1, run.printed()
-    summary = summary_of(tmp_path / "run")
+    summary = read_summary(tmp_path / "run")
     assert summary.ended.startswith("the host was stopped by a signal after ")
     assert " of 30 s" in summary.ended
     assert f"fault: {summary.ended}" in run.printed()
-    nothing_left(tmp_path / "run")
+    assert_no_process_left(tmp_path / "run")
 
 
 @pytest.mark.slow
 def test_record_time_while_disarmed_does_not_count(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--duration", "2") as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--duration", "2") as run:
         assert command.tell(run, "robot", "disarm").code == 0
         assert run.end() == 1, run.printed()
-    ended = summary_of(tmp_path / "run").ended
+    ended = read_summary(tmp_path / "run").ended
     assert "of 2 s" in ended
     assert "the time was over before the requested armed time was reached" in ended
 
@@ -123,7 +132,7 @@ def test_record_time_while_disarmed_does_not_count(tmp_path: Path) -> None:
 # --- the disk --------------------------------------------------------------------------------------------------
 
 
-def in_a_file_system(tmp_path: Path, options: str, prepare: str, *arguments: str) -> tuple[Ended, Path]:
+def in_a_file_system(tmp_path: Path, options: str, prepare: str, *arguments: str) -> tuple[CompletedRun, Path]:
     """A run whose --out is in a tmpfs of its own, mounted where nobody else sees it; what it left is copied out."""
     if shutil.which("unshare") is None or subprocess.run(["unshare", "-rm", "true"], check=False).returncode:
         pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
@@ -133,16 +142,16 @@ def in_a_file_system(tmp_path: Path, options: str, prepare: str, *arguments: str
         'disk=$1; left=$2; options=$3; prepare=$4; shift 4; mount -t tmpfs -o "$options" tmpfs "$disk" || exit 99; '
         'cd "$disk" && eval "$prepare"; cd "$left/.."; "$@"; code=$?; cp -a "$disk" "$left"; exit $code'
     )
-    network = [] if "--in-process" in arguments else ["--endpoint", free_endpoint()]
-    typed = [*SNAKESIM, "run", *arguments, "--out", str(disk / "run"), *network]
+    network = [] if "--in-process" in arguments else ["--endpoint", find_free_endpoint()]
+    typed = [*SNAKESIM_COMMAND, "run", *arguments, "--out", str(disk / "run"), *network]
     apart = ["unshare", "-rm", "sh", "-c", script, "sh", disk, left, options, prepare]
-    done = call([*apart, *typed], tmp_path, limit_s=120.0)
-    nothing_left(disk / "run")
+    done = run_to_end([*apart, *typed], tmp_path, limit_s=120.0)
+    assert_no_process_left(disk / "run")
     assert done.code != 99, done.err
     return done, left / "run"
 
 
-def orderly(ended: Ended, left: Path, *, code: int, warning: str) -> None:
+def orderly(ended: CompletedRun, left: Path, *, code: int, warning: str) -> None:
     """One warning, no traceback, no empty or half-written file, the right exit code."""
     assert ended.code == code, ended.out + ended.err
     assert "Traceback" not in ended.out + ended.err
@@ -251,7 +260,7 @@ def test_a_slow_disk_delays_no_tick_and_loses_nothing(tmp_path: Path, hangs: Pat
 
 @pytest.mark.slow
 def test_record_on_hanging_disk_delays_nothing(tmp_path: Path, hangs: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--stay") as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--stay") as run:
         wait_until(lambda: (tmp_path / "run" / "host.json").is_file(), "the first numbers on disk")
         hangs.touch()
         with open_session(Link(run.endpoint, "planar13")) as session:
@@ -259,12 +268,12 @@ def test_record_on_hanging_disk_delays_nothing(tmp_path: Path, hangs: Path) -> N
             time.sleep(1.0)
             assert newest_status(session).tick - before >= 0.8 * RATE_HZ
             began = time.monotonic()
-            answer = session.request(keys.ESTOP, EstopRequest(requester="anna"))
+            answer = session.send_request(keys.ESTOP, EstopRequest(requester="anna"))
             assert answer.ok
             assert answer.lifecycle == "estop"
             assert time.monotonic() - began < 3.0
             assert "not stored yet" in answer.reason or (tmp_path / "run" / ESTOP).exists()
-            assert session.request(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok
+            assert session.send_request(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok
         assert run.end(30.0) == 1, run.printed()
         assert "the disk has not answered" in run.printed()
         assert "Traceback" not in run.printed()

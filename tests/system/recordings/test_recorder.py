@@ -17,14 +17,14 @@ from websockets.typing import Origin, Subprotocol
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description
-from snakesim_operator.playback.play import play
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.playback.play import play_recording
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.command import armed_run, background
+from snakesim_testing.runs.command import run_in_background, running_armed_snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -53,11 +53,11 @@ def sighted_live(address: str, origin: str | None = None) -> list[str]:
 
 @pytest.mark.slow
 def test_recorder_loss_does_not_end_run_and_another_records(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG) as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG) as run:
         time.sleep(1.0)
         os.kill(run.part("recorder"), signal.SIGKILL)
         typed = ("record", "--endpoint", run.endpoint, "--out", "beside.mcap")
-        with background(tmp_path, *typed, "--foxglove", "0", "--foxglove-origin", TRUSTED) as beside:
+        with run_in_background(tmp_path, *typed, "--foxglove", "0", "--foxglove-origin", TRUSTED) as beside:
             assert beside.stdout is not None
             address = next(line for line in beside.stdout if "Foxglove" in line).rpartition(" ")[2].strip()
             file = tmp_path / "beside.mcap"
@@ -77,7 +77,7 @@ def test_recorder_loss_does_not_end_run_and_another_records(tmp_path: Path) -> N
         assert run.end() == 3, run.printed()  # complete, but the record is incomplete
     assert run.printed().count("warning:") == 1
     assert "recorder was ended by SIGKILL" in run.printed()
-    kept = list(RecordingReader(tmp_path / "run" / RECORDING).read_messages([keys.JOINTS]))
+    kept = list(RecordingReader(tmp_path / "run" / RECORDING_FILENAME).read_messages([keys.JOINTS]))
     assert len(kept) > 10
     alone = RunRecord.load(tmp_path / "beside.mcap")
     assert alone.config.name == "triplet"
@@ -90,16 +90,18 @@ def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
         "run", "triplet", "--in-process", "--no-record", "--duration", "0.1", "--out", "bare", cwd=tmp_path
     )
     assert ended.code == 0
-    assert not (tmp_path / "bare" / RECORDING).exists()
+    assert not (tmp_path / "bare" / RECORDING_FILENAME).exists()
     command.snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", "run", cwd=tmp_path)
-    endpoint, said = free_endpoint(), list[str]()
+    endpoint, said = find_free_endpoint(), list[str]()
     how = {"endpoint": endpoint, "namespace": "again", "rate": 0.5, "step": False}
-    player = threading.Thread(target=play, args=(tmp_path / "run" / RECORDING, iter(()), said.append), kwargs=how)
+    player = threading.Thread(
+        target=play_recording, args=(tmp_path / "run" / RECORDING_FILENAME, iter(()), said.append), kwargs=how
+    )
     player.start()
     wait_until(lambda: bool(said), "the player")
     with open_session(Link(endpoint, "again"), 5.0) as session:
-        robots = session.latched_reader(keys.DESCRIPTION, Description)
-        clocks, began = session.reader(keys.CLOCK, Clock), time.monotonic()
+        robots = session.declare_latched_reader(keys.DESCRIPTION, Description)
+        clocks, began = session.declare_reader(keys.CLOCK, Clock), time.monotonic()
         found = list[Clock]()
         wait_until(lambda: bool(found.extend(clocks.drain())) or bool(found and found[-1].tick == 99), "the last tick")
         assert time.monotonic() - began > 1.0

@@ -28,11 +28,11 @@ from snakesim_operator.recording import tap as tap_module
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recorder_process import record_to_file
 from snakesim_operator.recording.recover import recover_recording
-from snakesim_operator.recording.tap import Tap
+from snakesim_operator.recording.tap import MessageTap
 from snakesim_operator.recording.writer import RecordingWriter
-from snakesim_testing.hal.small_robots import PERIOD_NS, description
-from snakesim_testing.harness.endpoint import free_endpoint
-from snakesim_testing.harness.file_size import max_file_size
+from snakesim_testing.hal.small_robots import PERIOD_NS, make_description
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.harness.file_size import limited_file_size
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 from snakesim_testing.operator.clock_samples import clock
@@ -61,9 +61,9 @@ def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
     found = list((reader := RecordingReader(tmp_path / "a.mcap")).read_messages())
     assert [(one.key, one.payload, one.encoding) for one in found] == [(a.key, a.payload, a.encoding) for a in sent]
     # A tick that cannot be true, or none: the time of the newest clock.
-    assert [one.time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6, 7]
-    assert all(abs(one.wall_ns - time.time_ns()) < 60e9 for one in found)
-    assert reader.finished
+    assert [one.robot_time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6, 7]
+    assert all(abs(one.wall_time_ns - time.time_ns()) < 60e9 for one in found)
+    assert reader.is_complete
     assert reader.metadata == {"dropped": {}}
     assert not reader.missing
 
@@ -102,7 +102,7 @@ import os, sys, time
 from pathlib import Path
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.recording.recover import recover_recording
-from snakesim_testing.harness.file_size import max_file_size
+from snakesim_testing.harness.file_size import limited_file_size
 from snakesim_testing.operator.clock_samples import clock
 recording = RecordingWriter(Path(sys.argv[1]))
 for tick in range(10**9):
@@ -128,7 +128,7 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
     kept = len(list(reader.read_messages()))
     a_second_before = [tick for at, tick in ticks if at < ticks[-1][0] - 1.0]
     assert kept > a_second_before[-1]
-    assert not reader.finished
+    assert not reader.is_complete
     assert "its end: it breaks off" in reader.missing[0]
     with path.open("rb") as file, contextlib.suppress(Exception):  # the stock reader, as far as it goes
         stock = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
@@ -136,7 +136,7 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
 
 
 def test_recording_on_full_disk_ends_readable(tmp_path: Path) -> None:
-    with max_file_size(20_000):
+    with limited_file_size(20_000):
         recording = RecordingWriter(tmp_path / "a.mcap")
         for tick in range(5000):
             recording.write_arrival(clock(tick))
@@ -145,37 +145,43 @@ def test_recording_on_full_disk_ends_readable(tmp_path: Path) -> None:
         recording.close({})
     assert "File too large" in recording.failure
     reader = RecordingReader(tmp_path / "a.mcap")
-    ticks = [one.time_ns // PERIOD_NS for one in reader.read_messages()]
+    ticks = [one.robot_time_ns // PERIOD_NS for one in reader.read_messages()]
     assert len(ticks) > 200
     assert ticks == list(range(len(ticks)))
     assert not reader.losses.damage_count
-    assert not reader.finished
+    assert not reader.is_complete
 
 
 def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tap_module, "MAX_BYTES", 1000)
+    monkeypatch.setattr(tap_module, "MAX_QUEUED_BYTES", 1000)
     network = LocalNetwork()
-    tap, publisher = Tap(network.session()), network.session().publisher(keys.done_key("control"), Done)
+    tap, publisher = (
+        MessageTap(network.create_session()),
+        network.create_session().declare_publisher(keys.done_key("control"), Done),
+    )
     for tick in range(2000):
         publisher.put(Done(tick=tick))
-    kept = tap.drain()
+    kept = tap.take_arrivals()
     assert sum(len(arrival.payload) for arrival in kept) <= 1000
-    assert len(kept) + tap.dropped[keys.done_key("control")] == 2000
+    assert len(kept) + tap.dropped_count_by_key[keys.done_key("control")] == 2000
     publisher.put(Done(tick=1))
-    assert len(tap.drain()) == 1
+    assert len(tap.take_arrivals()) == 1
 
 
 def test_recording_in_lockstep_waits_for_slow_disk_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tap_module, "MAX_BYTES", 100)
-    monkeypatch.setattr(tap_module, "LIMIT_S", 0.2)
+    monkeypatch.setattr(tap_module, "MAX_QUEUED_BYTES", 100)
+    monkeypatch.setattr(tap_module, "DISK_TIMEOUT_S", 0.2)
     network = LocalNetwork()
-    tap, publisher = Tap(network.session()), network.session().publisher(keys.done_key("control"), Done)
-    tap.lossless = True
+    tap, publisher = (
+        MessageTap(network.create_session()),
+        network.create_session().declare_publisher(keys.done_key("control"), Done),
+    )
+    tap.is_lossless = True
     began = time.monotonic()
     for tick in range(200):
         publisher.put(Done(tick=tick))
     assert 0.2 <= time.monotonic() - began < 0.5
-    assert tap.dropped.total() + len(tap.drain()) == 200
+    assert tap.dropped_count_by_key.total() + len(tap.take_arrivals()) == 200
 
 
 def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:
@@ -187,14 +193,16 @@ def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> Non
 
 
 def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
-    endpoint, told = free_endpoint(), threading.Event()
+    endpoint, told = find_free_endpoint(), threading.Event()
     link, path = Link(endpoint, "planar13"), tmp_path / "a.mcap"
-    recorder = threading.Thread(target=lambda: record_to_file(link, path, lambda: not told.is_set(), after_host=True))
+    recorder = threading.Thread(
+        target=lambda: record_to_file(link, path, lambda: not told.is_set(), wait_for_host_exit=True)
+    )
     with open_session(Link(endpoint, "planar13", listen=True)) as host:
         host.declare_alive(HAL)
-        clocks = host.publisher(keys.CLOCK, Clock, lossless=True)
+        clocks = host.declare_publisher(keys.CLOCK, Clock, lossless=True)
         recorder.start()
-        wait_until(lambda: clocks.has_subscriber() and host.present(keys.alive_key("recorder")), "the recorder")
+        wait_until(lambda: clocks.has_subscriber() and host.list_tokens(keys.alive_key("recorder")), "the recorder")
         for tick in range(40):
             host.send(keys.CLOCK, clock(tick).payload)
             if tick == 20:
@@ -211,7 +219,7 @@ def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) ->
     own = keys.custom_key("left")
     early = Arrival(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0)
     schema = make_message_schema(Whisker, "test")
-    described = encode(msgspec.structs.replace(description(), custom={own: schema}))
+    described = encode(msgspec.structs.replace(make_description(), custom={own: schema}))
     robot = Arrival(keys.DESCRIPTION, described, format_encoding(Description), 0)
     recording = RecordingWriter(path)
     for arrival in (early, clock(4), robot, msgspec.structs.replace(early, monotonic_ns=1)):

@@ -11,11 +11,11 @@ from mcap.reader import make_reader
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.decoder import DecoderFactory
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.run_log import RunRecord
@@ -26,12 +26,12 @@ from snakesim_testing.runs.in_process_command import snakesim
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("recorded") / "run"
-    simulate(load("clutter", [parse_set("duration_s=2")]).config, out)
+    simulate(load_scenario("clutter", [parse_set_option("duration_s=2")]).config, out)
     return out
 
 
 def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
-    whole, alone = RunRecord.load(run), RunRecord.load(run / RECORDING)
+    whole, alone = RunRecord.load(run), RunRecord.load(run / RECORDING_FILENAME)
     arrays = {name: value for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
     assert len(arrays) > 8
     assert len(whole.time_s) == 200
@@ -39,15 +39,15 @@ def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
         assert np.array_equal(value, getattr(alone, name), equal_nan=True), name
     assert alone.host.command_digest == whole.host.command_digest
     assert alone.config == whole.config
-    assert alone.control == whole.control
+    assert alone.control_states == whole.control_states
     assert alone.worlds == whole.worlds
     assert alone.trajectories == whole.trajectories
     assert alone.missing == whole.missing == []
 
 
 def test_recordings_without_black_box_keep_numbers_of_host(run: Path, tmp_path: Path) -> None:
-    content, host = (run / RECORDING).read_bytes(), RunRecord.load(run).host
-    (tmp_path / RECORDING).write_bytes(content[: len(content) * 2 // 3])
+    content, host = (run / RECORDING_FILENAME).read_bytes(), RunRecord.load(run).host
+    (tmp_path / RECORDING_FILENAME).write_bytes(content[: len(content) * 2 // 3])
     record = RunRecord.load(tmp_path, host)
     assert 0 < len(record.time_s) < 200
     assert record.host.command_digest == host.command_digest
@@ -57,13 +57,13 @@ def test_recordings_without_black_box_keep_numbers_of_host(run: Path, tmp_path: 
 def test_recordings_report_ticks_that_never_reached_the_recorder(run: Path, tmp_path: Path) -> None:
     for file in run.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    (tmp_path / RECORDING).unlink()
-    recording = RecordingWriter(tmp_path / RECORDING)
-    for message in RecordingReader(run / RECORDING).read_messages():
-        if not 0.5e9 < message.time_ns < 1.5e9:
-            recording.write_arrival(Arrival(message.key, message.payload, message.encoding, message.wall_ns))
+    (tmp_path / RECORDING_FILENAME).unlink()
+    recording = RecordingWriter(tmp_path / RECORDING_FILENAME)
+    for message in RecordingReader(run / RECORDING_FILENAME).read_messages():
+        if not 0.5e9 < message.robot_time_ns < 1.5e9:
+            recording.write_arrival(Arrival(message.key, message.payload, message.encoding, message.wall_time_ns))
     recording.close({})
-    assert RunRecord.load(tmp_path / RECORDING).missing == []  # nothing in the file itself tells
+    assert RunRecord.load(tmp_path / RECORDING_FILENAME).missing == []  # nothing in the file itself tells
     ended = snakesim("recording", "report", ".", cwd=tmp_path)
     said = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
     assert ended.code == 3 and said in ended.err and said in (tmp_path / "report.html").read_text(), ended.err
@@ -81,7 +81,7 @@ def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path)
     assert info["command_digest"] == RunRecord.load(run).host.command_digest
     assert info["keys"]["sensor/joints"]["rate_hz"] == pytest.approx(100.0)
     assert "sensor/depth/head" in info["keys"]
-    content = (run / RECORDING).read_bytes()
+    content = (run / RECORDING_FILENAME).read_bytes()
     (tmp_path / "torn.mcap").write_bytes(content[: len(content) * 2 // 3])
     result = snakesim("recording", "info", "torn.mcap", cwd=tmp_path)
     assert result.code == 3
@@ -147,7 +147,7 @@ def test_what_is_no_recording_is_named(tmp_path: Path, command: str) -> None:
 
 def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:
     """Beside Foxglove's, each by its own decoder."""
-    with (run / RECORDING).open("rb") as file:
+    with (run / RECORDING_FILENAME).open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory(), ProtobufDecoder()])
         decoded = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
     angles = {message.tick: message.angle_rad for topic, message in decoded if topic == keys.JOINTS}

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.files import list_shipped
-from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.playback.control import Replay
-from snakesim_operator.recording.message import RECORDING
+from snakesim_hal.model.files import list_shipped_names
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_operator.playback.control import ControlReplay
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
@@ -20,19 +20,19 @@ QUICK = ("mamba_hills", "peg_row")  # between them they have all of the rest
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("recorded") / "run"
-    simulate(load("peg_row", [parse_set("duration_s=0.8")]).config, out)
+    simulate(load_scenario("peg_row", [parse_set_option("duration_s=0.8")]).config, out)
     return out
 
 
 @pytest.mark.parametrize(
     "scenario",
-    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in list_shipped("scenarios")],
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in list_shipped_names("scenarios")],
 )
 def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str) -> None:
     ended, _ = run_to_summary(tmp_path / "run", scenario, "--duration", str(DURATION_S), "--clock-mode", "lockstep")
     assert ended.code == 0, ended.printed
     replayed = snakesim("replay", "run", "--control", cwd=tmp_path)
-    ticks = round(DURATION_S * load(scenario).config.rate_hz)
+    ticks = round(DURATION_S * load_scenario(scenario).config.rate_hz)
     assert replayed.code == 0
     assert replayed.out == f"{ticks} commands, the same to the bit\n"
 
@@ -40,18 +40,18 @@ def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str
 def test_the_replay_of_the_same_is_the_same_run(recorded: Path, tmp_path: Path) -> None:
     ended = snakesim("replay", str(recorded), "--control", "--out", "again", cwd=tmp_path)
     assert ended.code == 0, ended.err
-    before, again = RunRecord.load(recorded), RunRecord.load(tmp_path / "again" / RECORDING)
+    before, again = RunRecord.load(recorded), RunRecord.load(tmp_path / "again" / RECORDING_FILENAME)
     assert again.host.command_digest == before.host.command_digest
-    assert again.control == before.control
+    assert again.control_states == before.control_states
     assert again.worlds == before.worlds
 
 
 def test_replay_allows_only_last_answer_to_be_missing(recorded: Path) -> None:
-    comparison = Replay(recorded / RECORDING, []).run()
+    comparison = ControlReplay(recorded / RECORDING_FILENAME, []).run()
     last = max(comparison.recorded)
     del comparison.recorded[last], comparison.recorded[last - 5]
-    comparison.ignore_unanswered(last)
-    assert comparison.different == [last - 5]
+    comparison.ignore_last_if_unanswered(last)
+    assert comparison.differing_ticks == [last - 5]
 
 
 def test_a_changed_gain_shows_in_compare(recorded: Path, tmp_path: Path) -> None:

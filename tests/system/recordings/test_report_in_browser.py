@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, chromium
+from snakesim_testing.operator.browser import CHROMIUM, MISSING, open_chromium
 from snakesim_testing.operator.recorded_triplet import Reader, read, triplet
 
 DRAWN = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
@@ -23,7 +23,7 @@ def test_every_chart_of_a_report_is_drawn_without_errors(record: RunRecord, tmp_
     reader: Reader = read(record)
     page = tmp_path / "report.html"
     page.write_text(reader.html)
-    with chromium() as browser:
+    with open_chromium() as browser:
         tab = browser.open(page.as_uri(), width)
         tab.wait_until_loaded()
         assert tab.errors == []

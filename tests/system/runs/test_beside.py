@@ -7,7 +7,7 @@ import pytest
 from snakesim_testing.harness.bad_plugins import BAD
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.command import run_to_summary, running
+from snakesim_testing.runs.command import run_to_summary, running_snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -45,7 +45,7 @@ def test_a_bad_controller_stops_its_robot(tmp_path: Path, backend: str, deed: st
 
 def test_a_stop_is_answered_while_it_hangs(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "hangs"))
-    with running(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
+    with running_snakesim(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
         run.wait_for("lease of control expired")
         stopped = command.tell(run, "estop")
         assert stopped.code == 0 and "planar13: stopped" in stopped.out, stopped.out + stopped.err
@@ -55,7 +55,7 @@ def test_a_stop_is_answered_while_it_hangs(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_failed_service_is_restarted_and_waits_for_arming(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "raises"))
-    with running(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
+    with running_snakesim(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
         run.wait_for("fault: ")
 
         def armed() -> bool:

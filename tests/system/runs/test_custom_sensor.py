@@ -16,7 +16,7 @@ from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
 from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as in_process
-from snakesim_testing.runs.command import Ended, call, environment, running
+from snakesim_testing.runs.command import CompletedRun, make_environment, run_to_end, running_snakesim
 from snakesim_testing.runs.command import snakesim as command
 from snakesim_testing.runs.documents import REPOSITORY
 
@@ -48,7 +48,7 @@ def robot(tmp_path: Path) -> str:
 @pytest.mark.slow  # docs/tutorials/your-sensor.md is typed in verification/documents
 def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robot: str) -> None:
     run = ("peg_row", "--set", robot, "--duration", "600", "--stay", "--clock-mode", "realtime")
-    with running(tmp_path / "run", *run) as started:
+    with running_snakesim(tmp_path / "run", *run) as started:
         started.wait_for(" of 600 s")  # armed, and moving
         with snakesim.Robot.connect(started.endpoint) as live:
             wait_until(lambda: live.read(LEFT) is not None, "a whisker")
@@ -73,7 +73,7 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             assert "Whisker on link 13" in text
             assert "bend_rad" in text
             assert " rad" in text
-        echoed = started.tell("topic", "echo", LEFT, "--count", "1")
+        echoed = started.run_tool("topic", "echo", LEFT, "--count", "1")
         assert json.loads(echoed.out)["message"]["bend_max_rad"] == 1.4, echoed.printed
         started.interrupt()  # in order: a killed recorder lacks its last half second, here that is all
     done = command("recording", "export", "run", "--format", "csv", "--out", "whiskers.csv", cwd=tmp_path)
@@ -109,10 +109,10 @@ SAID = {
 }
 
 
-def suite(folder: Path, robot: str, clause: str) -> Ended:
+def suite(folder: Path, robot: str, clause: str) -> CompletedRun:
     """The contract suite, as docs/hardware/contract-suite.md has it, on the simulator with the whiskers."""
     typed = [sys.executable, "-m", "pytest", "-q", *PYTEST, "--snakesim-set", robot, "-k", clause]
-    return call(typed, folder, environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
+    return run_to_end(typed, folder, make_environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import armed_run, run_to_summary, snakesim, summary_of
+from snakesim_testing.runs.command import read_summary, run_to_summary, running_armed_snakesim, snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -22,14 +22,14 @@ LONG = ["triplet", "--controller", "hold", "--duration", "600"]
 
 @pytest.mark.parametrize("clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
 def test_killed_controller_leads_to_safe_joints_and_failed_run(tmp_path: Path, clock_mode: str) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
-            statuses = session.reader(keys.STATUS, Status)
+            statuses = session.declare_reader(keys.STATUS, Status)
             wait_until(lambda: bool(statuses.drain()), "a status")
             os.kill(run.part("control"), signal.SIGKILL)
             wait_until(lambda: any("lease of control expired" in one.reason for one in statuses.drain()), "the reason")
         assert run.end() == 1
-    faults = {fault.what: fault for fault in summary_of(run.out).faults}  # a busy computer may see any of them first
+    faults = {fault.what: fault for fault in read_summary(run.out).faults}  # a busy computer may see any of them first
     assert set(faults) == {"service_lost", "lease_expired"}
     lost, expired = faults["service_lost"], faults["lease_expired"]
     record = RunRecord.load(tmp_path / "run")

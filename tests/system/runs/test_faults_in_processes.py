@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import armed_run, run_to_summary, snakesim
+from snakesim_testing.runs.command import run_to_summary, running_armed_snakesim, snakesim
 from snakesim_testing.runs.in_process_command import tell
 
 pytestmark = pytest.mark.e2e
@@ -50,7 +50,7 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
         "--backend",
         backend,
     ]
-    with armed_run(tmp_path / "run", *arguments) as run:
+    with running_armed_snakesim(tmp_path / "run", *arguments) as run:
         result = tell(run, "fault", "inject", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
         assert result.code == 1
         assert f"backend '{backend}' cannot do" in result.err
@@ -105,7 +105,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
     arguments += ["--clock-mode", "realtime", "--unchecked"]
     loaded = [tmp_path / part for part in ("host", "control")]
-    with armed_run(tmp_path / "run", *arguments, "--duration", "600") as run:
+    with running_armed_snakesim(tmp_path / "run", *arguments, "--duration", "600") as run:
         for words in (("mute", "joint_3"), ("hang", "control")):
             result = tell(run, "fault", "inject", *words)
             assert result.code == 1
@@ -114,7 +114,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         run.end()
     assert [file.read_text() for file in loaded] == ["", ""], "no process has the code that carries them out"
     allowed = ("--set", "allow_fault_injection=true", "--duration", "0.5", "--out", str(tmp_path / "allowed"))
-    snakesim("run", *arguments, *allowed, "--endpoint", free_endpoint(), cwd=tmp_path)
+    snakesim("run", *arguments, *allowed, "--endpoint", find_free_endpoint(), cwd=tmp_path)
     assert all("snakesim_hal.faults.injector" in file.read_text() for file in loaded)
     ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)
     assert ended.code == 1

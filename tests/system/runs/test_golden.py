@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base import arithmetic
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.run.in_process import simulate
 
 GOLDEN: dict[str, str] = json.loads((Path(__file__).parents[2] / "golden.json").read_text())
@@ -21,5 +21,5 @@ QUICK = ("triplet", "peg_row")
 )
 def test_shipped_scenario_has_its_digest(scenario: str) -> None:
     """After a change that is meant to change what robots do, `make golden` writes the digests again."""
-    done = simulate(load(scenario, [parse_set(f"duration_s={SECONDS}")]).config)
+    done = simulate(load_scenario(scenario, [parse_set_option(f"duration_s={SECONDS}")]).config)
     assert done.summary.command_digest[:16] == GOLDEN[scenario]

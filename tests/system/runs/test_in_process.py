@@ -9,17 +9,17 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_hal.model.scenario import Override, load_scenario, parse_set_option
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
-from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.run_reader import CONFIG, REPORT, SUMMARY
-from snakesim_operator.run.conclusion import conclude
+from snakesim_operator.recording.message import RECORDING_FILENAME
+from snakesim_operator.results.run_reader import CONFIG_FILENAME, REPORT_FILENAME, SUMMARY_FILENAME
+from snakesim_operator.run.conclusion import write_and_print_results
 from snakesim_operator.run.in_process import LOG_FILE, run_in_process, simulate
-from snakesim_testing.harness.command import SNAKESIM, environment
+from snakesim_testing.harness.command import SNAKESIM_COMMAND, make_environment
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.in_process_command import snakesim
 
-LEFT = {BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, RECORDING, REPORT, SUMMARY}
+LEFT = {BLACK_BOX, CONFIG_FILENAME, DESCRIPTION, HOST_RECORD, RECORDING_FILENAME, REPORT_FILENAME, SUMMARY_FILENAME}
 
 
 def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
     assert ended.code == 0, ended.out + ended.err
     assert {path.name for path in out.iterdir()} == LEFT | {LOG_FILE}
     assert "in one process" in ended.out
-    assert str(out / REPORT) in ended.out
+    assert str(out / REPORT_FILENAME) in ended.out
     assert not ended.err
 
 
@@ -46,7 +46,9 @@ class Failing(Hold):
 
 def test_in_process_controller_error_ends_in_safe_stop(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(FAILING)
-    result = simulate(load("triplet", [Override("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config)
+    result = simulate(
+        load_scenario("triplet", [Override("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config
+    )
     assert "control ended: controller" in result.summary.ended
     assert "no idea" in result.summary.ended
     assert [fault.what for fault in result.summary.faults] == ["service_lost", "lease_expired"]
@@ -85,10 +87,10 @@ class Compiled(Hold):
 
 def test_in_process_controller_that_hangs_ends_in_safe_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_LIMIT_S", 2.0)
+    monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_TIMEOUT_S", 2.0)
     (tmp_path / "endless.py").write_text(ENDLESS)
-    changes = [Override("controller", "./endless.py:Endless", "the test"), parse_set("start_limit_s=1")]
-    result = simulate(load("triplet", changes).config)
+    changes = [Override("controller", "./endless.py:Endless", "the test"), parse_set_option("start_limit_s=1")]
+    result = simulate(load_scenario("triplet", changes).config)
     assert "control ended: " in result.summary.ended, result.summary.ended
     assert "took longer than 2 s in one tick; if it needs so long, allow it with --set" in result.summary.ended
     assert result.record.host.lifecycle == "fault"
@@ -97,9 +99,18 @@ def test_in_process_controller_that_hangs_ends_in_safe_stop(tmp_path: Path, monk
 @pytest.mark.parametrize("controller", ["Endless", pytest.param("Compiled", marks=pytest.mark.slow)])
 def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS)
-    typed = [*SNAKESIM, "run", "triplet", "--in-process", "--controller", f"./endless.py:{controller}", "--out", "run"]
+    typed = [
+        *SNAKESIM_COMMAND,
+        "run",
+        "triplet",
+        "--in-process",
+        "--controller",
+        f"./endless.py:{controller}",
+        "--out",
+        "run",
+    ]
     with subprocess.Popen(
-        typed, cwd=tmp_path, env=environment(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        typed, cwd=tmp_path, env=make_environment(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as process:
         try:
             wait_until((tmp_path / "begun").exists, "a tick that does not end", 60)
@@ -112,7 +123,7 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, 
     assert time.monotonic() - began < 30
     if controller == "Endless":
         assert "The run ended early: interrupted." in said
-        assert (tmp_path / "run" / REPORT).is_file()
+        assert (tmp_path / "run" / REPORT_FILENAME).is_file()
     else:
         assert "had not returned 3 s after it received the signal to stop; its process was killed" in said
 
@@ -120,16 +131,20 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, 
 def test_ctrl_c_after_the_last_tick_costs_no_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def conclude_interrupted(*arguments: Any) -> int:
         os.kill(os.getpid(), signal.SIGINT)
-        return conclude(*arguments)
+        return write_and_print_results(*arguments)
 
-    monkeypatch.setattr("snakesim_operator.run.in_process.conclude", conclude_interrupted)
-    config = load("triplet", [parse_set("duration_s=0.1"), parse_set("clock_mode=lockstep")]).config
+    monkeypatch.setattr("snakesim_operator.run.in_process.write_and_print_results", conclude_interrupted)
+    config = load_scenario(
+        "triplet", [parse_set_option("duration_s=0.1"), parse_set_option("clock_mode=lockstep")]
+    ).config
     assert run_in_process(config, tmp_path / "run") == 0
-    assert (tmp_path / "run" / REPORT).is_file()
+    assert (tmp_path / "run" / REPORT_FILENAME).is_file()
 
 
 def test_in_process_run_with_fault_is_repeatable() -> None:
-    config = load("peg_row", [parse_set("duration_s=3"), parse_set('faults=["mute:joint_3@0.5"]')]).config
+    config = load_scenario(
+        "peg_row", [parse_set_option("duration_s=3"), parse_set_option('faults=["mute:joint_3@0.5"]')]
+    ).config
     first, second = (simulate(config).summary for _ in range(2))
     assert "joint_3" in first.ended
     assert first.ticks == second.ticks

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.files import list_shipped
-from snakesim_hal.model.scenario import load, parse_set, read_config
+from snakesim_hal.model.files import list_shipped_names
+from snakesim_hal.model.scenario import load_scenario, parse_set_option, read_config
 from snakesim_hal.network.client import Client
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, DepthImage, World
 from snakesim_operator.results.run_log import RunRecord as Record
-from snakesim_operator.results.run_reader import CONFIG
+from snakesim_operator.results.run_reader import CONFIG_FILENAME
 from snakesim_operator.run.in_process import Result, simulate
 from snakesim_testing.runs.command import run_to_summary
 
@@ -23,7 +23,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
     """Run it in processes, then its effective configuration in this one; both must agree in every tick."""
     ended, summary = run_to_summary(out, scenario, *arguments)
     assert ended.code == 0, ended.out + ended.err
-    theirs, ours = Record.load(out), simulate(read_config(out / CONFIG))
+    theirs, ours = Record.load(out), simulate(read_config(out / CONFIG_FILENAME))
     assert ours.summary.ended == "complete"
     assert ours.summary.command_digest == summary.command_digest
     assert ours.summary.path_distance_m == summary.path_distance_m
@@ -46,7 +46,7 @@ def test_processes_and_one_process_drive_the_motors_alike(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario", list_shipped("scenarios"))
+@pytest.mark.parametrize("scenario", list_shipped_names("scenarios"))
 def test_so_they_do_in_every_shipped_scenario(scenario: str, tmp_path: Path) -> None:
     same_both_ways(tmp_path / "run", scenario)
 
@@ -55,12 +55,14 @@ def test_so_they_do_in_every_shipped_scenario(scenario: str, tmp_path: Path) -> 
 def test_in_process_digest_of_robot_is_unchanged_by_camera(tmp_path: Path) -> None:
     """An image of the camera is named by the clock, and is there for whoever reads it at that tick."""
     seeing = same_both_ways(tmp_path / "run", "peg_row", "--duration", "1", "--set", "robot=planar13_camera")
-    blind = simulate(load("peg_row", [parse_set("duration_s=1")]).config)
+    blind = simulate(load_scenario("peg_row", [parse_set_option("duration_s=1")]).config)
     assert seeing.summary.command_digest == blind.summary.command_digest
-    config = load("peg_row", [parse_set("duration_s=0.5"), parse_set("robot=planar13_camera")]).config
+    config = load_scenario(
+        "peg_row", [parse_set_option("duration_s=0.5"), parse_set_option("robot=planar13_camera")]
+    ).config
     with InProcessRun(config) as run:
-        client = Client(run.network.session(), "onlooker")
-        images, client_ticks = client.subscribe(keys.depth_key("head"), DepthImage), client.ticks(0.0)
+        client = Client(run.network.create_session(), "onlooker")
+        images, client_ticks = client.subscribe(keys.depth_key("head"), DepthImage), client.iterate_ticks(0.0)
         read: list[tuple[int, int]] = []
         for _ in run.iterate_ticks():
             while (clock := next(client_ticks)) is not None:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.service import Guidance
-from snakesim_hal.model.outlines import outline_distance_m
-from snakesim_hal.model.plugins import SERVICES, offer_plugin
-from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.model.outlines import compute_outline_distance_m
+from snakesim_hal.model.plugins import SERVICES, register_plugin_temporarily
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_hal.model.scene import Cylinder
 from snakesim_hal.network.client import Client
 from snakesim_hal.wire.messages import World
-from snakesim_operator.results.metrics.map_score import score
+from snakesim_operator.results.metrics.map_score import score_map
 from snakesim_operator.run.in_process import simulate
 
 pytestmark = pytest.mark.e2e
@@ -33,21 +33,23 @@ class Deceived(Guidance):
 
 def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[World], RunConfig]:
     """What guidance told in a run on a row of pegs."""
-    config = load("peg_row", [parse_set(text) for text in (*HOW, f'mission.map="{map_}"', *more)]).config
-    with offer_plugin(SERVICES, "guidance", Deceived if deceived else Guidance):
+    config = load_scenario(
+        "peg_row", [parse_set_option(text) for text in (*HOW, f'mission.map="{map_}"', *more)]
+    ).config
+    with register_plugin_temporarily(SERVICES, "guidance", Deceived if deceived else Guidance):
         result = simulate(config)
     assert result.summary.ended == "complete"
     assert (result.summary.path_distance_m or 0) > 0.3
     record, last = result.record, result.record.worlds[-1]
-    nodes = record.nodes_w(record.row_at(last.timestamp_ns * 1e-9))
+    nodes = record.find_body_points_w(record.find_nearest_row(last.timestamp_ns * 1e-9))
     assert nodes is not None
-    truth, along = [placed.obstacle for placed in record.placed], nodes[-1] - nodes[-2]
-    found = score(last.obstacles, truth, nodes[-1], float(np.arctan2(along[1], along[0])))
+    truth, along = [placed.obstacle for placed in record.placed_obstacles], nodes[-1] - nodes[-2]
+    found = score_map(last.obstacles, truth, nodes[-1], float(np.arctan2(along[1], along[0])))
     if map_ == "perceived":
-        assert len(found.position_m) >= 4
-        assert not found.ghosts
-        assert not found.misses
-        assert np.median(found.position_m) < 0.02
+        assert len(found.position_errors_m) >= 4
+        assert not found.ghost_count
+        assert not found.missed_count
+        assert np.median(found.position_errors_m) < 0.02
     return record.worlds, config
 
 
@@ -73,4 +75,4 @@ def test_known_is_what_the_scene_file_says():
     assert obstacles
     assert all(o.name.startswith("lie_") for o in obstacles)
     assert all(o.last_seen_ns is None for o in obstacles)
-    assert outline_distance_m(obstacles[0], np.array(LIES[0].position_m)) < 0
+    assert compute_outline_distance_m(obstacles[0], np.array(LIES[0].position_m)) < 0

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.network.session_file import read_session
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
 from snakesim_testing.runs.lab_programs import SCENARIO, Lab
@@ -50,7 +50,7 @@ def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, mon
     for ended in (lab.tell("robot", "disarm"), command.snakesim("robot", "disarm", cwd=lab.folder)):
         assert ended.code == 1
         assert f"no robot on {endpoint}" in ended.err
-    elsewhere = command.snakesim("robot", "disarm", "--endpoint", free_endpoint(), cwd=lab.folder)
+    elsewhere = command.snakesim("robot", "disarm", "--endpoint", find_free_endpoint(), cwd=lab.folder)
     assert elsewhere.code == 1
     assert endpoint not in elsewhere.err
     ended = lab.tell("estop", "--router", "tcp/127.0.0.1:7447")

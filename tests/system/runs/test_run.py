@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.results.run_reader import REPORT
-from snakesim_testing.runs.command import TOO_SLOW, armed_run, run_to_summary, summary_of
+from snakesim_operator.results.run_reader import REPORT_FILENAME
+from snakesim_testing.runs.command import TOO_SLOW, read_summary, run_to_summary, running_armed_snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -30,8 +30,8 @@ def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
     assert summary.answered_fraction == 1.0
     assert summary.backend == "sim"
     assert summary.config["scene"]["name"] == "triplet"
-    assert (tmp_path / "run" / REPORT).stat().st_size > 20_000
-    assert str(tmp_path / "run" / REPORT) in ended.out
+    assert (tmp_path / "run" / REPORT_FILENAME).stat().st_size > 20_000
+    assert str(tmp_path / "run" / REPORT_FILENAME) in ended.out
 
 
 @contextmanager
@@ -68,9 +68,9 @@ def test_slow_computer_is_named_before_expired_lease(tmp_path: Path) -> None:
         "--set",
         "rate_hz=50",
     ]
-    with armed_run(tmp_path / "run", *arguments) as run, starved(run.part("control")):
+    with running_armed_snakesim(tmp_path / "run", *arguments) as run, starved(run.part("control")):
         assert run.end() == 1, run.printed()
-    ended = summary_of(tmp_path / "run").ended
+    ended = read_summary(tmp_path / "run").ended
     assert re.match(rf"{TOO_SLOW}(control|host) waited for a processor for \d+ of \d+ ms", ended), ended
     assert "; lease of control expired: " in ended
     assert f"fault: {TOO_SLOW}" in run.printed()

@@ -7,21 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import SHIPPED
+from snakesim_hal.model.files import SHIPPED_FILES_DIR
 from snakesim_hal.wire import keys
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.results.recording_contents import read_recording
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import LOG_FILE
-from snakesim_testing.harness.endpoint import free_endpoint
+from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.runs import in_process_command as in_process
-from snakesim_testing.runs.command import SNAKESIM, Ended, environment, run_to_summary
-from snakesim_testing.runs.documents import REPOSITORY, sections
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, CompletedRun, make_environment, run_to_summary
+from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 pytestmark = pytest.mark.e2e
 
 PAGE = REPOSITORY / "docs" / "how-to" / "write-a-service.md"
-SERVICE = next(section.files["mocap.py"] for section in sections(PAGE) if "mocap.py" in section.files)
+SERVICE = next(section.files["mocap.py"] for section in parse_sections(PAGE) if "mocap.py" in section.files)
 MORE = """
 
 class Another(MotionCapture):
@@ -45,7 +45,7 @@ NAMED = "services.sensor.plugin=./lab/mocap.py:MotionCapture"
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
     """A robot without a pose sensor, and a service that has one."""
-    robot = (SHIPPED / "robots" / "planar13.toml").read_text()
+    robot = (SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text()
     bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.pose]"))
     (tmp_path / "bare.toml").write_text(bare)
     (tmp_path / "lab").mkdir()
@@ -56,11 +56,11 @@ def home(tmp_path: Path) -> Path:
 SHORT = ["triplet", "--duration", "0.5", "--set", "robot=./bare.toml"]
 
 
-def digest_of(home: Path, out: str, run: Callable[..., tuple[Ended, RunSummary]]) -> str | None:
+def digest_of(home: Path, out: str, run: Callable[..., tuple[CompletedRun, RunSummary]]) -> str | None:
     """Of a run in which guidance knows the pose from the service alone."""
     ended, summary = run(home / out, *SHORT, "--set", NAMED)
     assert ended.code == 0, ended.out + ended.err
-    recorded = read_recording(home / out / RECORDING, (keys.POSE, keys.WORLD))
+    recorded = read_recording(home / out / RECORDING_FILENAME, (keys.POSE, keys.WORLD))
     assert set(range(50)) <= recorded.messages_by_tick[keys.POSE].keys()
     assert recorded.streams[keys.WORLD]
     return summary.command_digest
@@ -103,8 +103,20 @@ def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
 def test_file_service_starts_alone_by_path_or_name(home: Path) -> None:
     """It waits for a host, of which there is none, and says under which name."""
     for name in ("./lab/mocap.py:MotionCapture", "sensor"):
-        command = [*SNAKESIM, "start", "service", name, "triplet", "--set", NAMED, "--endpoint", free_endpoint()]
-        with subprocess.Popen(command, cwd=home, env=environment(home), stderr=subprocess.PIPE, text=True) as service:
+        command = [
+            *SNAKESIM_COMMAND,
+            "start",
+            "service",
+            name,
+            "triplet",
+            "--set",
+            NAMED,
+            "--endpoint",
+            find_free_endpoint(),
+        ]
+        with subprocess.Popen(
+            command, cwd=home, env=make_environment(home), stderr=subprocess.PIPE, text=True
+        ) as service:
             assert service.stderr is not None
             said = service.stderr.readline()
             service.terminate()

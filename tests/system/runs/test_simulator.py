@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import SimulatorRequest, Status
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
-from snakesim_testing.harness.processes import nothing_left
+from snakesim_testing.harness.processes import assert_no_process_left
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import running
+from snakesim_testing.runs.command import running_snakesim
 from snakesim_testing.runs.in_process_command import snakesim, tell
 
 pytestmark = pytest.mark.e2e
@@ -24,9 +24,9 @@ RUN = ["peg_row", "--duration", "1"]
 
 @pytest.mark.slow  # tests/system/host/test_simulated_time.py
 def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None:
-    plain = simulate(load(RUN[0], [parse_set("duration_s=1")]).config).summary
+    plain = simulate(load_scenario(RUN[0], [parse_set_option("duration_s=1")]).config).summary
     out = tmp_path / "run"
-    with running(out, *RUN) as run:
+    with running_snakesim(out, *RUN) as run:
 
         def sim(*asked: str, code: int = 0) -> str:
             ended = tell(run, "sim", *asked)
@@ -35,7 +35,7 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
 
         run.wait_for("network:")
         with open_session(Link(run.endpoint, "planar13"), 30.0) as session:
-            statuses = session.latched_reader(keys.STATUS, Status)
+            statuses = session.declare_latched_reader(keys.STATUS, Status)
             seen: list[Status] = []
 
             def shows(lifecycle: str, tick: int) -> bool:
@@ -58,7 +58,7 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
             wait_until(lambda: "PAUSED" in run.printed(), "the pause on the terminal")
             sim("resume")
         assert run.end() == 0, run.printed()
-    nothing_left(out)
+    assert_no_process_left(out)
     said = run.printed()
     assert "the simulator was reset" in said
     assert "host" in said
@@ -78,5 +78,5 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
 def pause(session: Session) -> bool:
     """False while there is no host that answers."""
     with contextlib.suppress(NotConnectedError):
-        return session.request(keys.SIMULATOR, SimulatorRequest(action="pause", requester="ada")).ok
+        return session.send_request(keys.SIMULATOR, SimulatorRequest(action="pause", requester="ada")).ok
     return False

@@ -7,9 +7,9 @@ import pytest
 
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import REPORT
+from snakesim_operator.results.run_reader import REPORT_FILENAME
 from snakesim_operator.results.summary import RunSummary
-from snakesim_testing.runs.command import Ended, run_to_summary
+from snakesim_testing.runs.command import CompletedRun, run_to_summary
 
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
 
@@ -17,7 +17,7 @@ FROM_S, TO_S = 2.0, 3.4
 FADED_S = 0.9  # after the push has ended: three time constants of the fade
 
 
-def run_with_fault(out: Path, fault: str) -> tuple[Ended, RunSummary]:
+def run_with_fault(out: Path, fault: str) -> tuple[CompletedRun, RunSummary]:
     return run_to_summary(out, "triplet", "--clock-mode", "realtime", "--duration", "6", "--fault", fault)
 
 
@@ -34,7 +34,7 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
     )  # a state may be 30 ms old, a lease lasts 50 ms
     assert "sensor/joints is 0.0" in (tmp_path / "run" / "control.log").read_text()
     assert "at most 0.03 s: no commands" in (tmp_path / "run" / "control.log").read_text()
-    assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT).read_text()
+    assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT_FILENAME).read_text()
 
 
 @pytest.mark.slow
@@ -51,11 +51,11 @@ def test_control_without_stream_holds_and_continues_when_it_returns(tmp_path: Pa
     assert not pushes[held].any()
     assert pushes[time_s > TO_S + 0.5].any()
     assert (record.mode[held] == Mode.POSITION).all()
-    reported = [state for state in record.control if state.reason.startswith(f"{key} is 0.")]
+    reported = [state for state in record.control_states if state.reason.startswith(f"{key} is 0.")]
     assert reported
     assert all(state.state == "NotLocomoting" for state in reported)
     assert any(f"s old, at most {limit_s:g} s" in state.reason for state in reported)
-    assert "Locomoting" in {state.state for state in record.control[-20:]}, "in the last second"
+    assert "Locomoting" in {state.state for state in record.control_states[-20:]}, "in the last second"
     late = (time_s > FROM_S + limit_s + FADED_S) & (time_s < TO_S)
     if late.any():  # nothing moves any more, and no target moves
         assert np.ptp(record.target[late], axis=0).max() < 0.02

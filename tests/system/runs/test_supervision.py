@@ -12,9 +12,9 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
 from snakesim_operator.results.summary import RunSummary
-from snakesim_testing.harness.processes import nothing_left, processes_of
+from snakesim_testing.harness.processes import assert_no_process_left, find_processes_of_run
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Running, armed_run, running, summary_of
+from snakesim_testing.runs.command import Running, read_summary, running_armed_snakesim, running_snakesim
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -29,7 +29,7 @@ class Robot:
     """A run as somebody on its network sees it."""
 
     def __init__(self, session: Session) -> None:
-        self._session, self._statuses = session, session.latched_reader(keys.STATUS, Status)
+        self._session, self._statuses = session, session.declare_latched_reader(keys.STATUS, Status)
         self._status: Status | None = None
 
     def status(self) -> Status:
@@ -49,12 +49,12 @@ class Robot:
         wait_until(lambda: self.status().ready_to_arm, "ready to arm", BACK_S)
 
     def tell(self, action: Literal["arm", "reset"]) -> Answer:
-        robot = self._session.latest(keys.DESCRIPTION, Description, BACK_S)
+        robot = self._session.wait_for_latched(keys.DESCRIPTION, Description, BACK_S)
         assert robot is not None
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
         )
-        return self._session.request(keys.LIFECYCLE, request)
+        return self._session.send_request(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
         wait_until(lambda: self.tell("arm").ok, "armed", BACK_S)
@@ -67,7 +67,7 @@ class Robot:
 
     def fault(self, kind: str, target: str, **more: object) -> Answer:
         request = FaultRequest(kind=kind, target=target, **more)  # pyright: ignore[reportArgumentType]
-        return self._session.request(keys.fault_key("run"), request, 5.0)
+        return self._session.send_request(keys.fault_key("run"), request, 5.0)
 
 
 def pids(run: Running, *names: str) -> dict[str, int]:
@@ -76,12 +76,12 @@ def pids(run: Running, *names: str) -> dict[str, int]:
 
 def interrupt(run: Running) -> RunSummary:
     assert run.interrupt() == 130 and "report:" in run.printed(), run.printed()
-    return summary_of(run.out)
+    return read_summary(run.out)
 
 
 @pytest.mark.parametrize("clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
 def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode: str) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay") as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             first, services = robot.reaches("armed"), pids(run, *SERVICES)
@@ -102,7 +102,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode
 
 
 def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot, before = Robot(session), run.part("control")
             os.kill(before, signal.SIGKILL)
@@ -125,7 +125,7 @@ def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -
 
 @pytest.mark.slow  # a row of the fault table
 def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
@@ -147,7 +147,7 @@ def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
         assert run.end() == 1
         assert "guidance was ended by SIGKILL" in run.printed()
@@ -155,7 +155,7 @@ def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> Non
 
 @pytest.mark.slow  # rows of the fault table
 def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
-    with armed_run(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
         with open_session(Link(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
@@ -183,11 +183,11 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
 
 def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
     frozen_soon = ("--set", 'faults=["freeze:control@0.2","freeze:host@0.2"]')
-    with running(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--with-router", *frozen_soon) as run:
+    with running_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--with-router", *frozen_soon) as run:
         run.wait_for("injected fault: freeze:host")
         frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
         assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]
-        assert len(processes_of(tmp_path / "run")) == 6  # router, host, three services, recorder
+        assert len(find_processes_of_run(tmp_path / "run")) == 6  # router, host, three services, recorder
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()
-        nothing_left(tmp_path / "run")
+        assert_no_process_left(tmp_path / "run")

@@ -15,12 +15,12 @@ from snakesim_drivers.kit.buses import Buses
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_type import DriverTypeContext
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.model.plugins import BACKENDS, find_plugin
+from snakesim_hal.model.plugins import BACKENDS, load_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
-from snakesim_hal.programs.preflight import backend_settings
+from snakesim_hal.programs.preflight import decode_backend_settings
 from snakesim_serial_backend import servo_backend
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.runs.in_process_command import run_to_summary
 
 MIXED_ROBOT = {
@@ -34,7 +34,7 @@ def configured(backend: str, **sections: Any) -> RunConfig:
     robot = MIXED_ROBOT if backend == "mixed" else {}
     own = {backend: {"physics_model": "inertia"} | sections.pop(backend, {})}
     clock_mode = "lockstep" if not sections and len(own[backend]) == 1 else "realtime"
-    return run_config(
+    return make_run_config(
         backend=backend,
         robot__chain__modules=4,
         rate_hz=100,
@@ -45,8 +45,8 @@ def configured(backend: str, **sections: Any) -> RunConfig:
 
 
 def opened(config: RunConfig) -> Any:
-    factory = find_plugin(BACKENDS, config.backend)
-    return factory(config, backend_settings(config, factory))
+    factory = load_plugin(BACKENDS, config.backend)
+    return factory(config, decode_backend_settings(config, factory))
 
 
 @pytest.mark.parametrize("backend", ["can", "odrive", "moteus", "cia402", "dynamixel", "mixed"])
@@ -80,10 +80,10 @@ def test_emulation_is_stated_only_without_real_drives(
     monkeypatch.setattr(servo_backend, "SerialWire", lambda port, *_: SimpleNamespace(port=port, latency_s=0.0))
     sections = {name: {"ports" if name == "dynamixel" else "channels": own} for name, own in buses.items()}
     config = configured(backend, **sections)
-    factory = find_plugin(BACKENDS, backend)
+    factory = load_plugin(BACKENDS, backend)
     clock = DriverClock(config)
     opened_buses: list[BusSpec] = []
-    for part in factory.split_by_driver_type(config, backend_settings(config, factory)):
+    for part in factory.group_joints_by_driver_type(config, decode_backend_settings(config, factory)):
         context = DriverTypeContext(config, part.settings, part.joints, clock, None)
         opened_buses += part.driver_type.plan_buses(context)
     in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.results.report.playback import playback
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_operator.results.report.playback import make_playback
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import UNRECORDED
 from snakesim_operator.run.in_process import simulate
@@ -89,7 +89,9 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
     assert ended.code == 0
     assert "reached after" in ended.out
     record = RunRecord.load(tmp_path / "run")
-    reached_s = next(state.timestamp_ns * 1e-9 for state in record.control if "the goal is reached" in state.reason)
+    reached_s = next(
+        state.timestamp_ns * 1e-9 for state in record.control_states if "the goal is reached" in state.reason
+    )
     assert 1.0 < reached_s < 4.0
     after = record.position_w_m[record.time_s > reached_s + 0.5, :2]
     assert np.ptp(after, axis=0).max() < 0.005
@@ -98,7 +100,9 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_report_shows_perceived_map_and_paths_beside_truth(tmp_path: Path) -> None:
-    film = playback(simulate(load("clutter", [parse_set("duration_s=1")]).config, tmp_path / "run").record)
+    film = make_playback(
+        simulate(load_scenario("clutter", [parse_set_option("duration_s=1")]).config, tmp_path / "run").record
+    )
     assert film is not None
     assert film.data["maps"]
     assert film.data["paths"]

@@ -9,8 +9,8 @@ import can
 import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire, to_python_can
-from snakesim_can_backend.bus.load import bus_load, check_load, plan_reports_at
-from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, scan, settings_of
+from snakesim_can_backend.bus.load import compute_bus_load, plan_reports_at, validate_bus_load
+from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, load_can_settings, scan
 from snakesim_can_backend.commands import COMMANDS
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
@@ -18,8 +18,8 @@ from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Modu
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns
-from snakesim_hal.model.scenario import load as load_scenario
-from snakesim_hal.model.scenario import parse_set
+from snakesim_hal.model.scenario import load_scenario as load_scenario
+from snakesim_hal.model.scenario import parse_set_option
 from snakesim_testing.can.frames import health, heartbeat
 from snakesim_testing.messages import raises_error
 from snakesim_testing.operator.registered import run_registered
@@ -62,7 +62,8 @@ def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert heading.split() == ["joints", "50", "Hz", "100", "Hz", "200", "Hz"]
     for row, joints in zip(rows, (13, 18, 30), strict=True):
         cells = [
-            f"{100 * bus_load(joints, plan_reports_at(rate, TRIPLET, CanSettings())):.1f}" for rate in (50, 100, 200)
+            f"{100 * compute_bus_load(joints, plan_reports_at(rate, TRIPLET, CanSettings())):.1f}"
+            for rate in (50, 100, 200)
         ]
         assert [word for word in row.split() if "." in word] == cells
         assert row.count("refused") == sum(float(cell) > 80 for cell in cells)
@@ -73,8 +74,8 @@ def test_a_table_of_several_buses_is_of_the_fullest(capsys: pytest.CaptureFixtur
     two = 'backend.channels=["can0", "can1"]'
     assert run(["drive", "load", "can", "triplet", "--set", two, "--joints", "13"]) == 0
     said = capsys.readouterr().out
-    loaded = load_scenario("triplet", [parse_set("backend=can"), parse_set(two)])
-    assert f"{100 * max(check_load(loaded.config, settings_of(loaded))):.1f} %" in said
+    loaded = load_scenario("triplet", [parse_set_option("backend=can"), parse_set_option(two)])
+    assert f"{100 * max(validate_bus_load(loaded.config, load_can_settings(loaded))):.1f} %" in said
     assert "the fullest of 2 buses" in said
 
 

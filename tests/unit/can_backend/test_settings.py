@@ -7,12 +7,12 @@ import pytest
 from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParameter
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.files import ConfigTable, decode_table
 from snakesim_testing.messages import raises_error
 
 
 def read(section: dict[str, Any]) -> CanSettings:
-    return decode(Table(section, "crawl.toml", {}), CanSettings, "backends.can")
+    return decode_table(ConfigTable(section, "crawl.toml", {}), CanSettings, "backends.can")
 
 
 @pytest.mark.parametrize(

@@ -10,15 +10,15 @@ from snakesim.environments.array_limiter import (
     LIMIT_NAMES,
     LimitArrays,
     MeasuredArrays,
-    find_active_limits,
+    find_active_limit_indices,
     limit_targets,
     limit_torque_limits,
 )
-from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
-from snakesim_hal.safety.limit_names import name_active_limits
+from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, MeasuredState
+from snakesim_hal.safety.limit_names import find_active_limits
 from snakesim_hal.safety.limiter import limit_command
 from snakesim_hal.wire.messages import Description, JointCommand, Mode
-from snakesim_testing.hal.small_robots import command, description
+from snakesim_testing.hal.small_robots import make_description, make_joint_command
 
 ROBOTS = 40
 JOINTS = 3
@@ -27,7 +27,7 @@ ROUNDS = 30
 
 def make_robot(random: np.random.Generator) -> Description:
     """A robot whose joints have limits of their own; some cannot move."""
-    robot = description()
+    robot = make_description()
     joints = [
         msgspec.structs.replace(
             joint,
@@ -68,21 +68,21 @@ def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: Mode) -> None:
 
         torque_limit_nm = limit_torque_limits(last_limit_nm, fraction, limits)
         target = limit_targets(mode, requested, last_target, torque_limit_nm, measured, limits)
-        names = find_active_limits(mode, requested, target, torque_limit_nm, fraction, measured, limits)
+        names = find_active_limit_indices(mode, requested, target, torque_limit_nm, fraction, measured, limits)
 
         for i, robot_limits in enumerate(limits_of_robot):
-            asked: JointCommand = command(
+            asked: JointCommand = make_joint_command(
                 robots[i],
                 mode=[mode] * JOINTS,
                 target=requested[i].tolist(),
                 torque_limit_nm=limits.torque_nm[i].tolist(),
             )
-            state = Measured(angle_rad[i], velocity_rad_s[i], np.zeros(JOINTS))
-            last = Applied(np.full(JOINTS, int(mode)), last_target[i], last_limit_nm[i])
+            state = MeasuredState(angle_rad[i], velocity_rad_s[i], np.zeros(JOINTS))
+            last = AppliedSetpoints(np.full(JOINTS, int(mode)), last_target[i], last_limit_nm[i])
             expected = limit_command(asked, measured=state, last=last, limits=robot_limits, torque_fraction=fraction[i])
             assert target[i].tobytes() == expected.target.tobytes()
             assert torque_limit_nm[i].tobytes() == expected.torque_limit_nm.tobytes()
-            expected_names = name_active_limits(
+            expected_names = find_active_limits(
                 asked, expected, measured=state, limits=robot_limits, torque_fraction=fraction[i]
             )
             assert {joint: LIMIT_NAMES[name] for joint, name in enumerate(names[i].tolist()) if name} == expected_names

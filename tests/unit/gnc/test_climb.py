@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.climb import ABOVE_M, Climb, line_height_m
+from snakesim_gnc.control.climb import CLEARANCE_M, PlatformClimb, compute_path_height_m
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_gnc.navigation.platform_rises import PlatformRises
-from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle, Rise
 from snakesim_testing.gnc.stage import make_robot
@@ -38,24 +38,26 @@ def test_a_path_rises_where_it_leads_over_a_platform(yaw_rad: float) -> None:
 
 @pytest.mark.parametrize("tail_s_m", [-0.9, -0.3, 0.2, 0.6, 1.1, 1.5])
 def test_climb_every_body_part_has_height_of_path(tail_s_m: float) -> None:
-    angles = Climb(make_robot(18, ("yaw", "pitch"))).angles_rad([RISE], tail_s_m)
+    angles = PlatformClimb(make_robot(18, ("yaw", "pitch"))).compute_pitch_angles_rad([RISE], tail_s_m)
     lengths = [link.length_m for link in make_robot(18, ("yaw", "pitch")).links]
-    wanted = [line_height_m([RISE], tail_s_m + s) for s in np.cumsum([0.0, *lengths])]
+    wanted = [compute_path_height_m([RISE], tail_s_m + s) for s in np.cumsum([0.0, *lengths])]
     begins_up = np.arcsin((wanted[2] - wanted[0]) / (lengths[0] + lengths[1]))  # the tail's slope, to its first pitch
     c, s = math.cos(begins_up), math.sin(begins_up)
     rotation = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
-    heights = link_frames((0.0, 0.0, wanted[0]), rotation, angles, AXES, lengths)[0][:, 2]
+    heights = compute_link_frames((0.0, 0.0, wanted[0]), rotation, angles, AXES, lengths)[0][:, 2]
     assert np.abs(heights[::2] - wanted[:-1:2]).max() < 1e-9
-    assert np.abs(heights - wanted[:-1]).max() < ABOVE_M
+    assert np.abs(heights - wanted[:-1]).max() < CLEARANCE_M
 
 
 def test_climb_needs_pitch_joints() -> None:
-    assert not Climb(make_robot(13)).angles_rad([RISE], 0.5).any()
+    assert not PlatformClimb(make_robot(13)).compute_pitch_angles_rad([RISE], 0.5).any()
 
 
 def test_seen_from_above_a_body_on_a_ramp_is_shorter() -> None:
     segments = [0.1, *[0.2] * 8, 0.1]
-    level, climbing = (BodyOnPath(Route(STRAIGHT), segments, rises).pose_at(0.0).nodes_w[0] for rises in ([], [RISE]))
+    level, climbing = (
+        BodyOnPath(Route(STRAIGHT), segments, rises).compute_pose_at(0.0).body_points_w[0] for rises in ([], [RISE])
+    )
     assert np.all(level[:4] == climbing[:4])
     assert level[-1] == pytest.approx(1.8)
     assert 0.005 < level[-1] - climbing[-1] < 0.05

@@ -6,16 +6,23 @@ from functools import cache
 import numpy as np
 import pytest
 
-from snakesim_gnc.geometry.body_on_path import chain_nodes
+from snakesim_gnc.geometry.body_on_path import compute_chain_points
 from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_grid import MAX_DISTANCE_M, NO_OBSTACLE, ObstacleGrid
 from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
 from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath
-from snakesim_hal.model.outlines import outline_distance_m
-from snakesim_hal.model.route import Route, yaw_segments_m
-from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal, find_start_pose, load, parse_set, place_obstacles
+from snakesim_hal.model.outlines import compute_outline_distance_m
+from snakesim_hal.model.route import Route, compute_yaw_segments_m
+from snakesim_hal.model.scenario import (
+    HeadingGoal,
+    WaypointGoal,
+    compute_start_pose,
+    load_scenario,
+    parse_set_option,
+    place_obstacles,
+)
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 from snakesim_testing.gnc.stage import make_world
 
@@ -28,9 +35,9 @@ SEARCH = SearchParameters(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
 def field(density: float = 8.0) -> tuple[list[Obstacle], np.ndarray]:
     """Obstacles, and the nodes of the body where it is laid down."""
     flags = ("scene.random_field.0.seed=1", f"scene.random_field.0.density_per_m2={density}")
-    config = load("surveyed_clutter", [parse_set(flag) for flag in flags]).config
-    start, segments = find_start_pose(config), yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
-    body = chain_nodes(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments).T
+    config = load_scenario("surveyed_clutter", [parse_set_option(flag) for flag in flags]).config
+    start, segments = compute_start_pose(config), compute_yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
+    body = compute_chain_points(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments).T
     return [placed.obstacle for placed in place_obstacles(config)], body
 
 
@@ -39,7 +46,7 @@ def world(at_s: float, obstacles: list[Obstacle]) -> World:
 
 
 def planner(known: list[Obstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:
-    return ClutterPlanner(goal or HeadingGoal(), known, search=SEARCH, turn_s=TURN_S)
+    return ClutterPlanner(goal or HeadingGoal(), known, search_parameters=SEARCH, update_period_s=TURN_S)
 
 
 def planned(
@@ -73,12 +80,12 @@ def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
     points = random.uniform((0.0, -1.2), (6.5, 1.2), (300, 2))
     near = made.find_nearest(points[:, 0], points[:, 1])
     for k, point in enumerate(points):
-        least = min(outline_distance_m(o, point) for o in obstacles)
+        least = min(compute_outline_distance_m(o, point) for o in obstacles)
         assert near.distance_m[k] == pytest.approx(min(least, MAX_DISTANCE_M), abs=0.011)
-        if near.obstacle[k] != NO_OBSTACLE and near.distance_m[k] > 1e-6:
+        if near.obstacle_index[k] != NO_OBSTACLE and near.distance_m[k] > 1e-6:
             assert np.hypot(*near.normal_w[k]) == pytest.approx(1.0)
             moved = point + 1e-4 * near.normal_w[k]
-            grown = outline_distance_m(obstacles[near.obstacle[k]], moved) - near.distance_m[k]
+            grown = compute_outline_distance_m(obstacles[near.obstacle_index[k]], moved) - near.distance_m[k]
             assert grown == pytest.approx(1e-4, rel=1e-3)
 
 
@@ -127,10 +134,10 @@ def test_only_what_is_seen_is_planned_around() -> None:
     blind = planned(made, body)
     wall = Obstacle(name="wall", shape="box", position_w=(2.2, 0.0, 0.1), half_size_m=(0.05, 0.4, 0.1), height_m=0.2)
     points = np.array(blind.path_w)
-    assert min(outline_distance_m(wall, p) for p in points) < 0.0  # it does not know yet
+    assert min(compute_outline_distance_m(wall, p) for p in points) < 0.0  # it does not know yet
     seen = planned(made, body, 0.2, [wall])
     assert seen.path_id != blind.path_id
-    assert min(outline_distance_m(wall, p) for p in np.array(seen.path_w)) > 0.03
+    assert min(compute_outline_distance_m(wall, p) for p in np.array(seen.path_w)) > 0.03
 
 
 @pytest.mark.slow  # whole runs through clutter reach it in tests/system/physics
@@ -177,7 +184,7 @@ def test_planner_follows_old_path_while_work_per_turn_is_bounded() -> None:
     obstacles, body = field()
     made = planner(obstacles)
     route = Route(np.concatenate([body, body[-1] + np.array([[1.0, 0.0], [5.0, 0.0]])]))
-    made.follow(route, ["peg"])
+    made.follow_route(route, ["peg"])
     seen = turns(made, body, 6, heading_rad=0.7)
     waiting = [one for one in seen if one.searching]
     assert 1 <= len(waiting) <= 4
@@ -193,13 +200,16 @@ def test_planner_follows_old_path_while_work_per_turn_is_bounded() -> None:
     assert {one.path_id for one in after} == {1}
     assert after[1].searched_nodes == 0
     begin = np.array(after[0].path_w)
-    ahead = route.position_w(route.length_m - 6.0 + np.arange(0.02, 0.1, 0.02))
+    ahead = route.compute_positions_w(route.length_m - 6.0 + np.arange(0.02, 0.1, 0.02))
     assert max(np.hypot(*(begin - point).T).min() for point in ahead) < 0.01  # it begins with the path before
 
 
 def test_a_plan_is_the_same_in_however_many_slices() -> None:
     obstacles, body = field()
-    made = [ClutterPlanner(HeadingGoal(), obstacles, search=SEARCH, turn_s=turn_s) for turn_s in (0.08, 0.5)]
+    made = [
+        ClutterPlanner(HeadingGoal(), obstacles, search_parameters=SEARCH, update_period_s=turn_s)
+        for turn_s in (0.08, 0.5)
+    ]
     few, many = (turns(one, body, 40)[-1] for one in made)
     assert few.path_id == 1
     assert few.path_w == many.path_w
@@ -209,12 +219,12 @@ def test_nothing_moves_before_the_first_path_is_there() -> None:
     obstacles, body = field()
     made = planner(obstacles)
     first = turns(made, body, 1)[0]
-    assert not made.ready
+    assert not made.has_plan
     assert first.speed_m_s == 0.0
     assert first.searching == "the first path"
     assert first.reason == "the first path: a path is being searched"
     moving = turns(made, body, 30)[-1]
-    assert made.ready
+    assert made.has_plan
     assert moving.speed_m_s == 0.2
     assert moving.searching == ""
     assert moving.reason == ""
@@ -236,7 +246,7 @@ def test_a_tick_that_is_shown_again_is_one_turn() -> None:
 def test_the_work_of_a_turn_is_bounded_whatever_is_planned(seen: bool, turn_s: float) -> None:
     """Counted, and in CPU time: ten times what the rate allows, so that a slow computer passes."""
     obstacles, body = field(density=12.0)
-    made = ClutterPlanner(HeadingGoal(), None if seen else obstacles, search=SEARCH, turn_s=turn_s)
+    made = ClutterPlanner(HeadingGoal(), None if seen else obstacles, search_parameters=SEARCH, update_period_s=turn_s)
     done, paths, took_s = [], set(), []
     for k in range(round(12.0 / turn_s)):  # it stands: stuck paths, backing out, and a turn to the left
         desired = DesiredMotion(0.2, heading_w_rad=None if k * turn_s < 8.0 else 0.7)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
-from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_testing.gnc.stage import make_robot
-from snakesim_testing.hal.small_robots import pose
+from snakesim_testing.hal.small_robots import make_pose
 
 ROBOT = make_robot()
 COUNT = len(ROBOT.joints)
@@ -24,7 +24,7 @@ def readings(pushes, *, friction=0.0, acceleration=(0.0, 0.0)):
     By d'Alembert: forces, and inertia against the common acceleration, are carried by the joints. Also returns what is
     left over of force and moment, which is zero if that acceleration is true.
     """
-    rear, frames = link_frames((0, 0, 0), np.eye(3), SHAPE, ["yaw"] * COUNT, LENGTHS)
+    rear, frames = compute_link_frames((0, 0, 0), np.eye(3), SHAPE, ["yaw"] * COUNT, LENGTHS)
     middles = rear + frames[:, :, 0] * np.array(LENGTHS)[:, None] / 2
     masses = np.array([link.mass_kg for link in ROBOT.links])
     loads = [
@@ -48,7 +48,7 @@ def estimated(torques, imu, pose: Pose | None = None) -> list[EstimatedPush]:
     return estimate_pushes(ROBOT, SHAPE.tolist(), [0.0] * COUNT, torques, imu, pose)
 
 
-@pytest.mark.parametrize(("friction", "moves"), [(0.0, None), (0.3, pose(velocity_w=(0.3, 0.0, 0.0)))])
+@pytest.mark.parametrize(("friction", "moves"), [(0.0, None), (0.3, make_pose(velocity_w=(0.3, 0.0, 0.0)))])
 def test_contact_estimate_without_contact_is_zero_despite_ground_friction(friction, moves):
     torques, imu, *_ = readings([], friction=friction, acceleration=(-friction * GRAVITY_M_S2, 0.0))
     assert estimated(torques, imu, pose=moves) == []
@@ -73,10 +73,13 @@ def test_contact_estimate_locates_side_and_force_of_accelerating_pushes(side):
         near = [
             c
             for c in found
-            if c.normal_l == (0.0, -side_of_it, 0.0) and abs(STARTS_M[c.link] + c.along_m - place_m) < 0.08
+            if c.normal_l == (0.0, -side_of_it, 0.0)
+            and abs(STARTS_M[c.link] + c.distance_from_rear_joint_m - place_m) < 0.08
         ]
         assert sum(c.force_n for c in near) == pytest.approx(force_n, rel=0.1), found
-        middle_m = sum((STARTS_M[c.link] + c.along_m) * c.force_n for c in near) / sum(c.force_n for c in near)
+        middle_m = sum((STARTS_M[c.link] + c.distance_from_rear_joint_m) * c.force_n for c in near) / sum(
+            c.force_n for c in near
+        )
         assert middle_m == pytest.approx(place_m, abs=0.02)
         assert all(0.5 < c.confidence <= 1.0 for c in near)
 

@@ -11,7 +11,7 @@ import pytest
 from snakesim.training.form import Policy
 from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave
 from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedParameters
-from snakesim_gnc.control.policy import POLICIES
+from snakesim_gnc.control.policy import POLICY_FOLDER
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import ControllerCommand
 from snakesim_hal.model.route import Route
@@ -32,7 +32,7 @@ def searching(*, among_pegs: bool = False, **parameters: float) -> tuple[Stage, 
 
 def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[ControllerCommand]:
     """What is commanded while the body stays where it is."""
-    return [controller.update(stage.observe(tick, TAIL_S_M)) for tick in ticks]
+    return [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in ticks]
 
 
 def targets(commands: list[ControllerCommand]) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_contact_search_fruitless_wave_is_replaced_by_the_other(among_pegs: bool
 def test_contact_search_wave_starts_slow_and_continues_fast() -> None:
     stage, controller = searching(among_pegs=True, shape_nm_per_rad=0.0)
     for tick in range(100):
-        controller.update(stage.observe(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
+        controller.update(stage.make_observation(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
     seen = stands(controller, stage, range(100, 1150))
     slow, fast = pytest.approx(2 * math.tau / 5.39, rel=0.15), pytest.approx(math.tau / 5.39, rel=0.15)
     assert [period_s(seen[first : first + 240]) for first in (150, 750)] == [slow, fast]
@@ -85,14 +85,16 @@ def test_contact_search_wave_starts_slow_and_continues_fast() -> None:
 def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
     stage, controller = searching()
     stands(controller, stage, range(110))
-    led = [controller.update(stage.observe(tick, TAIL_S_M + 0.0003 * (tick - 110))) for tick in range(110, 900)]
+    led = [
+        controller.update(stage.make_observation(tick, TAIL_S_M + 0.0003 * (tick - 110))) for tick in range(110, 900)
+    ]
     assert all(SEARCHES in command.telemetry.reason for command in led)
     assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [pytest.approx(0.8, rel=0.05)] * 3
 
 
 def test_contact_search_detects_standing_body_despite_pose_noise() -> None:
     (stage, controller), noise = searching(search_after_s=1.2), np.random.default_rng(1)
-    observations = (stage.observe(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
+    observations = (stage.make_observation(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
     assert any(SEARCHES in controller.update(observation).telemetry.reason for observation in observations)
 
 
@@ -103,7 +105,7 @@ def test_contact_search_can_be_disabled() -> None:
 
 def test_the_wave_is_that_of_the_shipped_policy() -> None:
     stage, passed_s, draw = make_stage(), 2.3, np.random.default_rng(3)
-    observation = stage.observe(0, TAIL_S_M)
+    observation = stage.make_observation(0, TAIL_S_M)
     assert observation.world is not None
     assert observation.trajectory is not None
     contacts = [
@@ -114,13 +116,13 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
         forces_n[contact.link] += np.linalg.norm(contact.force_w)
     velocity, torque = draw.normal(0.0, 1.0, 13).tolist(), draw.normal(0.0, 3.0, 13).tolist()
     joints = msgspec.structs.replace(observation.joints, velocity_rad_s=velocity, torque_nm=torque)
-    nodes = PlanarBody(stage.robot).nodes_w(observation.world, joints.angle_rad)
+    nodes = PlanarBody(stage.robot).compute_body_points_w(observation.world, joints.angle_rad)
     goal_w = nodes[:, -1] + np.array([0.5, 2.0])
     bearing_rad = np.arctan2(2.0, 0.5) - np.arctan2(*(nodes[:, -1] - nodes[:, 0])[::-1])
-    session = onnxruntime.InferenceSession(POLICIES / "lab.onnx")
+    session = onnxruntime.InferenceSession(POLICY_FOLDER / "lab.onnx")
     learned = msgspec.json.decode(session.get_modelmeta().custom_metadata_map["snakesim.learned"])
     sizes = {"time_s": 1, "goal_bearing": 2, "angle_rad": 13, "velocity_rad_s": 13, "torque_nm": 13, "contact_n": 14}
-    policy = Policy.of(learned, ["yaw"] * 13, sizes)
+    policy = Policy.make_from_parameters(learned, ["yaw"] * 13, sizes)
     goal = [np.cos(bearing_rad), np.sin(bearing_rad)]
     seen = [passed_s, *goal, *joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm, *forces_n]
     felt = replace(
@@ -129,16 +131,16 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
         world=msgspec.structs.replace(observation.world, contacts=contacts),
         trajectory=msgspec.structs.replace(observation.trajectory, goal_w=tuple(goal_w.tolist())),
     )
-    wave = ForceFeedbackWave(stage.robot).reference_rad(felt, passed_s)
-    assert wave == pytest.approx(policy.targets(np.array(seen, np.float32)), abs=1e-4)
+    wave = ForceFeedbackWave(stage.robot).compute_reference_rad(felt, passed_s)
+    assert wave == pytest.approx(policy.compute_targets(np.array(seen, np.float32)), abs=1e-4)
 
 
 def felt_by(stage: Stage, torque_nm: float = 0.0) -> np.ndarray:
     """Angles of all joints of a straight body, whatever path there is."""
-    joints = stage.observe(0, TAIL_S_M, torque_nm=torque_nm).joints
+    joints = stage.make_observation(0, TAIL_S_M, torque_nm=torque_nm).joints
     straight = msgspec.structs.replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
-    observation = replace(stage.observe(0, TAIL_S_M, without="world"), joints=straight)
-    return ForceFeedbackWave(stage.robot).reference_rad(observation, 0.3)
+    observation = replace(stage.make_observation(0, TAIL_S_M, without="world"), joints=straight)
+    return ForceFeedbackWave(stage.robot).compute_reference_rad(observation, 0.3)
 
 
 def test_contact_search_bends_along_same_curve_for_any_joint_spacing() -> None:
@@ -156,13 +158,14 @@ def test_contact_search_scales_torque_by_its_limit() -> None:
 
 def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
     stage = make_stage()
-    observation = stage.observe(0, TAIL_S_M)
+    observation = stage.make_observation(0, TAIL_S_M)
     knocked = replace(observation, joints=msgspec.structs.replace(observation.joints, velocity_rad_s=[20.0] * 13))
     calm, struck = ForceFeedbackWave(stage.robot), ForceFeedbackWave(stage.robot)
     for wave in (calm, struck):
-        wave.reference_rad(observation, 0.01)
+        wave.compute_reference_rad(observation, 0.01)
     apart = [
-        np.ptp([calm.reference_rad(observation, 0.01), struck.reference_rad(knocked, 0.01)], axis=0) for _ in range(20)
+        np.ptp([calm.compute_reference_rad(observation, 0.01), struck.compute_reference_rad(knocked, 0.01)], axis=0)
+        for _ in range(20)
     ]
     assert np.max(np.diff(apart, axis=0)) < 0.11
     assert np.max(apart[0]) < 0.11
@@ -173,7 +176,7 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
 def test_contact_search_of_moving_body_does_not_start(speed_m_s: float) -> None:
     stage, controller = searching()
     stage.speed_m_s = speed_m_s
-    moving = [controller.update(stage.observe(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
+    moving = [controller.update(stage.make_observation(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
     assert not any(SEARCHES in command.telemetry.reason for command in moving)
 
 
@@ -189,4 +192,4 @@ def test_contact_search_of_u_shaped_body_raises_no_error(pegs: list[Obstacle]) -
     for tail_s_m in np.linspace(0.3, 0.7, 9):
         controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
         for tick in range(5):
-            assert np.isfinite(controller.update(stage.observe(tick, float(tail_s_m))).setpoints.target).all()
+            assert np.isfinite(controller.update(stage.make_observation(tick, float(tail_s_m))).setpoints.target).all()

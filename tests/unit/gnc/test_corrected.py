@@ -11,14 +11,14 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_testing.gnc.stage import make_stage
 
 pytest.importorskip("gymnasium")
-from snakesim.environments.assisted import _make_corrected
+from snakesim.environments.assisted import _make_correcting_class
 
 MEMBERS = [name for name in vars(Controller) if not name.startswith("_") and name != "update"]
 
 
 @pytest.mark.parametrize("controller", [Hold, ObstacleTriplet, Policy])
 def test_it_has_every_declaration_of_the_other_controller(controller: type[Controller]) -> None:
-    corrected = require_base_class(_make_corrected(controller, []), Controller, "controller 'corrected'")
+    corrected = require_base_class(_make_correcting_class(controller, []), Controller, "controller 'corrected'")
     for name in MEMBERS:
         own, other = (getattr(cls, name) for cls in (corrected, controller))
         assert getattr(own, "__func__", own) is getattr(other, "__func__", other), name
@@ -26,8 +26,8 @@ def test_it_has_every_declaration_of_the_other_controller(controller: type[Contr
 
 def test_it_adds_corrections_to_targets_in_position_mode_alone() -> None:
     stage, residual_rad = make_stage(3), [0.0, 0.1, -0.2]
-    observation = stage.observe(0, 0.3)
-    corrected = _make_corrected(Hold, residual_rad)(stage.robot, NoParameters())
+    observation = stage.make_observation(0, 0.3)
+    corrected = _make_correcting_class(Hold, residual_rad)(stage.robot, NoParameters())
     command = corrected.update(observation)
     assert command.setpoints.mode == [Mode.POSITION] * 3
     added = [

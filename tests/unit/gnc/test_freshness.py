@@ -9,7 +9,7 @@ from snakesim_gnc.control.freshness import AgeLimits
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Description, SensorDescription, Trajectory, World
 from snakesim_testing.gnc.stage import make_world
-from snakesim_testing.hal.small_robots import description, run_config, state
+from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_run_config
 
 SCHEDULE = {
     "control": {"latency_ticks": 2},
@@ -23,11 +23,11 @@ NOW = 100 * SECOND
 def robot(**rates: float) -> Description:
     """With sensors of these rates in Hz, each with a delay of 0.05 s."""
     sensors = [SensorDescription(key=f"sensor/{name}", rate_hz=rate, delay_s=0.05) for name, rate in rates.items()]
-    return msgspec.structs.replace(description(), sensors=sensors)
+    return msgspec.structs.replace(make_description(), sensors=sensors)
 
 
 def limits(config: RunConfig | None = None, **rates: float) -> AgeLimits:
-    return AgeLimits.from_config(config or run_config(services=SCHEDULE), robot(**rates))
+    return AgeLimits.from_config(config or make_run_config(services=SCHEDULE), robot(**rates))
 
 
 def world(**changes: Any) -> World:
@@ -51,19 +51,19 @@ def test_the_limits_follow_from_rates_delays_and_schedules() -> None:
     assert found.trajectory_s == pytest.approx(0.04 + 0.2 + 3 * 0.2)
     assert limits().joints_s == pytest.approx(0.03)
     assert limits().sensors_s == {}
-    tracked = run_config(services={**SCHEDULE, "sensor": {"decimation": 10, "latency_ticks": 3}})
+    tracked = make_run_config(services={**SCHEDULE, "sensor": {"decimation": 10, "latency_ticks": 3}})
     assert limits(tracked).sensors_s == pytest.approx({"sensor/pose": 0.04 + 0.03 + 0.3})  # by a service's schedule
 
 
 def test_a_run_without_guidance_or_navigation_has_limits_too() -> None:
-    found = limits(run_config())
+    found = limits(make_run_config())
     assert found.world_s == pytest.approx(0.01 + 0.2)
     assert found.trajectory_s == pytest.approx(0.03 + 0.2)
 
 
 def test_freshness_limits_may_be_set_by_scenario() -> None:
     said = {"joints_s": 0.04, "pose_s": 0.5, "contacts_s": 5.0, "world_s": 0.1, "trajectory_s": 2.0}
-    found = limits(run_config(services=SCHEDULE, max_age=said), pose=100.0, contacts=10.0)
+    found = limits(make_run_config(services=SCHEDULE, max_age=said), pose=100.0, contacts=10.0)
     assert found.joints_s == 0.04
     assert found.world_s == 0.1
     assert found.trajectory_s == 2.0
@@ -75,7 +75,7 @@ def test_freshness_limits_may_be_set_by_scenario() -> None:
 )
 def test_freshness_invalid_scenario_limits_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(msgspec.ValidationError):
-        run_config(max_age=wrong)
+        make_run_config(max_age=wrong)
 
 
 @pytest.mark.parametrize(
@@ -103,10 +103,13 @@ def test_freshness_of_world_model_is_that_of_its_inputs(made: dict[str, Any], wo
 
 
 def test_a_perceived_map_is_as_old_as_its_newest_image() -> None:
-    config = run_config(services=SCHEDULE, mission={"map": "perceived"})
+    config = make_run_config(services=SCHEDULE, mission={"map": "perceived"})
     sensors = [SensorDescription(key=f"sensor/{name}", rate_hz=20.0, delay_s=0.03) for name in ("depth/a", "range/b")]
-    seeing = msgspec.structs.replace(description(), sensors=sensors)
-    found, known = AgeLimits.from_config(config, seeing), AgeLimits.from_config(run_config(services=SCHEDULE), seeing)
+    seeing = msgspec.structs.replace(make_description(), sensors=sensors)
+    found, known = (
+        AgeLimits.from_config(config, seeing),
+        AgeLimits.from_config(make_run_config(services=SCHEDULE), seeing),
+    )
     assert found.check_world(world(depth_timestamp_ns=NOW - 270_000_000), NOW) == ""
     old = found.check_world(world(depth_timestamp_ns=NOW - 400_000_000), NOW)
     assert old == "sensor/depth or sensor/range is 0.4 s old, at most 0.27 s"
@@ -120,7 +123,7 @@ def test_a_sensor_that_the_robot_lacks_cannot_be_stale() -> None:
 
 
 def test_joints_and_trajectory_have_their_own_limits() -> None:
-    found, joints = limits(), state(robot(), timestamp_ns=NOW)
+    found, joints = limits(), make_joint_state(robot(), timestamp_ns=NOW)
     assert found.check_joints(joints, NOW + 30_000_000) == ""
     assert found.check_joints(joints, NOW + 31_000_000) == "sensor/joints is 0.031 s old, at most 0.03 s"
     assert found.check_joints(joints, NOW - 10_000_000) == ""  # it came before its tick's clock

@@ -9,14 +9,14 @@ import pytest
 
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, positions
+from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_testing.gnc.stage import make_stage
 from snakesim_testing.messages import raises_error
 
 STAGE = make_stage(3)
-OBSERVATION = STAGE.observe(0, 0.3)
-GOOD = positions(STAGE.robot, OBSERVATION.joints.angle_rad)
+OBSERVATION = STAGE.make_observation(0, 0.3)
+GOOD = make_position_setpoints(STAGE.robot, OBSERVATION.joints.angle_rad)
 WHO = r"^controller ./wave.py:Wave \(class Wave\): "
 
 

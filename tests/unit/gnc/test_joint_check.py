@@ -2,10 +2,10 @@
 
 from snakesim_gnc.control.joint_check import JointCheck, JointCheckParameters
 from snakesim_hal.controller import Observation
-from snakesim_testing.hal.small_robots import description, state
+from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
 PERIOD_S = 0.01
-ROBOT = description()
+ROBOT = make_description()
 LIMIT_RAD = ROBOT.joints[0].angle_max_rad
 
 
@@ -15,7 +15,7 @@ def targets(start_rad: float, seconds: float, dead: int | None = None) -> list[l
     angles = [start_rad] * len(ROBOT.joints)
     made: list[list[float]] = []
     for tick in range(round(seconds / PERIOD_S)):
-        observation = Observation(tick, tick * PERIOD_S, PERIOD_S, state(ROBOT, angles), None, None)
+        observation = Observation(tick, tick * PERIOD_S, PERIOD_S, make_joint_state(ROBOT, angles), None, None)
         made.append(list(check.update(observation).setpoints.target))
         angles = [angle if joint == dead else made[-1][joint] for joint, angle in enumerate(angles)]
     return made

@@ -4,12 +4,12 @@ import msgspec
 import pytest
 
 from snakesim_gnc.control.live_parameters import LiveParameters
-from snakesim_hal.model.scenario import load
+from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, ControlParameters, ParametersRequest
-from snakesim_testing.hal.small_robots import description
+from snakesim_testing.hal.small_robots import make_description
 
 CLOCK = Clock(
     tick=7,
@@ -28,21 +28,21 @@ class Bench:
 
     def __init__(self) -> None:
         network = LocalNetwork()
-        config = load("triplet", []).config
-        self.parameters = LiveParameters(Client(network.session(), "control"), config)
-        self.parameters.configure(description())
+        config = load_scenario("triplet", []).config
+        self.parameters = LiveParameters(Client(network.create_session(), "control"), config)
+        self.parameters.configure(make_description())
         self.anew: list[bool] = []
-        network.answer = lambda: self.anew.append(self.parameters.answer_requests(CLOCK))
-        self.operator: LocalSession = network.session()
+        network.run_responders = lambda: self.anew.append(self.parameters.answer_requests(CLOCK))
+        self.operator: LocalSession = network.create_session()
         self.parameters.answer_requests(CLOCK)
 
     def ask(self, parameters: str, controller: str = "obstacle_triplet") -> Answer:
-        return self.operator.request(
+        return self.operator.send_request(
             keys.PARAMETERS, ParametersRequest(requester="ada", controller=controller, parameters=parameters)
         )
 
     def in_force(self) -> ControlParameters:
-        found = self.operator.latest(keys.PARAMETERS_IN_FORCE, ControlParameters, 1.0)
+        found = self.operator.wait_for_latched(keys.PARAMETERS_IN_FORCE, ControlParameters, 1.0)
         assert found is not None
         return found
 

@@ -7,23 +7,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.push import Touches, find_touches, push_forward
-from snakesim_gnc.geometry.planar import wrenches
+from snakesim_gnc.control.push import BodyContacts, find_body_contacts, solve_push
+from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.path_search.margin import MAX_CONTACT_FORCE_N, compute_margins_n
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_stage, nodes_of
+from snakesim_testing.gnc.stage import BODY_RADIUS_M, compute_body_points, make_stage
 
 SEEDS = st.integers(0, 2**31)
 
 
-def touching(tail_s_m: float, pegs: list[Obstacle] | None = None) -> tuple[np.ndarray, Touches, np.ndarray]:
+def touching(tail_s_m: float, pegs: list[Obstacle] | None = None) -> tuple[np.ndarray, BodyContacts, np.ndarray]:
     """Nodes of a body on the usual route, what touches it, and its joints' change of angle per metre of the way."""
     stage = make_stage()
-    nodes = nodes_of(stage, tail_s_m)
+    nodes = compute_body_points(stage, tail_s_m)
     outlines = Outlines.from_obstacles(stage.pegs if pegs is None else pegs)
-    slope = (angles_of(nodes_of(stage, tail_s_m + 0.01)) - angles_of(nodes)) / 0.01
-    return nodes, find_touches(nodes, BODY_RADIUS_M, outlines, reach_m=0.03, friction=0.0), slope
+    slope = (angles_of(compute_body_points(stage, tail_s_m + 0.01)) - angles_of(nodes)) / 0.01
+    return nodes, find_body_contacts(nodes, BODY_RADIUS_M, outlines, max_gap_m=0.03, friction=0.0), slope
 
 
 def angles_of(nodes: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ def test_the_margin_is_that_of_the_best_three_contacts(seed: int, count: int) ->
 
 def test_contacts_on_one_side_cannot_push() -> None:
     points = np.array([[0.2, 0.04], [0.6, 0.04], [1.0, 0.04], [1.3, 0.04]])
-    contacts = wrenches(points, np.tile([0.0, -1.0], (4, 1)))
+    contacts = compute_wrenches(points, np.tile([0.0, -1.0], (4, 1)))
     drag = np.array([1.0, 0.0, 0.0])
     assert compute_margins_n(contacts[None], drag[None])[0] == 0.0
     assert compute_margins_n(contacts[None, :2], drag[None])[0] == 0.0  # nor can two
@@ -60,23 +60,23 @@ def test_contacts_on_one_side_cannot_push() -> None:
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
 def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
-    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
+    push = solve_push(nodes, touches, slope, contact_gap_scale_m=0.005)
     assert len(touches) >= 3
-    assert push.balanced
-    assert push.lambdas.min() >= 0.0
-    forces = push.lambdas[:, None] * touches.directions_w
+    assert push.is_balanced
+    assert push.contact_forces.min() >= 0.0
+    forces = push.contact_forces[:, None] * touches.directions_w
     run = np.diff(nodes, axis=1).T
     share = np.hypot(*run.T) / np.hypot(*run.T).sum()
     drag = share[:, None] * run / np.hypot(*run.T)[:, None]
     assert forces.sum(axis=0) == pytest.approx(drag.sum(axis=0), abs=0.05)
     middles = nodes[:, :-1].T + 0.5 * run
-    moment = np.sum(wrenches(touches.places_w, forces)[:, 2]) - np.sum(wrenches(middles, drag)[:, 2])
+    moment = np.sum(compute_wrenches(touches.positions_w, forces)[:, 2]) - np.sum(compute_wrenches(middles, drag)[:, 2])
     assert moment == pytest.approx(0.0, abs=0.1)
-    for joint, torque in enumerate(push.torques_nm):  # what is ahead of each joint is in balance, too
+    for joint, torque in enumerate(push.joint_torques_nm):  # what is ahead of each joint is in balance, too
         at = nodes[:, joint + 1]
         ahead = touches.body_s_m > np.hypot(*run.T)[: joint + 1].sum()
-        held = np.sum(wrenches(touches.places_w - at, forces)[ahead, 2])
-        braked = np.sum(wrenches(middles - at, drag)[joint + 1 :, 2])
+        held = np.sum(compute_wrenches(touches.positions_w - at, forces)[ahead, 2])
+        braked = np.sum(compute_wrenches(middles - at, drag)[joint + 1 :, 2])
         assert torque + held - braked == pytest.approx(0.0, abs=1e-9)
 
 
@@ -86,22 +86,22 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
     random = np.random.default_rng(seed)
     pegs = [peg for peg in make_stage().pegs if random.uniform() < 0.6]
     nodes, touches, slope = touching(float(random.uniform(0.0, 2.0)), pegs)
-    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
-    assert (push.lambdas >= 0.0).all()
-    assert np.isfinite(push.torques_nm).all()
+    push = solve_push(nodes, touches, slope, contact_gap_scale_m=0.005)
+    assert (push.contact_forces >= 0.0).all()
+    assert np.isfinite(push.joint_torques_nm).all()
     if len(touches) < 3:
-        assert not push.balanced
+        assert not push.is_balanced
 
 
 @pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
 def test_margin_joints_do_not_work_against_each_other(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
     thrifty, smallest = (
-        push_forward(nodes, touches, one, contact_gap_scale_m=0.005) for one in (slope, np.zeros_like(slope))
+        solve_push(nodes, touches, one, contact_gap_scale_m=0.005) for one in (slope, np.zeros_like(slope))
     )
-    assert thrifty.balanced
-    assert smallest.balanced
-    done, circled = (np.abs(one.torques_nm * slope).sum() for one in (thrifty, smallest))
+    assert thrifty.is_balanced
+    assert smallest.is_balanced
+    done, circled = (np.abs(one.joint_torques_nm * slope).sum() for one in (thrifty, smallest))
     assert done < 0.9 * circled
     assert done < 1.5  # J per metre and newton; by virtual work 1 is the least
 
@@ -112,8 +112,10 @@ def test_margin_contacts_with_extra_cost_leave_push_to_others(tail_s_m: float) -
     three = np.argsort(touches.body_s_m)[:3]
     dearer = np.full(len(touches), 1000.0)
     dearer[three] = 0.0
-    push = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005, extra_cost=dearer)
-    usual = push_forward(nodes, touches, slope, contact_gap_scale_m=0.005)
-    assert push.residual < 0.1
-    assert np.delete(push.lambdas, three).sum() < 0.2 * push.lambdas.sum()
-    assert len(touches) == 3 or np.delete(usual.lambdas, three).sum() > np.delete(push.lambdas, three).sum()
+    push = solve_push(nodes, touches, slope, contact_gap_scale_m=0.005, extra_cost=dearer)
+    usual = solve_push(nodes, touches, slope, contact_gap_scale_m=0.005)
+    assert push.balance_residual < 0.1
+    assert np.delete(push.contact_forces, three).sum() < 0.2 * push.contact_forces.sum()
+    assert (
+        len(touches) == 3 or np.delete(usual.contact_forces, three).sum() > np.delete(push.contact_forces, three).sum()
+    )

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from snakesim_gnc.geometry.planar import space_evenly
+from snakesim_gnc.geometry.planar import resample_evenly
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
-from snakesim_gnc.navigation.path_search.native_growth import NativeGrowth
-from snakesim_gnc.navigation.path_search.native_library import NativeGrowthError, is_native_available, load_library
+from snakesim_gnc.navigation.path_search.native_growth import NativeExpander
+from snakesim_gnc.navigation.path_search.native_library import PlannerLibraryError, is_native_available, load_library
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
 from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
-from snakesim_gnc.navigation.path_search.specified_growth import SpecifiedGrowth
+from snakesim_gnc.navigation.path_search.specified_growth import NumpyExpander
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_native import load
@@ -31,7 +31,7 @@ def make_body(random: np.random.Generator) -> Floats:
     """Return a curve (n, 2) that undulates along x, from tail to head, and ends at the origin."""
     x = np.linspace(-0.9, 0.0, 91)
     y = random.uniform(0.0, 0.08) * np.sin(2 * np.pi * x / 0.8 + random.uniform(0.0, 6.0))
-    return space_evenly(np.column_stack([x, y - y[-1]]))
+    return resample_evenly(np.column_stack([x, y - y[-1]]))
 
 
 def make_obstacles(random: np.random.Generator, body_w: Floats) -> list[Obstacle]:
@@ -97,7 +97,7 @@ def test_paths_equal_those_of_the_specification_to_the_last_bit(kind: str, seed:
     goal_rad = float(random.uniform(-1.2, 1.2))
     failed_w = np.concatenate([body_w[::3] + random.normal(0.0, 0.02, 2) for _ in range(3)])
     found: list[tuple[list[int], SearchedPath | None]] = []
-    for growth in (SpecifiedGrowth, NativeGrowth):
+    for growth in (NumpyExpander, NativeExpander):
         beam = BeamSearch(ObstacleGrid(obstacles), parameters, growth)
         if kind == "ahead":
             search = beam.search_ahead(body_w, goal_rad, 30)
@@ -117,7 +117,7 @@ def test_of_paths_that_cost_the_same_both_keep_the_same(kept_nodes: int) -> None
     parameters = replace(SEARCH, kept_nodes=kept_nodes, progress_reward=0.0, curvature_change_cost_m=0.0)
     found = [
         finish(BeamSearch(ObstacleGrid([]), parameters, growth).search_ahead(body_w, 0.3, 10))
-        for growth in (SpecifiedGrowth, NativeGrowth)
+        for growth in (NumpyExpander, NativeExpander)
     ]
     assert_equal_bits(found[0], found[1])
 
@@ -152,19 +152,19 @@ def start_layer() -> NodeLayer:
 def test_an_array_of_a_wrong_size_is_named() -> None:
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS - 1, 3)))
     message = r"the drag of the lying body has the shape \(19, 3\), the C library of the planner expects \(20, 3\)"
-    with pytest.raises(NativeGrowthError, match=message):
-        NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=5)
+    with pytest.raises(PlannerLibraryError, match=message):
+        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), steps=5)
 
 
 @needs_library
 def test_no_more_layers_than_there_is_room_for() -> None:
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
-    paths = NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)
+    paths = NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)
     assert paths.trace_cheapest() is None
-    assert paths.grow()
-    assert paths.grow()
-    with pytest.raises(NativeGrowthError, match="have 2 arcs already"):
-        paths.grow()
+    assert paths.expand_layer()
+    assert paths.expand_layer()
+    with pytest.raises(PlannerLibraryError, match="have 2 arcs already"):
+        paths.expand_layer()
     path = paths.trace_cheapest()
     assert path is not None
     assert len(path.points_w) == 3
@@ -173,7 +173,7 @@ def test_no_more_layers_than_there_is_room_for() -> None:
 @pytest.fixture
 def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Switch the C libraries off."""
-    monkeypatch.setenv(load.SWITCH, load.OFF)
+    monkeypatch.setenv(load.SWITCH_VARIABLE, load.SWITCH_OFF)
     load_library.cache_clear()
     yield
     load_library.cache_clear()
@@ -199,5 +199,5 @@ def test_without_the_library_the_specification_plans() -> None:
     assert nodes[0] == 1
     assert path is not None
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
-    with pytest.raises(NativeGrowthError, match="SNAKESIM_NATIVE"):
-        NativeGrowth(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)
+    with pytest.raises(PlannerLibraryError, match="SNAKESIM_NATIVE"):
+        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), steps=2)

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_gnc.navigation.intents import LONGEST_NS, DesiredMotion, Intents
+from snakesim_gnc.navigation.intents import MAX_VALIDITY_NS, DesiredMotion, Intents
 from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Intent, Obstacle, World
@@ -26,7 +26,7 @@ def world(tail_x_m: float, timestamp_ns: int = 0) -> World:
 
 
 def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:
-    found = intents.desired(newest, round(at_s * SECOND))
+    found = intents.choose_motion(newest, round(at_s * SECOND))
     return found.speed_m_s, found.reason
 
 
@@ -73,8 +73,8 @@ def test_intent_validity_is_shortened_but_never_extended_beyond_maximum() -> Non
     assert desired(intents, brief, 0.5)[0] == 0.1
     assert desired(intents, brief, 0.6)[0] == 0.0
     intents, endless = Intents(MISSION_M_S), intent(0.0, valid_for_ns=2**62)
-    assert desired(intents, endless, LONGEST_NS / SECOND)[0] == 0.1
-    speed, why = desired(intents, endless, LONGEST_NS / SECOND + 0.1)
+    assert desired(intents, endless, MAX_VALIDITY_NS / SECOND)[0] == 0.1
+    speed, why = desired(intents, endless, MAX_VALIDITY_NS / SECOND + 0.1)
     assert speed == 0.0
     assert "valid for 5 s" in why
 
@@ -106,24 +106,24 @@ def test_navigation_intent_speed_is_limited_by_mission(speed_m_s: float) -> None
 
 def test_intent_direction_holds_while_standing_until_mission_resumes() -> None:
     intents = Intents(MISSION_M_S)
-    assert intents.desired(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
-    expired = intents.desired(None, 2 * SECOND)
+    assert intents.choose_motion(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
+    expired = intents.choose_motion(None, 2 * SECOND)
     assert expired.speed_m_s == 0.0
     assert expired.heading_w_rad == 1.5  # it stops on the path that it is on
-    assert intents.desired(intent(2.1, go=False), 2_100_000_000).heading_w_rad == 1.5
-    assert intents.desired(intent(2.2), 2_200_000_000).heading_w_rad is None
+    assert intents.choose_motion(intent(2.1, go=False), 2_100_000_000).heading_w_rad == 1.5
+    assert intents.choose_motion(intent(2.2), 2_200_000_000).heading_w_rad is None
 
 
 def test_intent_before_a_robot_restart_is_ignored_afterwards() -> None:
     intents, asked = Intents(MISSION_M_S), intent(50.0)
     assert desired(intents, asked, 50.1)[0] == 0.1
-    intents.start_over()
+    intents.reset()
     speed, why = desired(intents, None, 0.0)
     assert speed == 0.0
     assert "the intent of ann was for another start of the robot" in why
     assert desired(intents, None, 50.1)[0] == 0.0
     fresh = Intents(MISSION_M_S)
-    fresh.start_over()
+    fresh.reset()
     assert desired(fresh, None, 0.0) == (MISSION_M_S, "")
 
 
@@ -137,5 +137,5 @@ def test_intent_sent_before_a_stop_does_not_move_robot() -> None:
         "others have clocks of their own"
     )
     assert desired(intents, intent(1.9, go=False), 2.4)[0] == 0.0, "a stop counts in any order"
-    intents.start_over()
+    intents.reset()
     assert desired(intents, intent(0.1), 0.2)[0] == 0.1

@@ -14,12 +14,12 @@ HELD_NM = 0.6  # that every joint is measured with
 def test_obstacle_aided_leaving_torque_mode_holds_with_present_torque(lost: str):
     stage = make_stage()
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
-    observations = [stage.observe(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
+    observations = [stage.make_observation(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
     pushing = [controller.update(observation) for observation in observations][-1].setpoints
     assert set(pushing.mode) == {Mode.TORQUE}
     assert np.abs(pushing.target).max() > 0.1
 
-    holding = controller.update(stage.observe(40, 1.0, torque_nm=HELD_NM, without=lost)).setpoints
+    holding = controller.update(stage.make_observation(40, 1.0, torque_nm=HELD_NM, without=lost)).setpoints
     assert set(holding.mode) == {Mode.POSITION}
     stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
     by_spring_nm = (np.array(holding.target) - observations[-1].joints.angle_rad) * stiffness
@@ -30,5 +30,5 @@ def test_obstacle_aided_body_without_push_holds_in_position_mode():
     stage = make_stage()
     stage.pegs = []
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
-    commands = [controller.update(stage.observe(tick, 1.0)) for tick in range(40)]
+    commands = [controller.update(stage.make_observation(tick, 1.0)) for tick in range(40)]
     assert set(commands[-1].setpoints.mode) == {Mode.POSITION}

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, TripletParameters
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.gnc.stage import PERIOD_S, known, make_contact, make_stage
+from snakesim_testing.gnc.stage import PERIOD_S, make_contact, make_stage, require_value
 
 TAIL_S_M = 0.3
 
@@ -20,7 +20,7 @@ def torque_joints(command) -> list[int]:
 
 def stay(controller, stage, ticks, **more):
     """The last of many updates of a body that does not move."""
-    return [controller.update(stage.observe(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
+    return [controller.update(stage.make_observation(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
 
 
 STEADY_TICKS = 100  # until the controller of a body that does not move has settled
@@ -49,7 +49,7 @@ def test_triplet_report_has_place_and_propulsion_on_path():
     assert report.propulsion_n == pytest.approx(35.0, rel=0.01)
     assert report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
     assert len(report.bending_torque_nm) == len(report.reference_rad) == 13
-    assert 1 < known(report.condition) < 20
+    assert 1 < require_value(report.condition) < 20
 
 
 def test_triplet_push_point_forces_add_up_to_propulsion_along_tail():
@@ -69,7 +69,7 @@ def test_triplet_push_points_are_listed_from_tail_to_head():
 
 def test_triplet_propulsion_torque_is_bending_torque_of_its_joint():
     report = make_settled_command().telemetry
-    torque_nm = report.bending_torque_nm[known(report.propulsion_joint)]
+    torque_nm = report.bending_torque_nm[require_value(report.propulsion_joint)]
     assert report.propulsion_torque_nm == pytest.approx(torque_nm, rel=1e-6)
     rated_nm = 7.0
     assert report.torque_headroom_nm == pytest.approx(rated_nm - abs(torque_nm), abs=0.05)
@@ -85,7 +85,7 @@ def test_triplet_servo_targets_lead_by_load_when_requested():
     load = np.array(command.telemetry.bending_torque_nm) / stiffness
     assert lead[others] == pytest.approx(load[others], abs=2e-3)
     assert np.abs(load[others]).max() > 0.03
-    blind = controller.update(stage.observe(99, TAIL_S_M, without="world"))
+    blind = controller.update(stage.make_observation(99, TAIL_S_M, without="world"))
     targets = np.array(blind.setpoints.target)
     assert targets[others] == pytest.approx(np.array(command.setpoints.target)[others], abs=5e-3)  # and fades
 
@@ -93,7 +93,9 @@ def test_triplet_servo_targets_lead_by_load_when_requested():
 def test_the_faster_it_moves_the_less_it_pushes():
     stage = make_stage()
     controller = make_controller(stage)
-    forces = [controller.update(stage.observe(t, 0.1 + 0.1 * t * PERIOD_S)).telemetry.propulsion_n for t in range(60)]
+    forces = [
+        controller.update(stage.make_observation(t, 0.1 + 0.1 * t * PERIOD_S)).telemetry.propulsion_n for t in range(60)
+    ]
     assert forces[-1] == pytest.approx(35.0 * 0.5, rel=0.1)
 
 
@@ -101,10 +103,10 @@ def test_a_joint_that_has_swung_out_pushes_less():
     stage = make_stage()
     controller = make_controller(stage)
     settled = stay(controller, stage, 50).telemetry
-    joint, way = known(settled.propulsion_joint), np.sign(known(settled.propulsion_torque_nm))
+    joint, way = require_value(settled.propulsion_joint), np.sign(require_value(settled.propulsion_torque_nm))
     for first, turned_rad, share in ((50, 0.3 * way, 0.5), (60, -0.3 * way, 1.0)):
         observations = [
-            stage.observe(tick, TAIL_S_M, world_age_ticks=tick - 49, turned={joint: turned_rad})
+            stage.make_observation(tick, TAIL_S_M, world_age_ticks=tick - 49, turned={joint: turned_rad})
             for tick in range(first, first + 10)
         ]
         pushed = [controller.update(observation).telemetry.propulsion_n for observation in observations]
@@ -115,13 +117,15 @@ def test_triplet_joint_off_its_reference_returns_to_position_mode():
     stage = make_stage()
     stage.pegs = stage.pegs[1:4]
     controller = make_controller(stage, guard_s=0.5)
-    joint = known(stay(controller, stage, 10).telemetry.propulsion_joint)
-    command = controller.update(stage.observe(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9}))
+    joint = require_value(stay(controller, stage, 10).telemetry.propulsion_joint)
+    command = controller.update(stage.make_observation(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9}))
     assert torque_joints(command) == []
     assert f"joint_{joint + 1} left its reference" in command.telemetry.reason
-    turns = [controller.update(stage.observe(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(11, 40)]
+    turns = [controller.update(stage.make_observation(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(11, 40)]
     assert joint not in turns
-    assert joint in [controller.update(stage.observe(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(60, 80)]
+    assert joint in [
+        controller.update(stage.make_observation(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(60, 80)
+    ]
 
 
 def test_triplet_saturated_joint_is_reported_with_reduced_force():
@@ -129,10 +133,10 @@ def test_triplet_saturated_joint_is_reported_with_reduced_force():
     command = stay(make_controller(stage), stage, 100)
     report = command.telemetry
     assert report.saturated
-    assert known(report.torque_headroom_nm) < 0
-    assert known(report.propulsion_n) < 35.0
-    assert abs(command.setpoints.target[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
-    assert abs(report.bending_torque_nm[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
+    assert require_value(report.torque_headroom_nm) < 0
+    assert require_value(report.propulsion_n) < 35.0
+    assert abs(command.setpoints.target[require_value(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
+    assert abs(report.bending_torque_nm[require_value(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
 
 
 def test_triplet_hand_over_to_same_joint_keeps_torque_continuous():
@@ -143,15 +147,15 @@ def test_triplet_hand_over_to_same_joint_keeps_torque_continuous():
     for tick in range(200):
         if tick == 100:
             stage.pegs = [peg for peg in stage.pegs if peg.name != "peg_2"]
-        reports.append(controller.update(stage.observe(tick, tail_s_m, torque_nm=torque_nm)).telemetry)
-        torque_nm = known(reports[-1].propulsion_torque_nm)
+        reports.append(controller.update(stage.make_observation(tick, tail_s_m, torque_nm=torque_nm)).telemetry)
+        torque_nm = require_value(reports[-1].propulsion_torque_nm)
     before, after = reports[99], reports[199]
     assert [[p.obstacle for p in report.push_points] for report in (before, after)] == [
         ["peg_0", "peg_1", "peg_2"],
         ["peg_0", "peg_1", "peg_4"],
     ]
     assert before.propulsion_joint == after.propulsion_joint
-    torques = np.array([known(report.propulsion_torque_nm) for report in reports[99:]])
+    torques = np.array([require_value(report.propulsion_torque_nm) for report in reports[99:]])
     assert abs(torques[-1] - torques[0]) > 1.0
     assert np.abs(np.diff(torques)).max() < 0.1 * abs(torques[-1] - torques[0])
 
@@ -161,7 +165,7 @@ def test_triplet_without_requested_speed_does_not_push():
     controller = make_controller(stage)
     assert torque_joints(stay(controller, stage, 10))
     stage.speed_m_s = 0.0
-    command = controller.update(stage.observe(11, TAIL_S_M, world_age_ticks=1))
+    command = controller.update(stage.make_observation(11, TAIL_S_M, world_age_ticks=1))
     assert torque_joints(command) == []
     assert command.telemetry.reason == ""
     assert command.telemetry.usable_push_points == 4
@@ -183,7 +187,7 @@ def test_triplet_standing_still_is_reported_and_jam_released():
     contacts = [make_contact("peg_1", (400.0, 0.0, 0.0)), make_contact("peg_2", (-390.0, 0.0, 0.0))]
     pushed, released, jams = 0, 0, []
     for tick in range(200):
-        report = controller.update(stage.observe(tick, TAIL_S_M, contacts=contacts)).telemetry
+        report = controller.update(stage.make_observation(tick, TAIL_S_M, contacts=contacts)).telemetry
         if report.jammed:
             jams.append(report.reason)
             pushed += report.propulsion_joint is not None
@@ -194,7 +198,7 @@ def test_triplet_standing_still_is_reported_and_jam_released():
     assert released
     moved = stay(controller, stage, 3)
     assert moved.telemetry.jammed
-    report = [controller.update(stage.observe(200 + t, TAIL_S_M + 0.002 * t)).telemetry for t in range(40)][-1]
+    report = [controller.update(stage.make_observation(200 + t, TAIL_S_M + 0.002 * t)).telemetry for t in range(40)][-1]
     assert not report.jammed
     assert report.reason == ""
 
@@ -202,7 +206,7 @@ def test_triplet_standing_still_is_reported_and_jam_released():
 def test_pitch_joints_stay_straight():
     stage = make_stage(26, ("yaw", "pitch"))
     command = stay(make_controller(stage), stage, 100)
-    assert known(command.telemetry.propulsion_joint) % 2 == 0
+    assert require_value(command.telemetry.propulsion_joint) % 2 == 0
     assert command.telemetry.reason == ""
     pitch = np.array(command.setpoints.target)[1::2]
     assert np.abs(pitch).max() < 1e-6
@@ -214,7 +218,7 @@ def test_a_new_path_moves_no_target_at_once():
     controller = make_controller(stage)
     before = stay(controller, stage, 50).setpoints
     stage.path_id = 1
-    after = controller.update(stage.observe(50, TAIL_S_M + 0.05)).setpoints
+    after = controller.update(stage.make_observation(50, TAIL_S_M + 0.05)).setpoints
     steady = [i for i in range(13) if before.mode[i] == after.mode[i] == Mode.POSITION]
     assert len(steady) >= 11
     for i in steady:

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.contact_forces import NetContactForce
-from snakesim_gnc.control.push import find_touches, push_forward
-from snakesim_gnc.control.push_report import explain_push_standstill, push_points
+from snakesim_gnc.control.push import find_body_contacts, solve_push
+from snakesim_gnc.control.push_report import explain_push_standstill, make_push_point_messages
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_testing.gnc.stage import make_robot, make_world
 
 BODY = PlanarBody(make_robot())
-NODES = np.vstack([np.array(BODY.node_s_m), 0.06 * np.sin(2 * np.pi * np.array(BODY.node_s_m) / 0.6)])
+NODES = np.vstack([np.array(BODY.body_points_s_m), 0.06 * np.sin(2 * np.pi * np.array(BODY.body_points_s_m) / 0.6)])
 
 
 def peg(name: str, x: float, side: int) -> Obstacle:
@@ -26,17 +26,17 @@ def peg(name: str, x: float, side: int) -> Obstacle:
 
 
 def pushing(pegs: Sequence[Obstacle]):
-    touches = find_touches(NODES, 0.04, Outlines.from_obstacles(pegs), reach_m=0.03, friction=0.0)
-    return touches, push_forward(NODES, touches, np.zeros(len(NODES[0]) - 2), contact_gap_scale_m=0.005)
+    touches = find_body_contacts(NODES, 0.04, Outlines.from_obstacles(pegs), max_gap_m=0.03, friction=0.0)
+    return touches, solve_push(NODES, touches, np.zeros(len(NODES[0]) - 2), contact_gap_scale_m=0.005)
 
 
 def test_push_report_forces_sum_to_requested_push() -> None:
     world = make_world(obstacles=[peg("c", 0.9, -1), peg("a", 0.3, -1), peg("b", 0.6, 1)])
     touches, push = pushing(world.obstacles)
-    reported = push_points(BODY, world, touches, push, 10.0)
+    reported = make_push_point_messages(BODY, world, touches, push, 10.0)
     assert [contact.obstacle for contact in reported] == ["a", "b", "c"]  # tail to head
     total = np.sum([contact.force_w for contact in reported], axis=0)
-    assert push.balanced
+    assert push.is_balanced
     assert total[0] == pytest.approx(10.0, rel=0.15)
     assert abs(total[1]) < 1.0
     assert all(contact.tangent_w[0] > 0.0 for contact in reported)  # towards the head
@@ -52,7 +52,9 @@ def test_push_report_forces_sum_to_requested_push() -> None:
     ],
 )
 def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
-    nothing = NetContactForce(strongest_n=0.0, ahead_n=0.0, back_n=0.0, blocking_obstacle="", touched=frozenset())
+    nothing = NetContactForce(
+        max_contact_n=0.0, forward_n=0.0, backward_n=0.0, blocking_obstacle="", touched_obstacles=frozenset()
+    )
     jammed, why = explain_push_standstill(*pushing(pegs), force_n, max_force_n, nothing, ["a", "b", "c"])
     assert not jammed
     assert words in why

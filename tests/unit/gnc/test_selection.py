@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.obstacle_triplet.contacts import PushPoint, find_push_points, plan_contact
 from snakesim_gnc.control.obstacle_triplet.selection import (
-    Choice,
-    Triplets,
+    TripletChoice,
+    TripletFinder,
     choose_triplet,
     find_alternating_triples,
     find_propulsion_joint,
@@ -20,7 +20,14 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_testing.gnc.stage import BODY_RADIUS_M, CLEARANCE_M, make_pegs, make_route, make_stage, nodes_of
+from snakesim_testing.gnc.stage import (
+    BODY_RADIUS_M,
+    CLEARANCE_M,
+    compute_body_points,
+    make_pegs,
+    make_route,
+    make_stage,
+)
 
 SEGMENTS = [0.055, *[0.11] * 12, 0.055]
 NODE_S = [0.0, *np.cumsum(SEGMENTS).tolist()]
@@ -36,14 +43,14 @@ def planned_row():
 
 def points_at(tail_s_m, *, kept=(), off_w=(0.0, 0.0)):
     stage = make_stage()
-    lie = BodyOnPath(stage.route, SEGMENTS).pose_at(tail_s_m)
-    measured = nodes_of(stage, tail_s_m) + np.array(off_w)[:, None]
+    lie = BodyOnPath(stage.route, SEGMENTS).compute_pose_at(tail_s_m)
+    measured = compute_body_points(stage, tail_s_m) + np.array(off_w)[:, None]
     return find_push_points(planned_row(), kept, lie, measured, NODE_S, **LIMITS), lie
 
 
 def test_a_peg_is_met_at_its_inflection():
     route = make_route()
-    for contact, s in zip(planned_row(), route.inflections_s_m(), strict=False):
+    for contact, s in zip(planned_row(), route.find_inflections_s_m(), strict=False):
         assert contact.path_s_m == pytest.approx(s, abs=1e-3)
         assert contact.clearance_m == pytest.approx(CLEARANCE_M, abs=1e-5)
         assert contact.normal_w[0] > 0  # it pushes forward
@@ -79,7 +86,7 @@ def test_push_points_are_those_that_the_body_covers():
     points, lie = points_at(0.2)
     assert [p.contact.obstacle for p in points] == ["peg_0", "peg_1", "peg_2", "peg_3", "peg_4"]
     for point in points:
-        on_body = [np.interp(point.contact.path_s_m, lie.node_s_m, NODE_S)]
+        on_body = [np.interp(point.contact.path_s_m, lie.body_points_s_m, NODE_S)]
         assert [point.body_s_m] == pytest.approx(on_body)
         assert point.gap_m == pytest.approx(CLEARANCE_M, abs=2e-3)
 
@@ -99,7 +106,7 @@ def test_what_is_being_pushed_may_get_further_away():
 
 
 def test_contacts_at_the_tips_do_not_count():
-    s = make_route().inflections_s_m()[0]
+    s = make_route().find_inflections_s_m()[0]
     assert "peg_0" in [p.contact.obstacle for p in points_at(s - 0.04)[0]]
     assert "peg_0" not in [p.contact.obstacle for p in points_at(s - 0.02)[0]]
 
@@ -133,7 +140,7 @@ def test_noise_does_not_pass_the_turn_to_and_fro():
 def choices_in_row(count=7):
     row = planned_row()
     triplets = solve_triplets([(row[i], row[i + 1], row[i + 2]) for i in range(count)], condition_max=100.0)
-    return [Choice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
+    return [TripletChoice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
 
 
 def test_selection_keeps_triplet_and_successor_shares_most_push_points():
@@ -146,14 +153,14 @@ def test_selection_keeps_triplet_and_successor_shares_most_push_points():
 def test_of_equals_the_one_nearest_to_the_tail_is_chosen():
     row = choices_in_row()
     assert choose_triplet(row, None, switch_fraction=0.5) is row[0]
-    assert choose_triplet(row, None, switch_fraction=0.5, banned=[row[0].triplet.names]) is row[1]
-    assert choose_triplet(row, None, switch_fraction=0.5, banned=[c.triplet.names for c in row]) is None
+    assert choose_triplet(row, None, switch_fraction=0.5, banned_triplets=[row[0].triplet.names]) is row[1]
+    assert choose_triplet(row, None, switch_fraction=0.5, banned_triplets=[c.triplet.names for c in row]) is None
 
 
 def test_points_become_choices_with_a_joint_each():
     points, lie = points_at(0.2)
-    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.find_choices(points, lie.nodes_w, NODE_S, None, None)
+    triplets = TripletFinder(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
+    found, refused = triplets.find_choices(points, lie.body_points_w, NODE_S, None, None)
     threes = [[int(name[-1]) for name in c.triplet.names] for c in found]
     assert threes == [[0, 1, 2], [0, 1, 4], [1, 2, 3], [2, 3, 4]]
     assert len(refused) == 1
@@ -161,7 +168,7 @@ def test_points_become_choices_with_a_joint_each():
     for choice in found:
         assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
-    barred, why = triplets.find_choices(points, lie.nodes_w, NODE_S, None, found[0].joint)
+    barred, why = triplets.find_choices(points, lie.body_points_w, NODE_S, None, found[0].joint)
     assert [c.joint for c in barred] == [c.joint for c in found if c.joint != found[0].joint]
     assert len(barred) + len(why) == len(found) + len(refused)
 
@@ -174,7 +181,9 @@ def test_the_steepest_wave_depends_on_the_spacing(slope_deg: float, pushes: list
     route = make_route(math.tan(math.radians(slope_deg)) * 0.6 / math.tau)
     planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:5]]
     points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
-    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.find_choices(points, BodyOnPath(route, SEGMENTS).pose_at(0.2).nodes_w, NODE_S, None, None)
+    triplets = TripletFinder(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
+    found, refused = triplets.find_choices(
+        points, BodyOnPath(route, SEGMENTS).compute_pose_at(0.2).body_points_w, NODE_S, None, None
+    )
     assert ["".join(name[-1] for name in c.triplet.names) for c in found] == pushes
     assert all("lambda_1" in why for why in refused)

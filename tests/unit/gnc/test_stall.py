@@ -4,13 +4,13 @@ import msgspec
 import pytest
 
 from snakesim_gnc.control.contact_forces import MeasuredContacts, NetContactForce
-from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
+from snakesim_gnc.control.obstacle_triplet.stall import StallDetector, explain_stall
 from snakesim_hal.wire.messages import World
-from snakesim_testing.gnc.stage import known, make_contact, make_world
+from snakesim_testing.gnc.stage import make_contact, make_world, require_value
 
 
-def watch() -> StallWatch:
-    return StallWatch(stall_m=0.005, stall_s=1.0, propulsion_n=35.0)
+def watch() -> StallDetector:
+    return StallDetector(stall_m=0.005, stall_s=1.0, propulsion_n=35.0)
 
 
 def stalled_after(stall_watch, seconds, *, speed_m_s=0.0, force_n=35.0) -> float | None:
@@ -46,7 +46,7 @@ def along(*forces: tuple[str, float, float]) -> NetContactForce:
     """What contacts with these forces along and across the direction do."""
     felt = MeasuredContacts()
     felt.add_world(world_with(*forces))
-    return known(felt.resolve_along((2.0, 0.0)))
+    return require_value(felt.resolve_along((2.0, 0.0)))
 
 
 PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  # as a triplet of 30 N is
@@ -54,23 +54,23 @@ PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  #
 
 def cause(**more):
     given = {
-        "desired_n": 35.0,
+        "desired_force_n": 35.0,
         "force_n": 30.0,
         "net_force": along(*PUSHED),
         "push_points": ("peg_0", "peg_1", "peg_2"),
         "weight_n": 400.0,
-        "saturated": None,
-        "swung": None,
+        "saturated_joint": None,
+        "swung_out_joint": None,
         "jam_force_n": 60.0,
         "drag_ratio": 0.5,
     }
-    return explain(**{**given, **more})
+    return explain_stall(**{**given, **more})
 
 
 def test_stall_contacts_that_carry_load_are_no_jam():
     stall = cause()
-    assert not stall.jammed
-    assert not stall.release_triplet
+    assert not stall.is_jammed
+    assert not stall.should_release_triplet
     assert stall.reason == (
         "standing still with 30.0 N of propulsion; contacts push it on with 29.5 N, too little against the friction of "
         "the ground; raise propulsion_n"
@@ -79,29 +79,29 @@ def test_stall_contacts_that_carry_load_are_no_jam():
 
 def test_a_push_point_that_is_not_felt_is_named():
     stall = cause(net_force=along(PUSHED[0], ("peg_1", 3.2, -4.0)))
-    assert not stall.jammed
+    assert not stall.is_jammed
     assert "contacts push it on with 3.2 N (no contact at peg_2), too little" in stall.reason
 
 
-@pytest.mark.parametrize("saturated", [None, "joint_7"])
-@pytest.mark.parametrize("desired_n", [8.0, 35.0, 300.0])
-def test_a_body_that_touches_nothing_is_not_jammed(desired_n, saturated):
-    stall = cause(desired_n=desired_n, net_force=along(), weight_n=40.0, saturated=saturated)
-    assert not stall.jammed
-    assert not stall.release_triplet
+@pytest.mark.parametrize("saturated_joint", [None, "joint_7"])
+@pytest.mark.parametrize("desired_force_n", [8.0, 35.0, 300.0])
+def test_a_body_that_touches_nothing_is_not_jammed(desired_force_n, saturated_joint):
+    stall = cause(desired_force_n=desired_force_n, net_force=along(), weight_n=40.0, saturated_joint=saturated_joint)
+    assert not stall.is_jammed
+    assert not stall.should_release_triplet
     assert "no obstacle touches the body" in stall.reason
 
 
 def test_without_a_sensor_of_contacts_the_cause_is_unknown():
     stall = cause(net_force=None, weight_n=40.0)
-    assert not stall.jammed
-    assert stall.release_triplet
+    assert not stall.is_jammed
+    assert stall.should_release_triplet
     assert stall.reason.endswith("what holds it is unknown without a sensor of contacts")
 
 
 def test_a_jam_is_what_obstacles_hold_back():
     stall = cause(net_force=along(*PUSHED, ("post", -28.0, 60.0)))
-    assert stall.jammed
+    assert stall.is_jammed
     assert stall.reason == (
         "jammed: standing still with 30.0 N of propulsion; obstacles push it on with 30 N and hold it back with 28 N, "
         "post most"
@@ -113,18 +113,18 @@ def test_a_jam_is_what_obstacles_hold_back():
     [
         ({"net_force": along(*PUSHED, ("post", 0.0, 300.0))}, ""),
         (
-            {"saturated": "joint_7"},
+            {"saturated_joint": "joint_7"},
             "contacts push it on with 29.5 N, too little against the friction of the ground; "
             "joint_7 at its limit of torque gives no more of the 35.0 N desired",
         ),
         ({"weight_n": 40.0}, ""),
-        ({"swung": "joint_5"}, "joint_5 has swung out and leaves no more of the 35.0 N desired"),
+        ({"swung_out_joint": "joint_5"}, "joint_5 has swung out and leaves no more of the 35.0 N desired"),
     ],
 )
 def test_stall_straining_body_that_stands_is_released_without_jam(given, words):
     stall = cause(**given)
-    assert stall.release_triplet
-    assert not stall.jammed
+    assert stall.should_release_triplet
+    assert not stall.is_jammed
     assert words in stall.reason
     assert not stall.reason.startswith("jam")
 
@@ -133,9 +133,9 @@ def test_forces_are_judged_as_means_over_50_ms():
     felt = MeasuredContacts()
     for turn in range(9):
         felt.add_world(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
-    net_force = known(felt.resolve_along((1.0, 0.0)))
-    assert net_force.strongest_n == pytest.approx(10.0)
-    assert net_force.ahead_n == pytest.approx(10.0)
+    net_force = require_value(felt.resolve_along((1.0, 0.0)))
+    assert net_force.max_contact_n == pytest.approx(10.0)
+    assert net_force.forward_n == pytest.approx(10.0)
 
 
 def test_estimated_contacts_are_no_measured_forces():
@@ -143,4 +143,4 @@ def test_estimated_contacts_are_no_measured_forces():
     felt.add_world(world)
     felt.add_world(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
     assert felt.resolve_along((1.0, 0.0)) is None
-    assert felt.mean_sizes_n(["peg_1"]) == []
+    assert felt.compute_mean_magnitudes_n(["peg_1"]) == []

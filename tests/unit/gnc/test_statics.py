@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from snakesim_gnc.control.obstacle_triplet import compute_bending_torque_nm, solve_triplet
-from snakesim_gnc.control.obstacle_triplet.statics import add_tether
+from snakesim_gnc.control.obstacle_triplet.statics import add_tether_force
 from snakesim_testing.messages import raises_error
 
 PROPULSION_N = 35.0
@@ -66,7 +66,7 @@ def test_contacts_at_inflections_have_a_closed_form(slope_deg):
 @pytest.mark.parametrize(("slope_deg", "feasible"), [(29.9, True), (30.1, False), (40.0, False), (1.0, True)])
 def test_beyond_30_degrees_the_tail_contact_would_have_to_pull(slope_deg, feasible):
     solved = at_inflections(np.radians(slope_deg)).solve()
-    assert solved.feasible is feasible
+    assert solved.is_feasible is feasible
     assert ("lambda_1" in solved.reason) is not feasible
     assert bool(solved.reason) is not feasible
 
@@ -74,7 +74,7 @@ def test_beyond_30_degrees_the_tail_contact_would_have_to_pull(slope_deg, feasib
 @given(cases())
 def test_forces_and_moments_balance(case):
     forces = case.solve().forces_n
-    pushed = add_tether(forces, case.normals, -PROPULSION_N * case.tangent)
+    pushed = add_tether_force(forces, case.normals, -PROPULSION_N * case.tangent)
     size = np.abs(forces).max() + PROPULSION_N
     assert np.abs(pushed.sum(axis=0)).max() < 1e-9 * size
     assert abs(cross(case.points, pushed).sum()) < 1e-9 * size
@@ -148,7 +148,7 @@ def test_statics_agrees_with_corrected_paper_equations(case):
 def test_statics_bending_torque_from_head_and_tail_agrees(case, joints):
     places = np.array([0.0, 0.3, 0.6])
     solved = case.solve()
-    pushed = add_tether(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
+    pushed = add_tether_force(solved.forces_n, case.normals, -PROPULSION_N * case.tangent)
     joints_w = np.array(joints)
     joints_s = joints_w[:, 0]
     ahead = compute_bending_torque_nm(joints_w, joints_s, case.points, places, pushed)
@@ -169,7 +169,7 @@ MEETING = replace(PARALLEL, normals=TO_A_POINT / np.linalg.norm(TO_A_POINT, axis
 @pytest.mark.parametrize("case", [PARALLEL, MEETING], ids=["parallel", "meeting in a point"])
 def test_normals_that_decide_nothing_are_refused_as_ill_conditioned(case):
     solved = case.solve()
-    assert not solved.feasible
+    assert not solved.is_feasible
     assert "ill-conditioned" in solved.reason
     assert solved.condition > 100
     assert np.isnan(solved.forces_n).all()
@@ -178,15 +178,15 @@ def test_normals_that_decide_nothing_are_refused_as_ill_conditioned(case):
 
 def test_statics_conditioning_limit_can_be_set():
     case = at_inflections(np.radians(1.0))
-    assert case.solve(condition_max=1e3).feasible
-    assert not case.solve(condition_max=10).feasible
+    assert case.solve(condition_max=1e3).is_feasible
+    assert not case.solve(condition_max=10).is_feasible
 
 
 @pytest.mark.parametrize("from_contact_m", [0.1, 0.0])
 def test_statics_joint_at_contact_or_third_normal_has_no_authority(from_contact_m):
     case = at_inflections(0.3)
     solved = replace(case, joint=case.points[2] - from_contact_m * case.normals[2]).solve()
-    assert not solved.feasible
+    assert not solved.is_feasible
     assert "no authority" in solved.reason
     assert np.isfinite(solved.forces_n).all()
 

@@ -24,7 +24,7 @@ BY_SHAPE = {"shape_nm_per_rad": 0.0}  # in position mode, whose targets show the
 
 
 def references(controller, stage, ticks: int, speed_m_s: float = 0.0) -> np.ndarray:
-    observations = [stage.observe(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(ticks)]
+    observations = [stage.make_observation(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(ticks)]
     return np.array([controller.update(observation).telemetry.reference_rad for observation in observations])
 
 
@@ -47,7 +47,7 @@ def test_undulation_head_steers_to_path_and_against_its_bend(lag_rad: float, ben
 def test_undulation_standing_body_is_pushed_harder_up_to_limit() -> None:
     stage = make_stage()
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters(max_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE))
-    first, *_, last = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(400)]
+    first, *_, last = [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in range(400)]
     pushed = np.abs(np.array(last.setpoints.target) - first.setpoints.target)
     assert 0.01 < pushed.max() < 2.0 / 60.0 + 0.25  # of the torque, and of the largest look-ahead
     assert last.telemetry.propulsion_n is not None
@@ -77,7 +77,9 @@ def test_undulation_push_uses_friction_of_the_planned_path() -> None:
         stage = make_stage()
         stage.assumed_obstacle_friction = friction
         controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
-        points = [controller.update(stage.observe(tick, TAIL_S_M)) for tick in range(50)][-1].telemetry.push_points
+        points = [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in range(50)][
+            -1
+        ].telemetry.push_points
         assert len(points) >= 3
         tilts.append(float(np.mean([point.normal_w[0] for point in points])))  # of the forces, along the way
     assert tilts[0] - tilts[1] == pytest.approx(0.2, abs=0.05)
@@ -95,8 +97,8 @@ def test_undulation_compliant_wave_shrinks_only_at_resistance() -> None:
     def largest(resistance: float) -> float:
         controller, swing = CompliantUndulation(stage.robot, parameters), 0.0
         for tick in range(400):
-            observation = stage.observe(tick, TAIL_S_M)
-            resisted = [resistance * angle for angle in controller.reference_rad(observation, 0.0)]
+            observation = stage.make_observation(tick, TAIL_S_M)
+            resisted = [resistance * angle for angle in controller.compute_reference_rad(observation, 0.0)]
             joints = msgspec.structs.replace(observation.joints, torque_nm=resisted)
             reference = controller.update(dataclasses.replace(observation, joints=joints)).telemetry.reference_rad
             swing = max(swing, float(np.abs(reference).max())) if tick > 200 else 0.0
@@ -109,7 +111,7 @@ def test_undulation_compliant_wave_shrinks_only_at_resistance() -> None:
 def test_without_a_path_a_compliant_wave_yields_to_nothing() -> None:
     stage = make_stage()
     controller = CompliantUndulation(stage.robot, CompliantUndulationParameters())
-    observations = [stage.observe(t, TAIL_S_M, without="trajectory", torque_nm=3.0) for t in range(50)]
+    observations = [stage.make_observation(t, TAIL_S_M, without="trajectory", torque_nm=3.0) for t in range(50)]
     held = [controller.update(observation).telemetry.reference_rad for observation in observations]
     assert all(one == held[0] for one in held)
 

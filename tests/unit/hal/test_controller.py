@@ -16,22 +16,22 @@ from snakesim_hal.controller import (
     Observation,
     decode_parameters,
     load_controller,
-    positions,
+    make_position_setpoints,
 )
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.plugins import CONTROLLERS, list_installed, require_base_class
-from snakesim_hal.model.scenario import load, parse_set
-from snakesim_hal.programs.preflight import check_plugins
-from snakesim_testing.hal.small_robots import description, state
+from snakesim_hal.model.plugins import CONTROLLERS, list_installed_plugins, require_base_class
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_hal.programs.preflight import validate_and_complete_config
+from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
-SHIPPED = list_installed(CONTROLLERS)
+SHIPPED = list_installed_plugins(CONTROLLERS)
 DECLARED = {name for name in vars(Controller) if not name.startswith("_")}
 DECLARATIONS = DECLARED - {"check", "update"}
 
 
 class Plain(Controller[NoParameters]):
     def update(self, observation: Observation) -> ControllerCommand:
-        return ControllerCommand(positions(self.robot, observation.joints.angle_rad))
+        return ControllerCommand(make_position_setpoints(self.robot, observation.joints.angle_rad))
 
 
 class GainParameters(FileStruct, frozen=True):
@@ -43,7 +43,7 @@ class Gained(Plain):
 
 
 def test_a_subclass_with_update_alone_has_all_defaults() -> None:
-    robot = description()
+    robot = make_description()
     plain = Plain(robot, NoParameters())
     assert plain.robot is robot
     assert plain.parameters == NoParameters()
@@ -52,8 +52,8 @@ def test_a_subclass_with_update_alone_has_all_defaults() -> None:
     assert plain.required_measurements == (())
     assert decode_parameters(Plain, {}, "a.toml", "controllers.plain") == Plain.Parameters()
     Plain.check(robot, NoParameters())
-    command = plain.update(Observation(0, 0.0, 0.01, state(robot), None, None))
-    assert command.setpoints.target == list(state(robot).angle_rad)
+    command = plain.update(Observation(0, 0.0, 0.01, make_joint_state(robot), None, None))
+    assert command.setpoints.target == list(make_joint_state(robot).angle_rad)
 
 
 def test_controller_parameters_are_checked_by_struct_naming_file_or_flag() -> None:
@@ -131,9 +131,9 @@ def test_controller_preflight_refuses_other_classes_with_instructions(wrong: str
     text, words = WRONG[wrong]
     file = tmp_path / "wave.py"
     file.write_text(text)
-    config = load("triplet", [parse_set(f"controller={file}:Wave")]).config
+    config = load_scenario("triplet", [parse_set_option(f"controller={file}:Wave")]).config
     with pytest.raises(ConfigError, match=re.escape(words.format(file=file))) as caught:
-        check_plugins(config)
+        validate_and_complete_config(config)
     assert str(caught.value).startswith("controller '")
     assert "snakesim_hal.controller" in str(caught.value)
 
@@ -147,9 +147,9 @@ def test_preflight_calls_the_check_of_a_controller(tmp_path: Path) -> None:
         "    def check(cls, robot, parameters):\n"
         "        raise ConfigError(f'{cls.__name__} does not move {robot.robot}')\n"
     )
-    config = load("triplet", [parse_set(f"controller={tmp_path}/picky.py:Picky")]).config
+    config = load_scenario("triplet", [parse_set_option(f"controller={tmp_path}/picky.py:Picky")]).config
     with pytest.raises(ConfigError, match=r"^Picky does not move planar13$"):
-        check_plugins(config)
+        validate_and_complete_config(config)
 
 
 def test_a_class_without_a_file_is_named_by_its_module() -> None:

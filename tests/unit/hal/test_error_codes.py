@@ -44,9 +44,9 @@ def find_codes(nodes: list[ast.AST]) -> Iterator[str]:
         match node:
             case ast.keyword(arg="code", value=value) | ast.Assign(targets=[ast.Name(id="code")], value=value):
                 yield from find_texts(value)
-            case ast.Assign(targets=[ast.Name(id="INCOMPLETE_CODE")], value=value):
+            case ast.Assign(targets=[ast.Name(id="INCOMPLETE_ERROR_CODE")], value=value):
                 yield from find_texts(value)
-            case ast.FunctionDef(name="_choose_code", body=[_, *body]):
+            case ast.FunctionDef(name="_choose_error_code", body=[_, *body]):
                 for statement in body:
                     yield from find_texts(statement)
 

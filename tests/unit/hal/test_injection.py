@@ -9,18 +9,23 @@ from hypothesis import strategies as st
 from docs.site.kinds_table import PAGE, with_table
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import (
-    KINDS,
+    FAULT_KINDS,
     Injection,
     InjectionPlan,
-    check_injection,
-    check_targets,
-    explain_kinds,
-    kinds_in_short,
+    describe_fault_kinds,
     parse_injection,
+    summarize_fault_kinds,
+    validate_and_complete_injection,
+    validate_injection_targets,
 )
-from snakesim_hal.model.fault_plan import check_backend_can, check_planned, check_without_run, parse_planned
+from snakesim_hal.model.fault_plan import (
+    parse_and_validate_planned_faults,
+    parse_planned_faults,
+    validate_faults_for_backend,
+    validate_faults_without_supervisor,
+)
 from snakesim_hal.wire import keys
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 TARGETS = {
@@ -36,12 +41,12 @@ seconds = st.floats(0.0, 1e4).map(lambda s: round(s, 2))
 
 @st.composite
 def injections(draw: st.DrawFn) -> Injection:
-    sort = draw(st.sampled_from(sorted(KINDS)))
-    name = draw(st.sampled_from(sorted(KINDS[sort])))
+    sort = draw(st.sampled_from(sorted(FAULT_KINDS)))
+    name = draw(st.sampled_from(sorted(FAULT_KINDS[sort])))
     start_s = draw(seconds)
     end_s = draw(st.one_of(st.just(inf), seconds.map(lambda s: round(start_s + s + 0.01, 2))))
-    amount = KINDS[sort][name].amount
-    drawn = None if amount is None else draw(st.sampled_from([amount.low, amount.default, amount.high]))
+    amount = FAULT_KINDS[sort][name].amount
+    drawn = None if amount is None else draw(st.sampled_from([amount.min_value, amount.default, amount.max_value]))
     return Injection(name, draw(st.sampled_from(TARGETS[sort])), start_s, end_s, drawn)
 
 
@@ -51,8 +56,8 @@ def test_texts_go_both_ways(injection: Injection) -> None:
     assert str(there) == str(injection)
     assert there.kind == injection.kind
     assert there.target == injection.target
-    assert there.part == injection.part
-    assert there.about is KINDS[there.target_type][there.kind]
+    assert there.executing_part == injection.executing_part
+    assert there.kind_info is FAULT_KINDS[there.target_type][there.kind]
 
 
 def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
@@ -80,43 +85,43 @@ def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
     ],
 )
 def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None:
-    assert parse_injection(text).part == part
+    assert parse_injection(text).executing_part == part
 
 
 def test_what_is_not_there_cannot_go_wrong() -> None:
-    check_targets(
+    validate_injection_targets(
         [parse_injection("mute:joint_13@1"), parse_injection("kill:host@1")], services=["control"], joints=13, buses=0
     )
     with raises_error(ConfigError, code="injection/unknown-target"):
-        check_targets([parse_injection("drop:guidance/world@1")], services=["control"], joints=13, buses=0)
+        validate_injection_targets([parse_injection("drop:guidance/world@1")], services=["control"], joints=13, buses=0)
 
 
 def test_a_request_is_checked_like_a_text() -> None:
-    assert check_injection(Injection("drop", keys.JOINTS)).amount == 1.0
+    assert validate_and_complete_injection(Injection("drop", keys.JOINTS)).amount == 1.0
     with raises_error(ConfigError, code="injection/unknown-fault"):
-        check_injection(Injection("mute", "control"), "mute control")
+        validate_and_complete_injection(Injection("mute", "control"), "mute control")
 
 
 @given(st.lists(injections(), max_size=8), st.lists(seconds, max_size=8))
 def test_injection_plan_yields_each_change_once_in_time_order(given_: list[Injection], looks: list[float]) -> None:
     plan, seen = InjectionPlan(given_), []
     for now_s in [*sorted(looks), inf]:
-        due = plan.until(now_s)
-        assert (all(change.at_s <= now_s for change in due) and plan.next_s() > now_s) or now_s == inf
+        due = plan.pop_due_transitions(now_s)
+        assert (all(change.time_s <= now_s for change in due) and plan.next_transition_s() > now_s) or now_s == inf
         seen += due
-    assert [change.at_s for change in seen] == sorted(change.at_s for change in seen)
-    ends = [i for i in given_ if i.end_s != inf and not i.about.once]
-    assert sorted(str(c.injection) for c in seen if c.begins) == sorted(map(str, given_))
-    assert sorted(str(c.injection) for c in seen if not c.begins) == sorted(map(str, ends))
-    assert plan.next_s() == inf
+    assert [change.time_s for change in seen] == sorted(change.time_s for change in seen)
+    ends = [i for i in given_ if i.end_s != inf and not i.kind_info.is_instantaneous]
+    assert sorted(str(c.injection) for c in seen if c.is_start) == sorted(map(str, given_))
+    assert sorted(str(c.injection) for c in seen if not c.is_start) == sorted(map(str, ends))
+    assert plan.next_transition_s() == inf
 
 
 def test_help_explains_every_kind() -> None:
-    for kinds in KINDS.values():
+    for kinds in FAULT_KINDS.values():
         for name, kind in kinds.items():
-            assert name in kinds_in_short()
-            assert name in explain_kinds()
-            assert kind.description in explain_kinds()
+            assert name in summarize_fault_kinds()
+            assert name in describe_fault_kinds()
+            assert kind.description in describe_fault_kinds()
 
 
 def test_the_page_has_every_kind() -> None:
@@ -127,24 +132,26 @@ def test_the_page_has_every_kind() -> None:
 
 
 def test_a_runs_plan_names_the_entry_that_is_wrong() -> None:
-    assert [str(i) for i in parse_planned(run_config(faults=["mute:joint_1@1"]))] == ["mute:joint_1@1"]
+    assert [str(i) for i in parse_planned_faults(make_run_config(faults=["mute:joint_1@1"]))] == ["mute:joint_1@1"]
     with raises_error(ConfigError, code="injection/unknown-fault", field="crawl"):
-        parse_planned(run_config(faults=["mute:joint_1@1", "mute"]))
+        parse_planned_faults(make_run_config(faults=["mute:joint_1@1", "mute"]))
     with raises_error(ConfigError, code="injection/unknown-target", field="faults[0]"):
-        check_planned(run_config(faults=["mute:joint_4@1"]))
-    check_planned(run_config(faults=["cut:bus_8@1", "hang:control@1", "leak:joint_3@1"]))
+        parse_and_validate_planned_faults(make_run_config(faults=["mute:joint_4@1"]))
+    parse_and_validate_planned_faults(make_run_config(faults=["cut:bus_8@1", "hang:control@1", "leak:joint_3@1"]))
 
 
 def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
-    does = {"does": ("leak",), "buses": 1, "because": "it is a toy"}
-    check_backend_can(run_config(faults=["leak:joint_1@1", "mute:joint_1@1", "slow:simulator@1"]), **does)
+    backend = {"supported_kinds": ("leak",), "buses": 1, "reason": "it is a toy"}
+    validate_faults_for_backend(
+        make_run_config(faults=["leak:joint_1@1", "mute:joint_1@1", "slow:simulator@1"]), **backend
+    )
     with raises_error(ConfigError, code="injection/not-supported", field="faults[1]"):
-        check_backend_can(run_config(faults=["leak:joint_1@1", "reboot:joint_1@1"]), **does)
+        validate_faults_for_backend(make_run_config(faults=["leak:joint_1@1", "reboot:joint_1@1"]), **backend)
     with raises_error(ConfigError, code="injection/unknown-target", field="bus_2"):
-        check_backend_can(run_config(faults=["cut:bus_2@1"]), **does)
+        validate_faults_for_backend(make_run_config(faults=["cut:bus_2@1"]), **backend)
 
 
 def test_injection_by_host_alone_refuses_killing_processes() -> None:
-    check_without_run(run_config(faults=["hang:control@1", "mute:joint_2@1"]))
+    validate_faults_without_supervisor(make_run_config(faults=["hang:control@1", "mute:joint_2@1"]))
     with raises_error(ConfigError, code="injection/not-supported"):
-        check_without_run(run_config(faults=["mute:joint_2@1", "kill:control@1"]))
+        validate_faults_without_supervisor(make_run_config(faults=["mute:joint_2@1", "kill:control@1"]))

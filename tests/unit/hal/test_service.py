@@ -7,7 +7,7 @@ from snakesim_hal.service import Service, ServiceLoop
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, Done, JointState, Message, Process
 from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
-from snakesim_testing.hal.small_robots import run_config, state
+from snakesim_testing.hal.small_robots import make_joint_state, make_run_config
 
 
 class Undemanding(Service):
@@ -27,20 +27,20 @@ class Undemanding(Service):
 
 def test_service_waits_for_the_joints_before_it_answers_ticks() -> None:
     network = LocalNetwork()
-    hal = network.session()
-    hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
-    clocks, felt = hal.publisher(keys.CLOCK, Clock), hal.publisher(keys.JOINTS, JointState)
-    done = hal.reader(keys.done_key("navigation"), Done)
-    loop = ServiceLoop(Undemanding, run_config(clock_mode=CLOCK.clock_mode), network.session())
+    hal = network.create_session()
+    hal.declare_latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
+    clocks, felt = hal.declare_publisher(keys.CLOCK, Clock), hal.declare_publisher(keys.JOINTS, JointState)
+    done = hal.declare_reader(keys.done_key("navigation"), Done)
+    loop = ServiceLoop(Undemanding, make_run_config(clock_mode=CLOCK.clock_mode), network.create_session())
     clocks.put(CLOCK)
-    loop.join()
-    entries = hal.latched_reader(keys.PROCESS_ALL, Process)
-    loop.act()
+    loop.connect()
+    entries = hal.declare_latched_reader(keys.PROCESS_ALL, Process)
+    loop.step()
     assert done.drain() == []
     assert entries.drain()[-1].waits_for == [keys.JOINTS]
-    felt.put(state(ROBOT, 0.1, tick=CLOCK.tick))
+    felt.put(make_joint_state(ROBOT, 0.1, tick=CLOCK.tick))
     clocks.put(CLOCK)
-    loop.act()
+    loop.step()
     assert [one.tick for one in done.drain()] == [CLOCK.tick]
     assert entries.drain()[-1].waits_for == []
     loop.close()

@@ -25,9 +25,9 @@ def test_arming_is_tried_again_until_the_robot_is_ready(monkeypatch: pytest.Monk
         return outcome
 
     monkeypatch.setattr(command, "_arm_once", try_once)
-    monkeypatch.setattr(command, "RETRY_S", 0.001)
+    monkeypatch.setattr(command, "RETRY_PERIOD_S", 0.001)
     printed: list[str] = []
-    assert command.arm("row", "sim", RobotSelection(), printed.append, wait_s=30.0) == 0
+    assert command.arm_robot("row", "sim", RobotSelection(), printed.append, wait_s=30.0) == 0
     assert printed == ["waiting: no robot", "waiting: waiting for control"], "each reason once"
 
 
@@ -38,7 +38,7 @@ def test_a_refusal_that_does_not_pass_by_itself_ends_the_wait(monkeypatch: pytes
     monkeypatch.setattr(command, "_arm_once", refuse)
     began_s = time.monotonic()
     with pytest.raises(RefusedError, match="state is fault"):
-        command.arm("row", "sim", RobotSelection(), wait_s=30.0)
+        command.arm_robot("row", "sim", RobotSelection(), wait_s=30.0)
     assert time.monotonic() - began_s < 10.0
 
 
@@ -48,4 +48,4 @@ def test_without_wait_the_first_refusal_counts(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(command, "_arm_once", refuse)
     with pytest.raises(command.NotReadyError):
-        command.arm("row", "sim", RobotSelection())
+        command.arm_robot("row", "sim", RobotSelection())

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from docs.site.commands_page import PAGE, make_page
-from snakesim_hal.model.plugins import COMMANDS, list_installed, offer_plugin
+from snakesim_hal.model.plugins import COMMANDS, list_installed_plugins, register_plugin_temporarily
 from snakesim_hal.programs.commands import Command, Noun
 from snakesim_operator.cli import CommandParser, MainParser, find_subparsers, main, make_parser
 
@@ -53,9 +53,9 @@ LEAVES = {name_of(leaf): leaf for leaf in walk(TREE)}
 
 
 def test_command_tree_has_few_top_level_words() -> None:
-    assert len(TREE.commands.choices) <= MAX_COMMANDS
-    listed = [action.dest for _, actions in TREE.commands_by_heading() for action in actions]
-    assert sorted(listed) == sorted(TREE.commands.choices), "each has a heading"
+    assert len(TREE.subparsers.choices) <= MAX_COMMANDS
+    listed = [action.dest for _, actions in TREE.list_commands_by_heading() for action in actions]
+    assert sorted(listed) == sorted(TREE.subparsers.choices), "each has a heading"
 
 
 @pytest.mark.parametrize("name", LEAVES)
@@ -100,7 +100,7 @@ def test_each_robot_is_addressed_in_the_same_way() -> None:
 def test_messages_and_pages_name_commands_that_exist() -> None:
     page = make_page()
     for words in re.findall(r"`snakesim ([a-z0-9 ]+)`", page):
-        assert TREE.has_command(words.split()) or words in {*TREE.commands.choices, "robot calibrate"}, words
+        assert TREE.has_command(words.split()) or words in {*TREE.subparsers.choices, "robot calibrate"}, words
 
 
 def test_command_reference_page_is_current() -> None:
@@ -121,13 +121,13 @@ NOUN = Noun(name="arm_rest", heading="robot", help="Move the arm rest.")
 
 def added(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a package with the entry point `arm_rest` be installed."""
-    names = [*list_installed(COMMANDS), "arm_rest"]
-    monkeypatch.setattr("snakesim_hal.model.plugins.list_installed", lambda _group: names)
+    names = [*list_installed_plugins(COMMANDS), "arm_rest"]
+    monkeypatch.setattr("snakesim_hal.model.plugins.list_installed_plugins", lambda _group: names)
 
 
 def test_a_package_adds_a_noun_and_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
     added(monkeypatch)
-    with offer_plugin(COMMANDS, "arm_rest", (NOUN, LOWER)):
+    with register_plugin_temporarily(COMMANDS, "arm_rest", (NOUN, LOWER)):
         assert main(["arm_rest", "lower", "7"]) == 7
         assert "arm_rest" in make_parser().format_help()
 
@@ -136,9 +136,9 @@ def test_command_without_noun_is_reported_and_others_work(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     added(monkeypatch)
-    with offer_plugin(COMMANDS, "arm_rest", (LOWER,)):
+    with register_plugin_temporarily(COMMANDS, "arm_rest", (LOWER,)):
         parser = MainParser()
-        parser.add_installed()
+        parser.add_installed_commands()
     assert "no Noun 'arm_rest' is registered" in capsys.readouterr().err
     assert isinstance(parser, CommandParser)
     assert parser.has_command(["robot", "check"])

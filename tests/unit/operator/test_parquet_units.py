@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.playback.export import export
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_operator.playback.export import export_run
 from snakesim_operator.run.in_process import simulate
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
 
 
 def test_every_column_of_an_export_has_its_unit(tmp_path: Path) -> None:
-    simulate(load("triplet", [parse_set("duration_s=0.3")]).config, tmp_path / "run")
-    assert export([tmp_path / "run"], "parquet", tmp_path / "a.parquet", lambda _line: None) == 0
+    simulate(load_scenario("triplet", [parse_set_option("duration_s=0.3")]).config, tmp_path / "run")
+    assert export_run([tmp_path / "run"], "parquet", tmp_path / "a.parquet", lambda _line: None) == 0
     schema = parquet.read_schema(tmp_path / "a.parquet")
     units = {column.name: column.metadata[b"unit"].decode() for column in schema}
     assert units["time_s"] == "s"
@@ -26,9 +26,9 @@ def test_every_column_of_an_export_has_its_unit(tmp_path: Path) -> None:
 
 
 def test_table_of_an_evaluation_has_units(tmp_path: Path) -> None:
-    from snakesim_operator.features.evaluate.store import PARQUET, write_tables
+    from snakesim_operator.features.evaluate.store import PARQUET_FILENAME, write_tables
 
     write_tables(tmp_path, [], {})
-    schema = parquet.read_schema(tmp_path / PARQUET)
+    schema = parquet.read_schema(tmp_path / PARQUET_FILENAME)
     assert schema.field("displacement_m_s").metadata[b"unit"] == b"m/s"
     assert schema.field("controller").metadata is None

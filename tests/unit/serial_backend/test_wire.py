@@ -31,11 +31,11 @@ def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -
         assert wire.receive(0.0) == b""
         pty.send(b"later")
         assert wire.receive(1.0) == b"later"
-        wire.cut(begins=True)
+        wire.set_cut(begins=True)
         wire.send(b"lost")
         assert wire.error() == "it is cut"
         assert wire.receive(0.0) == b""
-        wire.cut(begins=False)
+        wire.set_cut(begins=False)
         assert wire.error() == ""
         pty.expected_bytes = len(b"first?")
         assert pty.receive() == b"first?"

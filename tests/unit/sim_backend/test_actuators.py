@@ -5,10 +5,10 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
-from snakesim_sim_backend.model.build import build
+from snakesim_sim_backend.model.build import build_sim_model
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 RESPONSE_S = 0.01
 NOTHING = 1e-12  # N·m
@@ -19,7 +19,7 @@ ICE = {"ground": {"friction": 0.0}}
 
 def fast_run(robot=None, **settings):
     """One joint on ice, sampled at every physics step of 1 ms."""
-    return Run(make_config(robot or TWO_LINKS, ICE, rate_hz=1000), **settings)
+    return SimulatorRig(make_config(robot or TWO_LINKS, ICE, rate_hz=1000), **settings)
 
 
 def torque(run):
@@ -29,10 +29,10 @@ def torque(run):
 def test_a_motor_without_response_time_answers_at_once():
     run = fast_run({**TWO_LINKS, "motor": {"response_time_s": 0.0}})
     run.command(Mode.TORQUE, 0.02)
-    run.go()
+    run.advance()
     assert torque(run) == pytest.approx(0.02)
     run.command(Mode.PASSIVE)
-    run.go()
+    run.advance()
     assert torque(run) == pytest.approx(0.0, abs=NOTHING)
 
 
@@ -40,7 +40,7 @@ def test_actuator_before_first_command_has_no_torque_at_any_speed():
     run = fast_run()
     run.sim.data.qvel[6] = 20.0
     for _ in range(50):
-        run.go()
+        run.advance()
         assert torque(run) == pytest.approx(0.0, abs=NOTHING)
 
 
@@ -48,21 +48,21 @@ def test_actuator_before_first_command_has_no_torque_at_any_speed():
 def test_actuator_torque_stays_within_robot_and_command_limits(mode):
     run = fast_run(HEAVY_ROTOR)
     run.command(mode, -100.0, limit=50.0)
-    run.go(0.2)
+    run.advance(0.2)
     assert torque(run) == pytest.approx(-run.config.robot.limits.torque_nm)
     run.command(mode, -100.0, limit=1.5)
-    run.go(0.1)
+    run.advance(0.1)
     assert torque(run) == pytest.approx(-1.5)
 
 
 def test_actuator_lowered_limit_applies_at_motor_response():
     run = fast_run(HEAVY_ROTOR)
     run.command(Mode.TORQUE, 6.0)
-    run.go(0.2)
+    run.advance(0.2)
     run.command(Mode.TORQUE, 6.0, limit=1.0)
     before = torque(run)
     for _ in range(100):
-        run.go()
+        run.advance()
         assert torque(run) >= before * np.exp(-1e-3 / RESPONSE_S) - 1e-9
         before = torque(run)
     assert before == pytest.approx(1.0)
@@ -74,7 +74,7 @@ def test_the_motor_does_not_drive_a_joint_beyond_its_speed():
     run.command(Mode.TORQUE, 3.0)
     speeds, torques = [], []
     for _ in range(200):
-        run.go()
+        run.advance()
         speeds.append(run.sim.true_state().velocities_rad_s[0])
         torques.append(torque(run))
         if abs(run.sim.true_state().angles_rad[0]) > 2.5:
@@ -89,7 +89,7 @@ def test_actuator_below_nine_tenths_speed_has_full_torque():
     limit = run.config.robot.limits.speed_rad_s
     run.sim.data.qvel[6] = 0.85 * limit
     run.command(Mode.TORQUE, 7.0)
-    run.go(0.1)
+    run.advance(0.1)
     assert run.sim.true_state().velocities_rad_s[0] > 0.8 * limit
     assert torque(run) == pytest.approx(7.0, rel=1e-3)
 
@@ -101,7 +101,7 @@ def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
     run = fast_run(HEAVY_ROTOR)
     robot = run.config.robot
     run.command(before, targets[before])
-    run.go(0.1)
+    run.advance(0.1)
     run.command(after, targets[after])
     for _ in range(30):
         state, had = run.sim.true_state(), torque(run)
@@ -113,7 +113,7 @@ def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
             Mode.VELOCITY: robot.motor.velocity_gain_nm_s_per_rad * (targets[after] - speed),
             Mode.TORQUE: targets[after],
         }[after]
-        run.go()
+        run.advance()
         wanted = had + (demand - had) * (1 - np.exp(-1e-3 / RESPONSE_S))
         assert torque(run) == pytest.approx(wanted, abs=1e-6)
 
@@ -122,16 +122,16 @@ def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
 @pytest.mark.parametrize(("torque_nm", "speed"), [(7.0, 7.5), (1000.0, 100.0)])
 def test_very_stiff_joints_are_stable(response_s, torque_nm, speed):
     stiff = {"stiffness_nm_per_rad": 1000.0, "damping_nm_s_per_rad": 20.0, "response_time_s": response_s}
-    run = Run(make_config({"motor": stiff, "limits": {"torque_nm": torque_nm, "speed_rad_s": speed}}))
+    run = SimulatorRig(make_config({"motor": stiff, "limits": {"torque_nm": torque_nm, "speed_rad_s": speed}}))
     zigzag = [0.3 * (-1) ** i for i in range(13)]
     run.command([Mode.POSITION] * 13, zigzag)
-    run.go(1.0)
+    run.advance(1.0)
     assert run.sim.true_state().angles_rad == pytest.approx(zigzag, abs=1e-3)
 
 
 def test_gains_that_swing_up_are_refused():
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        Run(make_config({"motor": {"response_time_s": 0.015, "damping_nm_s_per_rad": 0.5}}))
+        SimulatorRig(make_config({"motor": {"response_time_s": 0.015, "damping_nm_s_per_rad": 0.5}}))
 
 
 def test_a_body_that_is_not_as_its_file_says():
@@ -139,9 +139,11 @@ def test_a_body_that_is_not_as_its_file_says():
     plain, other = (fast_run(HEAVY_ROTOR, mass_scale=scale, motor_gain_scale=scale) for scale in (1.0, 2.0))
     for run in (plain, other):
         run.command(Mode.POSITION, 0.01)
-        run.go()
+        run.advance()
     assert torque(other) == pytest.approx(2 * torque(plain), rel=1e-3)
     assert torque(plain) > 0.01
     assert other.sim.describe() == plain.sim.describe()
-    light, heavy = (build(make_config(), SimSettings(mass_scale=scale)).model.body_mass.sum() for scale in (1.0, 2.0))
+    light, heavy = (
+        build_sim_model(make_config(), SimSettings(mass_scale=scale)).model.body_mass.sum() for scale in (1.0, 2.0)
+    )
     assert heavy == pytest.approx(2 * light)

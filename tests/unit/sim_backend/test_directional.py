@@ -10,11 +10,11 @@ from snakesim_sim_backend.laws.directional import (
     NO_AXIS,
     Coefficients,
     Underside,
+    apply_directional_friction,
     combine_coefficients,
-    direct_force,
 )
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_testing.sim.simulator_rig import lie_down, make_config
+from snakesim_testing.sim.simulator_rig import make_config, make_resting_body
 
 HU = (0.11, 0.14, 0.19)  # forward, backward, sideways
 STIFFNESS, DAMPING, NORMAL_N = 5000.0, 30000.0, 3.0  # of a foot of 0.3 kg, with steps of 2 ms
@@ -30,7 +30,7 @@ def test_sliding_force_is_that_of_hu_in_every_direction(angle_rad: float) -> Non
     velocity = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
     isotropic = -hu().largest * NORMAL_N * velocity
     x, y, z = isotropic.tolist()
-    force = direct_force((x, y, z), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), hu(), 0.0)
+    force = apply_directional_friction((x, y, z), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), hu(), 0.0)
     along = HU[0] if velocity[0] > 0 else HU[1]
     assert force == pytest.approx((-NORMAL_N * along * velocity[0], -NORMAL_N * HU[2] * velocity[1], 0.0))
     assert np.dot(force, velocity) < 0.0
@@ -45,7 +45,9 @@ def test_equal_coefficients_are_not_directional() -> None:
 
 
 def test_without_an_axis_all_directions_are_sideways() -> None:
-    force = direct_force((-1.0, 2.0, 0.0), (0.0, 0.0, 0.0), NO_AXIS, Coefficients(1.0, 0.2, 0.3, 0.5, 0, 0), 0.0)
+    force = apply_directional_friction(
+        (-1.0, 2.0, 0.0), (0.0, 0.0, 0.0), NO_AXIS, Coefficients(1.0, 0.2, 0.3, 0.5, 0, 0), 0.0
+    )
     assert force == (-0.5, 1.0, 0.0)
 
 
@@ -53,7 +55,7 @@ def test_viscous_force_is_normal_force_times_coefficient_times_speed() -> None:
     step_s, speed = 0.002, np.array([0.3, -0.2, 0.0])
     x, y, z = (speed * step_s).tolist()
     coefficients = combine_coefficients(0.0, 0.0, 0.0, 0.5, 3.0, 0.0)
-    force = direct_force((0.0, 0.0, 0.0), (x, y, z), (0.0, 1.0, 0.0), coefficients, NORMAL_N / step_s)
+    force = apply_directional_friction((0.0, 0.0, 0.0), (x, y, z), (0.0, 1.0, 0.0), coefficients, NORMAL_N / step_s)
     assert force == pytest.approx((-NORMAL_N * 3.0 * 0.3, NORMAL_N * 0.5 * 0.2, 0.0))
 
 
@@ -78,7 +80,7 @@ def test_friction_never_gives_more_energy_than_its_spring_has(coefficients: tupl
             pull = -STIFFNESS * stretch - DAMPING * slip
             pull *= min(1.0, limit_n / max(np.hypot(*pull), 1e-12))
             axis = (math.cos(heading), math.sin(heading), 0.0)
-            x, y, _ = direct_force((pull[0], pull[1], 0.0), (slip[0], slip[1], 0.0), axis, found, 0.0)
+            x, y, _ = apply_directional_friction((pull[0], pull[1], 0.0), (slip[0], slip[1], 0.0), axis, found, 0.0)
             force = np.array([x, y])
             work_j += 0.5 * float((last_force + force) @ slip)
             last_force = force
@@ -90,7 +92,7 @@ def test_friction_never_gives_more_energy_than_its_spring_has(coefficients: tupl
 
 def test_underside_turns_from_link_to_link() -> None:
     config = make_config({"chain": {"modules": 3}})
-    sim, data, _ = lie_down(config, SimSettings(), 0.4)
+    sim, data, _ = make_resting_body(config, SimSettings(), 0.4)
     lengths_m = config.robot.link_lengths_m
     underside = Underside(data, sim.first_link_body, lengths_m)
     first = sim.first_link_body
@@ -110,7 +112,7 @@ def test_underside_turns_from_link_to_link() -> None:
 
 def test_sides_and_back_of_a_link_are_not_its_underside() -> None:
     config = make_config({"chain": {"modules": 3}})
-    sim, data, physics = lie_down(config, SimSettings())
+    sim, data, physics = make_resting_body(config, SimSettings())
     underside = Underside(data, sim.first_link_body, config.robot.link_lengths_m)
     body = sim.first_link_body + 1
     faces = []

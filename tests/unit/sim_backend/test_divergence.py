@@ -8,31 +8,31 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Mode
 from snakesim_testing.messages import raises_error
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 
 def test_divergence_names_tick_joint_and_value_and_keeps_last_state():
-    run = Run(make_config())
+    run = SimulatorRig(make_config())
     run.command(Mode.POSITION, 0.1)
-    run.go(0.1)
+    run.advance(0.1)
     good = run.sim.true_state()
     run.sim.data.qfrc_applied[6 + 4] = 1e9
     with raises_error(BackendError, code="simulator/diverged"):
-        run.go()
+        run.advance()
     assert run.sim.true_state().angles_rad == pytest.approx(good.angles_rad, abs=1e-12)
     assert run.sample().joints.angle_rad == pytest.approx(good.angles_rad, abs=1e-12)
     with raises_error(BackendError, code="simulator/diverged"):
-        run.go()
+        run.advance()
 
 
 @pytest.mark.parametrize(("where", "value"), [("qpos", np.nan), ("qvel", np.inf), ("xfrc_applied", np.nan)])
 def test_what_is_no_number_is_found_at_once(where, value):
-    run = Run(make_config())
+    run = SimulatorRig(make_config())
     getattr(run.sim.data, where).flat[10] = value
     with raises_error(BackendError, code="simulator/diverged"):
-        run.go()
+        run.advance()
     samples = run.sample()
-    for message in (samples.joints, *samples.others.values()):
+    for message in (samples.joints, *samples.by_key.values()):
         assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message  # refuses NaN
 
 
@@ -41,19 +41,19 @@ def test_a_robot_too_quick_for_the_step_is_found_out():
     wild = {"motor": {"stiffness_nm_per_rad": 1e5, "damping_nm_s_per_rad": 1e3, "armature_kg_m2": 0.0}}
     wild["motor"] |= {"response_time_s": 0.005}
     wild["limits"] = {"torque_nm": 1000.0, "speed_rad_s": 100.0}
-    run = Run(make_config(wild), timestep_s=0.01, contact_time_s=0.02)
+    run = SimulatorRig(make_config(wild), timestep_s=0.01, contact_time_s=0.02)
     run.command([Mode.POSITION] * 13, [0.5 * (-1) ** i for i in range(13)])
     with raises_error(BackendError, code="simulator/diverged"):
-        run.go(5.0)
+        run.advance(5.0)
 
 
 def test_what_mujoco_cannot_do_is_an_error_of_the_backend():
-    run = Run(make_config({"motor": {"friction_nm": 0.1}}))
-    run.go(0.1)
+    run = SimulatorRig(make_config({"motor": {"friction_nm": 0.1}}))
+    run.advance(0.1)
     run.sim.sim.model.opt.solver = 99
     for _attempt in range(2):
         with raises_error(BackendError, code="simulator/diverged"):
-            run.go()
+            run.advance()
 
 
 def test_a_robot_that_mujoco_cannot_build_is_named(monkeypatch):
@@ -62,4 +62,4 @@ def test_a_robot_that_mujoco_cannot_build_is_named(monkeypatch):
 
     monkeypatch.setattr(mujoco.MjSpec, "compile", fails)
     with raises_error(ConfigError, code="simulator/cannot-build", field="planar13"):
-        Run(make_config())
+        SimulatorRig(make_config())

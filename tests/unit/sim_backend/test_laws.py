@@ -13,10 +13,10 @@ from mujoco import batch
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_native.libraries import LAWS
-from snakesim_native.load import load
+from snakesim_native.libraries import LAWS_LIBRARY
+from snakesim_native.load import load_shared_library
 from snakesim_sim_backend.laws.version import LawsVersion
-from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, SimModel, build_sim_model
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
@@ -83,11 +83,11 @@ class Simulation:
     """One version of the laws in a scene."""
 
     def __init__(self, config: RunConfig, laws: LawsVersion) -> None:
-        self.sim: SimModel = build(config, SimSettings(), laws=laws, measures_force=True)
+        self.sim: SimModel = build_sim_model(config, SimSettings(), laws=laws, measures_force=True)
         self.model = self.sim.model
         self.data = mujoco.MjData(self.model)
         self.physics = Physics(self.sim, self.data)
-        self.measured_force = self.physics.measure_force()
+        self.measured_force = self.physics.start_force_measurement()
 
     def go(self, state: "State", min_friction: float) -> list[Floats]:
         """Begin at a state, and step. Returns everything that the laws compute."""
@@ -95,8 +95,8 @@ class Simulation:
         self.data.qpos[:] = state.positions
         self.data.qvel[:] = state.velocities
         self.physics.set_min_friction(min_friction)
-        self.physics.begin()
-        self.measured_force = self.physics.measure_force()
+        self.physics.reset()
+        self.measured_force = self.physics.start_force_measurement()
         results = self._list_results()
         for _ in range(STEPS_PER_STATE):
             self.data.qfrc_applied[:] = state.forces
@@ -150,8 +150,8 @@ def count_obstacle_dofs(model: mujoco.MjModel) -> int:
 @pytest.fixture(autouse=True)
 def library() -> None:
     """Skip the test where there is no C version."""
-    loaded = load(LAWS)
-    if loaded.handle is None:
+    loaded = load_shared_library(LAWS_LIBRARY)
+    if loaded.library is None:
         pytest.skip(loaded.problem)
 
 

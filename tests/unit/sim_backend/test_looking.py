@@ -14,7 +14,7 @@ from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Ranges
 from snakesim_sim_backend.laws.flat_ground import SINK_M
 from snakesim_testing.messages import raises_error
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 NOSE_M = 13 * 0.11 + 0.04
 CAMERA = {"name": "head", "width": 161, "height": 121, "rate_hz": 100.0, "delay_s": 0.0, "range_min_m": 0.02}
@@ -25,14 +25,14 @@ POST = {"cylinder": [{"position_m": [NOSE_M + 1.05, 0.0], "radius_m": 0.05, "hei
 def simulate(scene=None, *, kind="depth", **sensor):
     """A straight snake along x with one camera or lidar."""
     base = CAMERA if kind == "depth" else {"name": "front", "rate_hz": 100.0, "delay_s": 0.0}
-    return Run(make_config({"sensors": {kind: [{**base, **sensor}]}}, scene or {}))
+    return SimulatorRig(make_config({"sensors": {kind: [{**base, **sensor}]}}, scene or {}))
 
 
 def newest(run, key=HEAD) -> Any:
     """What the sensor measured at this tick; it arrives with the next."""
     run.sample()
-    run.go()
-    message = run.sample().others[key]
+    run.advance()
+    message = run.sample().by_key[key]
     run.sim.close()
     assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
     return message

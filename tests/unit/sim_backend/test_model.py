@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_testing.messages import raises_error
-from snakesim_testing.sim.simulator_rig import Run, make_config, open_sim
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config, open_sim
 
 FRICTION_NM = 0.12
 VISCOUS_NM_S_PER_RAD = 0.03
@@ -84,7 +84,7 @@ def test_contacts_too_stiff_for_the_step_are_refused():
 
 def test_neighbours_pass_through_each_other_and_distant_links_do_not():
     config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}})
-    run = Run(config)
+    run = SimulatorRig(config)
     data, model = run.sim.data, run.sim.sim.model
     assert not any(data.contact.geom.min(axis=1) > 0)
     data.qpos[7:] = 1.0  # rolled up: far more than a full turn

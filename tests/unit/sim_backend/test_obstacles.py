@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.outlines import outline_distance_m
+from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_hal.model.scenario import place_obstacles
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 KINDS = {
     "tall_peg": {"cylinder": [{"position_m": [3.0, 1.0], "radius_m": 0.1, "height_m": 0.4}]},
@@ -20,7 +20,7 @@ KINDS = {
 def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
     """Link 0's rear cap, a sphere of the body's radius, moved in along a line."""
     config = make_config(scene=scene)
-    run = Run(config)
+    run = SimulatorRig(config)
     data = run.sim.data
     (placed,) = place_obstacles(config)
     center = np.array(placed.obstacle.position_w[:2])
@@ -30,7 +30,7 @@ def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
         data.qpos[3:7] = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]  # the snake points away from the obstacle
         data.qpos[7:] = 0.0
         reach = np.linspace(0.0, 1.0, 20001)
-        gaps = np.array([outline_distance_m(placed.obstacle, center + r * outward) for r in reach[::20]])
+        gaps = np.array([compute_outline_distance_m(placed.obstacle, center + r * outward) for r in reach[::20]])
         touching = float(np.interp(radius, gaps, reach[::20]))
         for offset, touched in ((2e-5, set[str]()), (-2e-5, {placed.obstacle.name})):
             data.qpos[:3] = [*(center + (touching + offset) * outward), radius]
@@ -40,8 +40,8 @@ def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
 
 def test_steps_and_ground_and_the_snake_itself_are_no_contacts():
     step = {"step": [{"position_m": [0.7, 0.0], "size_m": [3.0, 2.0], "height_m": 0.05}]}
-    run = Run(make_config(scene=step))
-    run.go(0.2)
+    run = SimulatorRig(make_config(scene=step))
+    run.advance(0.2)
     assert run.sim.data.ncon > 0
     assert run.sim.true_state().contacts == []
     run.sim.data.qpos[7:] = 1.0
@@ -53,5 +53,5 @@ def test_obstacle_may_have_the_name_of_a_link():
     pegs = [
         {"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name} for i, name in enumerate(["ground", "link_3"])
     ]
-    run = Run(make_config(scene={"cylinder": pegs}))
+    run = SimulatorRig(make_config(scene={"cylinder": pegs}))
     assert [name for name in run.sim.sim.obstacle_of_geom if name] == ["ground", "link_3"]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.scenario import find_start_pose, load
+from snakesim_hal.model.scenario import compute_start_pose, load_scenario
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.model.tether import WINCH_N_S_PER_M
@@ -18,7 +18,7 @@ from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, Tether
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
-from snakesim_testing.sim.simulator_rig import G, Run, make_config
+from snakesim_testing.sim.simulator_rig import G, SimulatorRig, make_config
 
 ICE = {"ground": {"friction": 0.0}}
 FOUR = {"chain": {"modules": 4}}
@@ -103,13 +103,13 @@ class Firmware:
     "config",
     [
         make_config(),
-        load("triplet").config,
+        load_scenario("triplet").config,
         make_config(scene={**HILLS, **CURVE}, base_robot="mamba", start={"on_route": True}),
     ],
     ids=["flat", "triplet", "hills_mamba"],
 )
 def test_physics_model_starts_like_the_simulator(config):
-    physics_model, state = make_physics_model(config), Run(config).sim.true_state()
+    physics_model, state = make_physics_model(config), SimulatorRig(config).sim.true_state()
     pose = physics_model.pose()
     assert physics_model.angle_rad == pytest.approx(state.angles_rad, abs=1e-4)
     assert pose.position_w == pytest.approx(state.base_position_w, abs=1e-4)
@@ -120,7 +120,7 @@ def test_physics_model_starts_like_the_simulator(config):
 
 
 def test_physics_model_without_torque_stays_at_rest():
-    physics_model: PhysicsModel = make_physics_model(load("triplet").config)
+    physics_model: PhysicsModel = make_physics_model(load_scenario("triplet").config)
     angles, before = physics_model.angle_rad.copy(), physics_model.pose()
     pass_time(physics_model, seconds=1.0)
     after = physics_model.pose()
@@ -194,13 +194,13 @@ def test_in_motion_the_shafts_carry_what_the_outer_links_need(motor):
 def test_position_loop_once_a_step_equals_simulator_motors():
     """All the way within a thousandth of the motion, and the torques within 3 % of the greatest."""
     config = make_config({"chain": {"modules": 6}}, rate_hz=1000)
-    physics_model, run = make_physics_model(config), Run(config, timestep_s=0.001)
+    physics_model, run = make_physics_model(config), SimulatorRig(config, timestep_s=0.001)
     firmware = Firmware(config, physics_model.step_s)
     worst_rad, worst_nm, max_rad, max_nm = 0.0, 0.0, 0.0, 0.0
     for k in range(1000):
         target = np.array([0.1 * np.sin(0.0063 * k - 0.8 * i) - 0.1 * np.sin(-0.8 * i) for i in range(6)])
         run.command(Mode.POSITION, target.tolist())
-        run.go()
+        run.advance()
         firmware.drive(physics_model, target)
         state = run.sim.true_state()
         worst_rad = max(worst_rad, np.abs(physics_model.angle_rad - state.angles_rad).max())
@@ -295,7 +295,7 @@ def test_at_the_start_imus_feel_gravity_alone():
     config = make_config()
     imu = make_physics_model(config).imu()
     assert imu is not None
-    assert imu == Run(config).sample().others["sensor/imu"]
+    assert imu == SimulatorRig(config).sample().by_key["sensor/imu"]
     for turning, force in zip(imu.angular_velocity_rad_s, imu.acceleration_m_s2, strict=True):
         assert turning == pytest.approx((0, 0, 0), abs=1e-6)
         assert force == pytest.approx((0, 0, G), abs=0.05)
@@ -335,7 +335,7 @@ def test_diverging_physics_is_reported_at_once_and_permanently(torque):
     bad[4] = torque
     with raises_error(BackendError, code="simulator/diverged"):
         physics_model.advance(bad)
-    assert physics_model.angle_rad == pytest.approx(find_start_pose(config).angles_rad, abs=1e-3)
+    assert physics_model.angle_rad == pytest.approx(compute_start_pose(config).angles_rad, abs=1e-3)
     assert np.isfinite(physics_model.shaft_torque_nm()).all()
     imu = physics_model.imu()
     assert imu is not None

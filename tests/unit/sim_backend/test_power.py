@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import Mode, Power, SensorDescription
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 WITH = {"sensors!": {"joints": {}, "power": {"rate_hz": 5.0}}}
 
@@ -21,10 +21,10 @@ def overheat(end_s: float = inf) -> Injection:
 
 
 def test_power_sample_keeps_its_rate_and_starts_at_ambient():
-    run = Run(make_config(WITH))
+    run = SimulatorRig(make_config(WITH))
     sensor = SensorDescription(key=keys.POWER, rate_hz=5.0, delay_s=0.0)
     assert sensor in run.sim.describe().sensors
-    power = run.sensed(Power)
+    power = run.sample_only_sensor(Power)
     assert power.motor_c == power.board_c == [20.0] * run.count
     assert power.voltage_v == [24.0] * run.count
     assert power.current_a == pytest.approx([0.05] * run.count)
@@ -32,18 +32,18 @@ def test_power_sample_keeps_its_rate_and_starts_at_ambient():
     assert power.leak == [False] * run.count
     due: list[int] = []
     for _ in range(40):
-        run.go()
-        if keys.POWER in run.sample().others:
+        run.advance()
+        if keys.POWER in run.sample().by_key:
             due.append(run.tick)
     assert due == [20, 40]
 
 
 def test_a_motor_that_works_gets_warm_and_takes_current():
-    run = Run(make_config(WITH))
+    run = SimulatorRig(make_config(WITH))
     run.sample()
     run.command(Mode.TORQUE, [3.5, *[0.0] * (run.count - 1)])
-    run.go(6.0)
-    power = run.sensed(Power)
+    run.advance(6.0)
+    power = run.sample_only_sensor(Power)
     # The joint turns to its stop and pushes; 3.5 of 7 N·m settle at 80 °C, by a time constant of a minute.
     assert power.motor_c[0] == pytest.approx(20 + 60 * (1 - 2.718 ** (-6 / 60)), abs=0.6)
     assert power.motor_c[-1] < 20.5
@@ -51,20 +51,20 @@ def test_a_motor_that_works_gets_warm_and_takes_current():
 
 
 def test_heat_on_request_goes_away_by_itself_or_is_held():
-    run = Run(make_config(WITH))
+    run = SimulatorRig(make_config(WITH))
     for end_s, later_c in ((inf, 109.0), (5.0, 110.0)):
         assert run.sim.inject(overheat(end_s), begins=True)
-        run.go(1.0)
-        assert run.sensed(Power).motor_c[2] == pytest.approx(later_c, abs=1.0)
-    assert run.sensed(Power).motor_c[1] == pytest.approx(20.0, abs=0.1)
+        run.advance(1.0)
+        assert run.sample_only_sensor(Power).motor_c[2] == pytest.approx(later_c, abs=1.0)
+    assert run.sample_only_sensor(Power).motor_c[1] == pytest.approx(20.0, abs=0.1)
     assert run.sim.inject(overheat(5.0), begins=False)
-    run.go(10.0)
-    assert run.sensed(Power).motor_c[2] < 98.0
+    run.advance(10.0)
+    assert run.sample_only_sensor(Power).motor_c[2] < 98.0
 
 
 def test_without_the_sensor_there_is_no_heat_on_request():
     config = make_config({"sensors!": {"joints": {}}}, faults=["overheat:joint_1@1"])
     with raises_error(ConfigError, code="injection/not-supported"):
         SimBackend.check(config, SimSettings())
-    assert not Run(make_config({"sensors!": {"joints": {}}})).sim.inject(overheat(), begins=True)
+    assert not SimulatorRig(make_config({"sensors!": {"joints": {}}})).sim.inject(overheat(), begins=True)
     assert SimBackend.check(make_config(WITH, faults=["overheat:joint_1@1"]), SimSettings())

@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
 from snakesim_sim_backend.sensors.timing import SamplingSchedule
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 CORNER = {
     "ground": {"friction": 0.0},
@@ -19,7 +19,7 @@ CORNER = {
 def pushed(sensors=None, **top):
     """A bent snake that is pushed at a peg."""
     robot = {"chain": {"modules": 6}, "sensors": sensors or {}}
-    run = Run(make_config(robot, CORNER, **top))
+    run = SimulatorRig(make_config(robot, CORNER, **top))
     run.command([Mode.POSITION] * 6, [0.1, -0.2, 0.3, 0.1, -0.2, 0.3])
     run.sim.data.xfrc_applied[run.sim.sim.model.body("link_2").id, 1] = 15.0
     return run
@@ -28,18 +28,20 @@ def pushed(sensors=None, **top):
 def frames_of(run):
     """Origins and rotations of the links, from what the robot itself publishes."""
     samples, robot = run.sample(), run.config.robot
-    pose = samples.others[keys.POSE]
+    pose = samples.by_key[keys.POSE]
     assert isinstance(pose, Pose)
     rotation = rotation_from_quaternion(pose.orientation_wxyz)
-    return samples, *link_frames(pose.position_w, rotation, samples.joints.angle_rad, robot.axes, robot.link_lengths_m)
+    return samples, *compute_link_frames(
+        pose.position_w, rotation, samples.joints.angle_rad, robot.axes, robot.link_lengths_m
+    )
 
 
 @pytest.mark.parametrize("robot", ["planar13", "mamba"])
 def test_links_are_where_the_published_pose_and_angles_say(robot):
-    run = Run(make_config(base_robot=robot))
+    run = SimulatorRig(make_config(base_robot=robot))
     n = run.count
     run.command([Mode.POSITION] * n, [0.3 * np.sin(i) for i in range(n)])
-    run.go(0.3)
+    run.advance(0.3)
     _, origins, rotations = frames_of(run)
     data, model = run.sim.data, run.sim.sim.model
     mujoco.mj_kinematics(model, data)
@@ -50,10 +52,10 @@ def test_links_are_where_the_published_pose_and_angles_say(robot):
 
 def test_contacts_in_link_frames_are_the_true_contacts():
     run = pushed()
-    run.go(0.5)
+    run.advance(0.5)
     samples, origins, rotations = frames_of(run)
     truth = run.sim.true_state().contacts
-    message = samples.others[keys.CONTACTS]
+    message = samples.by_key[keys.CONTACTS]
     assert isinstance(message, Contacts)
     assert message.contacts
     for felt, true in zip(message.contacts, truth, strict=True):
@@ -73,19 +75,19 @@ def test_contacts_in_link_frames_are_the_true_contacts():
 
 def test_weak_touches_go_unfelt():
     run = pushed({"contacts": {"rate_hz": 1000.0, "threshold_n": 100.0}})
-    run.go(0.5)
+    run.advance(0.5)
     assert run.sim.true_state().contacts
-    assert run.sensed(Contacts).contacts == []
+    assert run.sample_only_sensor(Contacts).contacts == []
 
 
 def test_imu_on_spinning_snake_measures_centripetal_acceleration():
-    run = Run(make_config(scene={"ground": {"friction": 0.0}}))
+    run = SimulatorRig(make_config(scene={"ground": {"friction": 0.0}}))
     spin, middle = 2.0, 13 * 0.11 / 2
     run.sim.data.qvel[5] = spin
     run.sim.data.qvel[1] = -spin * middle  # about its center
     run.command(Mode.POSITION)
-    run.go(0.02)
-    imu = run.sensed(Imu)
+    run.advance(0.02)
+    imu = run.sample_only_sensor(Imu)
     lengths = np.array(run.config.robot.link_lengths_m)
     centers = np.cumsum(lengths) - lengths / 2
     assert np.array(imu.angular_velocity_rad_s)[:, 2] == pytest.approx(spin, rel=0.01)
@@ -93,12 +95,12 @@ def test_imu_on_spinning_snake_measures_centripetal_acceleration():
 
 
 def test_pose_velocity_is_the_derivative_of_pose():
-    run = Run(make_config(scene={"ground": {"friction": 0.0}}, rate_hz=1000))
+    run = SimulatorRig(make_config(scene={"ground": {"friction": 0.0}}, rate_hz=1000))
     run.sim.data.qvel[:6] = [0.3, -0.2, 0.0, 0.0, 0.0, 1.5]
-    run.go(0.3)
-    before = run.sensed(Pose)
-    run.go()
-    after = run.sensed(Pose)
+    run.advance(0.3)
+    before = run.sample_only_sensor(Pose)
+    run.advance()
+    after = run.sample_only_sensor(Pose)
     change = (np.array(after.position_w) - before.position_w) / 1e-3
     assert after.velocity_w == pytest.approx(change, abs=5e-3)
     turned = rotation_from_quaternion(after.orientation_wxyz) @ rotation_from_quaternion(before.orientation_wxyz).T
@@ -114,23 +116,23 @@ def test_noise_has_the_deviations_of_the_robot_file():
     }
     quiet, noisy = pushed(), pushed(sensors)
     for run in (quiet, noisy):
-        run.go(0.5)
+        run.advance(0.5)
     errors: dict[tuple[str, float], list[np.ndarray]] = {}
     plain = quiet.sample()
-    contact = plain.others[keys.CONTACTS].contacts[0]  # pyright: ignore[reportAttributeAccessIssue]
-    orientation = rotation_from_quaternion(plain.others[keys.POSE].orientation_wxyz)  # pyright: ignore[reportAttributeAccessIssue]
+    contact = plain.by_key[keys.CONTACTS].contacts[0]  # pyright: ignore[reportAttributeAccessIssue]
+    orientation = rotation_from_quaternion(plain.by_key[keys.POSE].orientation_wxyz)  # pyright: ignore[reportAttributeAccessIssue]
     for _ in range(1000):
         sample = noisy.sample()
-        imu, pose, touches = (sample.others[key] for key in (keys.IMU, keys.POSE, keys.CONTACTS))
+        imu, pose, touches = (sample.by_key[key] for key in (keys.IMU, keys.POSE, keys.CONTACTS))
         turn = rotation_from_quaternion(pose.orientation_wxyz) @ orientation.T  # pyright: ignore[reportAttributeAccessIssue]
         felt = touches.contacts[0]  # pyright: ignore[reportAttributeAccessIssue]
         for name, sigma, got, true in (
             ("angle", 0.01, sample.joints.angle_rad, plain.joints.angle_rad),
             ("velocity", 0.2, sample.joints.velocity_rad_s, plain.joints.velocity_rad_s),
             ("torque", 0.5, sample.joints.torque_nm, plain.joints.torque_nm),
-            ("gyro", 0.03, imu.angular_velocity_rad_s, plain.others[keys.IMU].angular_velocity_rad_s),  # pyright: ignore[reportAttributeAccessIssue]
-            ("accelerometer", 0.4, imu.acceleration_m_s2, plain.others[keys.IMU].acceleration_m_s2),  # pyright: ignore[reportAttributeAccessIssue]
-            ("position", 0.002, pose.position_w, plain.others[keys.POSE].position_w),  # pyright: ignore[reportAttributeAccessIssue]
+            ("gyro", 0.03, imu.angular_velocity_rad_s, plain.by_key[keys.IMU].angular_velocity_rad_s),  # pyright: ignore[reportAttributeAccessIssue]
+            ("accelerometer", 0.4, imu.acceleration_m_s2, plain.by_key[keys.IMU].acceleration_m_s2),  # pyright: ignore[reportAttributeAccessIssue]
+            ("position", 0.002, pose.position_w, plain.by_key[keys.POSE].position_w),  # pyright: ignore[reportAttributeAccessIssue]
             ("attitude", 0.01, [turn[2, 1], turn[0, 2], turn[1, 0]], [0.0, 0.0, 0.0]),
             ("contact position", 0.003, felt.position_l, contact.position_l),
             ("contact force", 0.7, felt.force_l, contact.force_l),
@@ -153,12 +155,14 @@ def test_noise_has_the_deviations_of_the_robot_file():
     ],
 )
 def test_sensor_is_due_after_each_of_its_periods(tick_hz, sensor_hz, due):
-    run = Run(make_config({"chain": {"modules": 1}, "sensors": {"pose": {"rate_hz": sensor_hz}}}, rate_hz=tick_hz))
+    run = SimulatorRig(
+        make_config({"chain": {"modules": 1}, "sensors": {"pose": {"rate_hz": sensor_hz}}}, rate_hz=tick_hz)
+    )
     ticks = []
     for _ in range(due[-1] + 1):
-        if keys.POSE in run.sample().others:
+        if keys.POSE in run.sample().by_key:
             ticks.append(run.tick)
-        run.go()
+        run.advance()
     assert ticks == due
 
 
@@ -183,8 +187,8 @@ def test_sensor_delayed_joint_states_are_those_of_earlier_ticks():
         assert joints.timestamp_ns == tick * PERIOD_NS
         assert joints.age_ns == [(tick - captured_tick) * PERIOD_NS] * 6
         assert joints.angle_rad == history[captured_tick].angle_rad
-        delayed.go()
-        prompt.go()
+        delayed.advance()
+        prompt.advance()
 
 
 def test_sensor_delayed_pose_is_that_of_earlier_tick_with_its_timestamp():
@@ -193,8 +197,8 @@ def test_sensor_delayed_pose_is_that_of_earlier_tick_with_its_timestamp():
     prompt = pushed()
     history = []
     for tick in range(12):
-        pose = delayed.sample().others.get(keys.POSE)
-        history.append(prompt.sample().others[keys.POSE])
+        pose = delayed.sample().by_key.get(keys.POSE)
+        history.append(prompt.sample().by_key[keys.POSE])
         captured_tick = tick - delay_ticks
         if captured_tick < 0:
             assert pose is None
@@ -205,5 +209,5 @@ def test_sensor_delayed_pose_is_that_of_earlier_tick_with_its_timestamp():
             assert pose.tick == tick
             assert pose.timestamp_ns == captured_tick * PERIOD_NS
             assert pose.position_w == captured.position_w
-        delayed.go()
-        prompt.go()
+        delayed.advance()
+        prompt.advance()

@@ -4,13 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.model.scenario import find_start_pose, load
+from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.scenario import compute_start_pose, load_scenario
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.laws.flat_ground import SINK_M
 from snakesim_sim_backend.model.ground import make_heights
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
-from snakesim_testing.sim.simulator_rig import Run, make_config
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 
 def uneven_of(config):
@@ -26,17 +26,17 @@ def deepest_m(run):
 def stays(run, seconds=1.0, within_m=2e-3):
     """Holding the angles of its start, the snake does not move any more."""
     start = run.sim.true_state()
-    run.command([Mode.POSITION] * run.count, find_start_pose(run.config).angles_rad.tolist())
-    run.go(seconds)
+    run.command([Mode.POSITION] * run.count, compute_start_pose(run.config).angles_rad.tolist())
+    run.advance(seconds)
     end = run.sim.true_state()
     assert np.linalg.norm(end.base_position_w - start.base_position_w) < within_m
     assert np.abs(end.velocities_rad_s).max() < 0.02
 
 
 def test_start_on_flat_ground_is_at_rest_at_time_zero():
-    config = load("triplet").config
-    run = Run(config)
-    state, pose = run.sim.true_state(), find_start_pose(config)
+    config = load_scenario("triplet").config
+    run = SimulatorRig(config)
+    state, pose = run.sim.true_state(), compute_start_pose(config)
     assert state.time_s == 0.0
     assert state.base_position_w == pytest.approx([*pose.position_w, config.robot.module.radius_m], abs=1.1 * SINK_M)
     assert state.angles_rad == pytest.approx(pose.angles_rad, abs=1e-3)
@@ -59,7 +59,7 @@ def test_start_hills_have_requested_height_and_repeat_for_seed():
 
 def test_the_height_field_is_where_the_heights_say():
     config = make_config(scene=HILLS)
-    run = Run(config, settle_s=0.0)
+    run = SimulatorRig(config, settle_s=0.0)
     heights = make_heights(uneven_of(config))
     grid = np.linspace(-3.0, 3.0, len(heights))
     hit = np.zeros(1, dtype=np.int32)
@@ -71,9 +71,9 @@ def test_the_height_field_is_where_the_heights_say():
 
 @pytest.mark.parametrize("robot", ["planar13", "mamba"])
 def test_on_uneven_ground_it_rests_where_it_was_put(robot):
-    run = Run(make_config(scene={**HILLS, **CURVE}, base_robot=robot, start={"on_route": True}))
+    run = SimulatorRig(make_config(scene={**HILLS, **CURVE}, base_robot=robot, start={"on_route": True}))
     assert deepest_m(run) < 2e-3
-    state, pose = run.sim.true_state(), find_start_pose(run.config)
+    state, pose = run.sim.true_state(), compute_start_pose(run.config)
     assert state.base_position_w[:2] == pytest.approx(pose.position_w, abs=0.05)
     assert not state.velocities_rad_s.any()
     stays(run, within_m=0.01)
@@ -82,11 +82,11 @@ def test_on_uneven_ground_it_rests_where_it_was_put(robot):
 
 def test_start_half_on_a_step_does_not_sink_in():
     step = {"step": [{"position_m": [1.2, 0.0], "size_m": [1.2, 1.0], "height_m": 0.06}]}
-    run = Run(make_config(scene={**step, **CURVE}, base_robot="mamba", start={"on_route": True}))
+    run = SimulatorRig(make_config(scene={**step, **CURVE}, base_robot="mamba", start={"on_route": True}))
     stays(run, within_m=0.01)
     assert deepest_m(run) < 2e-3
     state, robot = run.sim.true_state(), run.config.robot
-    origins, _ = link_frames(
+    origins, _ = compute_link_frames(
         state.base_position_w,
         rotation_from_quaternion(state.base_orientation_wxyz),
         state.angles_rad,
@@ -98,8 +98,8 @@ def test_start_half_on_a_step_does_not_sink_in():
 
 
 def test_alternating_axes_lie_stably_passive_and_held():
-    run = Run(make_config(base_robot="mamba"))
-    run.go(1.0)
+    run = SimulatorRig(make_config(base_robot="mamba"))
+    run.advance(1.0)
     state = run.sim.true_state()
     assert state.angles_rad == pytest.approx([0.0] * 18, abs=0.01)
     assert np.abs(state.velocities_rad_s).max() < 1e-2
@@ -108,6 +108,6 @@ def test_alternating_axes_lie_stably_passive_and_held():
 
 def test_a_long_and_a_short_robot_start_too():
     for modules in (1, 40):
-        run = Run(make_config({"chain": {"modules": modules}}))
-        run.go(0.05)
+        run = SimulatorRig(make_config({"chain": {"modules": modules}}))
+        run.advance(0.05)
         assert run.sim.true_state().base_position_w[2] == pytest.approx(0.04, abs=1e-3)

@@ -5,7 +5,7 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from snakesim_testing.messages import raises_error
-from snakesim_testing.sim.simulator_rig import Run, make_config, open_sim
+from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config, open_sim
 
 ICE = {"ground": {"friction": 0.0}}
 BACKWARD = {"link": 0, "point_m": 0.0, "direction_w": [-1.0, 0.0]}
@@ -13,7 +13,7 @@ BACKWARD = {"link": 0, "point_m": 0.0, "direction_w": [-1.0, 0.0]}
 
 def pulled(force, tether=BACKWARD):
     """A stiff snake on ice that hangs on a rope, if on any, and is pulled at link 2."""
-    run = Run(make_config({"chain": {"modules": 4}}, ICE), tether=tether)
+    run = SimulatorRig(make_config({"chain": {"modules": 4}}, ICE), tether=tether)
     run.command(Mode.POSITION)
     run.sim.data.xfrc_applied[run.sim.sim.model.body("link_2").id, :3] = force
     return run
@@ -21,22 +21,22 @@ def pulled(force, tether=BACKWARD):
 
 def test_tether_tension_equals_the_pull():
     run = pulled([12.0, 0.0, 0.0])
-    run.go(1.0)
+    run.advance(1.0)
     assert run.sim.tether_tension_n == pytest.approx(12.0, rel=0.01)
     assert abs(run.sim.true_state().base_position_w[0]) < 1e-3
 
 
 def test_tether_does_not_hold_along_its_pull():
     run = pulled([-1.0, 0.0, 0.0])
-    run.go(1.0)
+    run.advance(1.0)
     assert run.sim.tether_tension_n == pytest.approx(0.0, abs=1e-9)
     assert run.sim.true_state().base_position_w[0] == pytest.approx(-0.5 * 1.0 / 1.2, rel=0.05)
 
 
 def test_tether_hardly_holds_sideways_and_has_tension_only_if_present():
     run, free = pulled([0.0, 0.5, 0.0]), pulled([0.0, 0.5, 0.0], tether=None)
-    run.go(0.5)
-    free.go(0.5)
+    run.advance(0.5)
+    free.advance(0.5)
     assert run.sim.tether_tension_n == pytest.approx(0.0, abs=0.1)
     assert free.sim.tether_tension_n is None
     moved = run.sim.true_state().base_position_w[1]
@@ -46,7 +46,7 @@ def test_tether_hardly_holds_sideways_and_has_tension_only_if_present():
 
 def test_tether_pulls_in_its_direction_from_any_point():
     run = pulled([0.0, -9.0, 0.0], {"link": 2, "point_m": 0.055, "direction_w": [0.0, 3.0]})
-    run.go(1.0)
+    run.advance(1.0)
     assert run.sim.tether_tension_n == pytest.approx(9.0, rel=0.01)
 
 

@@ -10,10 +10,10 @@ from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.batch.placed import place
+from snakesim_sim_backend.batch.placed import create_settled_robot
 from snakesim_sim_backend.laws.version import LawsVersion, choose_laws
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_sim_backend.state.contacts import TouchReader
+from snakesim_sim_backend.state.contacts import ObstacleContactReader
 from snakesim_testing.sim.simulator_rig import make_config
 
 STEPS = 300
@@ -34,17 +34,17 @@ needs_c = pytest.mark.skipif(choose_laws() == "python", reason="there is no C ve
 @needs_c
 @pytest.mark.parametrize("name", SCENES)
 def test_the_state_has_the_forces_that_python_reads(name: str) -> None:
-    placed = place(make_config(scene={"name": "test", **SCENES[name]}))
+    placed = create_settled_robot(make_config(scene={"name": "test", **SCENES[name]}))
     random = np.random.default_rng(1)
     joints = placed.motors.count
     limits_nm = [joint.limits.torque_nm for joint in placed.config.robot.joint_table]
     touched = 0
     for step in range(STEPS):
         if step % 30 == 0:
-            placed.motors.drive([Mode.POSITION] * joints, random.uniform(-1.2, 1.2, joints).tolist(), limits_nm)
+            placed.motors.set_inputs([Mode.POSITION] * joints, random.uniform(-1.2, 1.2, joints).tolist(), limits_nm)
         placed.physics.step(1)
-        expected = [[touch.link, *touch.force_w] for touch in placed.touches.read()]
-        assert placed.read_touches() == expected
+        expected = [[touch.link, *touch.force_w] for touch in placed.contact_reader.read()]
+        assert placed.read_obstacle_contacts() == expected
         touched += len(expected)
     assert touched > 20
 
@@ -56,8 +56,8 @@ class MeasuringRobot:
         config = make_config(scene={"name": "test", **scene})
         self.backend = SimBackend(config, SimSettings(timestep_s=step_s), laws=laws)
         self.step_s: float = self.backend.sim.model.opt.timestep
-        self.touches = TouchReader(self.backend.sim, self.backend.data, self.backend.physics.contacts)
-        self.measured_force = self.backend.physics.measure_force()
+        self.touches = ObstacleContactReader(self.backend.sim, self.backend.data, self.backend.physics.contacts)
+        self.measured_force = self.backend.physics.start_force_measurement()
         self._modes = [Mode.POSITION] * config.robot.chain.modules
         self._limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
         self._random = np.random.default_rng(1)
@@ -80,7 +80,7 @@ def test_measured_force_in_c_equals_that_in_python(name: str, step_s: float) -> 
     for number in range(3 * STEPS):
         robot.step(number)
         forces_n = robot.touches.sum_forces_n()
-        specification.add(forces_n)
+        specification.add_sample(forces_n)
         assert robot.measured_force.max_n == specification.max_n, f"step {number}"
         pair_counts.add(len(forces_n))
     assert {0, 1, 2} <= pair_counts
@@ -116,6 +116,6 @@ def test_computing_forces_again_adds_nothing_to_the_measured_force(laws: LawsVer
 
 @needs_c
 def test_force_cannot_be_measured_in_a_model_without_its_plugin() -> None:
-    placed = place(make_config(scene={"name": "test", **SCENES["rough and smooth pegs"]}))
+    placed = create_settled_robot(make_config(scene={"name": "test", **SCENES["rough and smooth pegs"]}))
     with pytest.raises(ValueError, match="measured_force"):
-        placed.physics.measure_force()
+        placed.physics.start_force_measurement()

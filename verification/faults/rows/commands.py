@@ -11,8 +11,8 @@ import msgspec
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, LeaseRequest
-from snakesim_testing.hal.authority_rig import ROBOT, armed
-from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, command
+from snakesim_testing.hal.authority_rig import ROBOT, make_armed_rig
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, make_joint_command
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import robot
 from verification.faults.row import Request, Trial
@@ -162,14 +162,14 @@ def interleaved(request: Request) -> Iterator[Trial]:
     )
 
 
-OWN, THEIRS = command(ROBOT, 0.1), command(ROBOT, 0.3)
+OWN, THEIRS = make_joint_command(ROBOT, 0.1), make_joint_command(ROBOT, 0.3)
 
 
 class TwoWriters:
     """A robot that the first writer has armed. The second asks for the lease, and commands with guessed epochs."""
 
     def __init__(self, rng: random.Random) -> None:
-        self.rng, self.rig, self.theirs = rng, armed(), FORGED
+        self.rng, self.rig, self.theirs = rng, make_armed_rig(), FORGED
         self.authority = self.rig.authority
         self.epoch, self.holder = self.authority.lease.epoch, self.authority.lease.holder
 
@@ -180,10 +180,10 @@ class TwoWriters:
         for move in self.rng.sample(moves, MOVES):
             self.rig.now_ns += self.rng.randrange(PERIOD_NS // 2)
             got += move()
-        decision = self.authority.decide()
-        self.authority.check_deadlines(self.rig.now_ns, self.rig.tick)
+        decision = self.authority.compute_setpoints()
+        self.authority.latch_faults_and_expire_lease(self.rig.now_ns, self.rig.tick)
         stopped = self.authority.state != "armed"
-        return got + (decision.sequence is not None and decision.sequence >= FORGED) + stopped
+        return got + (decision.command_sequence is not None and decision.command_sequence >= FORGED) + stopped
 
     def first(self) -> bool:
         """The first commands, with its own epoch."""
@@ -205,7 +205,7 @@ class TwoWriters:
             epoch=self.epoch,
             priority=self.rng.randrange(101),
         )
-        answer = self.authority.on_lease(lease_request, self.rig.now_ns)
+        answer = self.authority.handle_lease_request(lease_request, self.rig.now_ns)
         return answer.ok or self.authority.lease.holder != self.holder
 
     def ends(self) -> bool:
@@ -219,6 +219,6 @@ class TwoWriters:
         started_robot = msgspec.structs.replace(
             command, sequence=sequence, tick=tick, lease_epoch=epoch, arm_session=arm_session
         )
-        return self.authority.offer_command(
+        return self.authority.process_command(
             started_robot, now_ns=now_ns, tick=tick, age_ns=self.rng.randrange(LEASE_NS)
         )

@@ -15,7 +15,7 @@ from typing import Any
 
 from snakesim_hal.model.fault_kinds import Injection
 from snakesim_hal.model.scenario import RunConfig, write_config
-from snakesim_hal.programs.preflight import check_plugins
+from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_operator.run import children
 from snakesim_testing.harness.wait import wait_until
 from verification.faults.drives_process import READY
@@ -38,6 +38,7 @@ BUSES: dict[str, dict[str, Any]] = {
     "can": {"backend__channels": [BUS]},
     "odrive": {"backend__channels": [BUS]},
     "moteus": {"backend__channels": [BUS]},
+    "cia402": {"backend__channels": [BUS]},
     "dynamixel": {"backend__ports": [SERVOS]},
     "mixed": {"backends__odrive__channels": [BUS], "backends__dynamixel__ports": [SERVOS]},
 }
@@ -46,8 +47,15 @@ WATCHDOGS = ("drive_fault", "module_watchdog")
 
 def robot_of(backend: str, **dotted: Any) -> RunConfig:
     """The triplet with drives of one type, or of several."""
-    body = {"robot": "planar13_mixed"} if backend == "mixed" else {}
-    return configuration(backend, rate_hz=RATE_HZ, **body, **dotted)
+    changes: dict[str, Any] = {}
+    match backend:
+        case "mixed":
+            changes["robot"] = "planar13_mixed"
+        case "feetech":  # These servos have no torque mode.
+            changes["controller"] = "lateral_undulation"
+        case _:
+            pass
+    return configuration(backend, rate_hz=RATE_HZ, **changes, **dotted)
 
 
 # --- the host's process is frozen ------------------------------------------------------------------------------
@@ -86,7 +94,7 @@ class DrivesOutside:
 
     def close(self) -> None:
         """End it."""
-        children.stop_all([self._child])
+        children.stop_children([self._child])
 
 
 def host_frozen(request: Request) -> Iterator[Trial]:
@@ -98,7 +106,10 @@ def host_frozen(request: Request) -> Iterator[Trial]:
         contextlib.chdir(request.folder),
         (request.folder / "drives.log").open("ab", buffering=0) as log,
         contextlib.closing(DrivesOutside(request.folder, config, log)) as drives,
-        robot(request, check_plugins(config)) as (started_robot, observer),  # once the servos' port is there
+        robot(request, validate_and_complete_config(config)) as (
+            started_robot,
+            observer,
+        ),  # once the servos' port is there
     ):
         for _ in range(request.trials):
             _set_in_motion(request, started_robot, observer, lambda: all(drives.enabled()))
@@ -178,7 +189,7 @@ def at_host(kind: str, expected: dict[str, Sequence[str]], request: Request) -> 
     rng = random.Random(9)
     config = robot_of(request.backend, robot__heat__time_constant_s=COOLS_IN_S)
     what = expected.get(request.backend, expected["others"])
-    with robot(request, check_plugins(config)) as (started_robot, observer):  # as `snakesim run` does
+    with robot(request, validate_and_complete_config(config)) as (started_robot, observer):  # as `snakesim run` does
         joints = len(observer.description().joints)
         for _ in range(request.trials):
             _set_in_motion(request, started_robot, observer)

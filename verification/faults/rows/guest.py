@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, parse_node
-from snakesim_hal.model.scenario import Override, load
+from snakesim_hal.model.scenario import Override, load_scenario
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.programs import host_program as host_process
 from snakesim_testing.can.listened_bus import (
@@ -32,7 +32,7 @@ from snakesim_testing.can.listened_bus import (
     stop_commands,
 )
 from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
-from snakesim_testing.hal.small_robots import write_files
+from snakesim_testing.hal.small_robots import write_scenario_files
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import START_LIMIT_S, Robot, robot
 from verification.faults.row import Request, Trial
@@ -161,7 +161,7 @@ def watchdog(request: Request) -> Iterator[Trial]:
         now_us = BOOTED
         for count in range(rng.randrange(5, 40)):
             now_us += 10 * MS
-            module.sync(count, QUIET)
+            module.handle_sync(count, QUIET)
             module.poll(now_us)
             module.receive_setpoint(setpoint(count), now_us)
         assert module.state == ModuleState.ARMED, module.state
@@ -175,9 +175,11 @@ def watchdog(request: Request) -> Iterator[Trial]:
 
 def clock_step(request: Request) -> Iterator[Trial]:
     """An hour ahead, then an hour back, while a robot moves at 25 Hz. The value: faults and stops."""
-    scenario = write_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
+    scenario = write_scenario_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
     settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
-    config = load(scenario, [Override(key, value, "the fault table") for key, value in settings.items()]).config
+    config = load_scenario(
+        scenario, [Override(key, value, "the fault table") for key, value in settings.items()]
+    ).config
     with robot(request, config) as (started_robot, observer):
         for number in range(request.trials):
             trial = Trial(value=None)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 from snakesim_can_backend.protocol.definitions import CommandAction
-from snakesim_hal.model.fault_kinds import Injection, check_injection
+from snakesim_hal.model.fault_kinds import Injection, validate_and_complete_injection
 from snakesim_hal.wire.messages import Answer, Status
 from verification.faults import bus_log
 from verification.faults.observer import Observer, TrialError
@@ -48,7 +48,7 @@ def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
 
 def injected(observer: Observer, injection: Injection, what: Sequence[str], period_ms: float) -> Trial:
     """Inject a fault once, and return the trial. what: names that the driver may give it; period_ms: of the host."""
-    injection, requested_ns = check_injection(injection), time.monotonic_ns()
+    injection, requested_ns = validate_and_complete_injection(injection), time.monotonic_ns()
     answer = observer.inject("hal", injection.kind, injection.target, for_s=FAULT_DURATION_S)
     begun = _begun_tick(answer, period_ms)
     status = observer.first_fault(requested_ns)
@@ -82,7 +82,7 @@ def _objections(observer: Observer, injection: Injection, what: Sequence[str], r
     if observer.state() != "fault":
         failures.append(f"not latched: {observer.in_words()}")
     joints = observer.joints[max(observer.joints)]
-    aside = {injection.number} if injection.target_type == "joint" else set[int]()
+    aside = {injection.target_index} if injection.target_type == "joint" else set[int]()
     torques = [
         abs(torque)
         for i, (torque, valid) in enumerate(zip(joints.torque_nm, joints.valid, strict=True))

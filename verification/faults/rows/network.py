@@ -117,7 +117,7 @@ def _far_side() -> Iterator[Path]:
         _ip("link", "add", "ours", "type", "veth", "peer", "name", "theirs", "netns", far.pid)
         _ip("address", "add", f"{OURS}/24", "dev", "ours")
         _ip("link", "set", "ours", "up")
-        far.address("theirs", f"{THEIRS}/24")
+        far.set_address("theirs", f"{THEIRS}/24")
         yield Path(f"/proc/{far.pid}/ns/net")
 
 

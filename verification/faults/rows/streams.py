@@ -37,7 +37,7 @@ def no_joints(request: Request) -> Iterator[Trial]:
 def withheld(key: str, request: Request) -> Iterator[Trial]:
     """The value: from the request to the injector to the last setpoints with which a joint pushed."""
     with robot(request, **ALONG_PEGS) as (started_robot, observer):
-        states = observer.session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
+        states = observer.session.declare_reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
         back_ms: list[float] = []
         for _ in range(request.trials):
             _pushing(started_robot, observer)

@@ -2,7 +2,15 @@
 
 from verification.faults.row import DRIVE_TYPES, Heading, Row
 from verification.faults.rows import drives, modules
-from verification.faults.table.row_kinds import NO_BUS, bus_row, drive_row, isolated_row, joint_row, sensor_row
+from verification.faults.table.row_kinds import (
+    NO_BUS,
+    NO_WATCHDOG,
+    bus_row,
+    drive_row,
+    isolated_row,
+    joint_row,
+    sensor_row,
+)
 
 DRIVE_FAILS = Heading(
     fault="drives of every type: host frozen for 1 s; a drive silent, restarted, too hot; the bus lost",
@@ -17,7 +25,7 @@ DRIVE_FAILS = Heading(
             deadline=f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before reset and arming",
             limit=0.0,
             unit="drives enabled again",
-            measures=dict.fromkeys(DRIVE_TYPES, drives.host_frozen),
+            measures={**dict.fromkeys(DRIVE_TYPES, drives.host_frozen), "feetech": NO_WATCHDOG},
             environment="namespaces",
         ),
         drive_row(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
-from snakesim_hal.model.fault_kinds import KINDS
+from snakesim_hal.model.fault_kinds import FAULT_KINDS
 from verification.faults.row import DRIVE_TYPES, Backend, Environment, Measure, Row
 from verification.faults.rows import attacks, drives, guest, isolation, modules, streams
 
@@ -26,6 +26,7 @@ FRAMES_THROUGH = "messages got through"
 # Why a row does not apply to the simulator.
 NO_BUS = "a simulator has no bus"
 NO_MODULES = "a simulator has no modules; what its sensors can do is in the rows by a whole robot"
+NO_WATCHDOG = "these servos have no watchdog: they hold their last angle until the driver runs again"
 NO_MODULES_LEFT = "the simulator is in the host's process: without a host nothing is there that could move"
 
 
@@ -86,7 +87,7 @@ def joint_row(name: str, kind: str, fault_name: str) -> Row:
     """Return a row about a joint module on CAN. fault_name: what the driver reports."""
     return Row(
         name=name,
-        fault=f"a joint module: {KINDS['joint'][kind].description}",
+        fault=f"a joint module: {FAULT_KINDS['joint'][kind].description}",
         expected=NAMES_JOINT,
         deadline="50 ms from right after the module's last good answer to the stop mode on the bus",
         limit=50.0,

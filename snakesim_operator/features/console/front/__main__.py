@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from snakesim_hal.base.process import die_with_parent, on_stop_signal, raise_open_files
+from snakesim_hal.base.process import call_on_stop_signals, raise_open_file_limit, set_parent_death_signal
 from snakesim_hal.base.terminal import print_line, run_tool
-from snakesim_hal.base.workers import start_worker
+from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.programs.arguments import add_network, add_parent, read_session_option
+from snakesim_hal.programs.arguments import add_network_arguments, add_parent, read_session_option
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_operator.base.console_port import TOKEN_VARIABLE
 from snakesim_operator.base.robot_selection import RobotSelection
@@ -34,15 +34,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--browsers", type=int, required=True, help="inherited descriptor of the listening socket")
     parser.add_argument("--pages", type=Path, required=True, help="Unix socket of the page server")
     parser.add_argument("--recording", action="store_true", help="there is no robot that can be stopped")
-    add_network(parser, "")
+    add_network_arguments(parser, "")
     add_parent(parser)
     return run_tool("snakesim console", partial(_run, parser.parse_args(argv)))
 
 
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.parent is not None:
-        die_with_parent(arguments.parent)
-    raise_open_files(MAX_OPEN_FILES)
+        set_parent_death_signal(arguments.parent)
+    raise_open_file_limit(MAX_OPEN_FILES)
     stop = None if arguments.recording else _prepare_stop(arguments)
     listening = socket.socket(fileno=arguments.browsers)
     server = FrontServer(listening, arguments.pages, os.environ[TOKEN_VARIABLE], stop, print_line)
@@ -57,7 +57,7 @@ async def _serve_until_signal(server: FrontServer) -> None:
     def end() -> None:
         loop.call_soon_threadsafe(ended.set)
 
-    on_stop_signal(end)
+    call_on_stop_signals(end)
     await server.run(ended)
 
 
@@ -70,14 +70,14 @@ def _prepare_stop(arguments: argparse.Namespace) -> PreparedStop:
         link = Link(arguments.router or arguments.endpoint or DEFAULT_ENDPOINT, arguments.namespace)
     selection = RobotSelection(link.endpoint, link.namespace, link.session)
     stop = PreparedStop(selection, link, lambda requester, result: print_line(f"{requester}: {result}"))
-    start_worker("stop session", partial(_keep_session, stop, link))
+    start_restarting_thread("stop session", partial(_keep_session, stop, link))
     return stop
 
 
 def _keep_session(stop: PreparedStop, link: Link) -> None:
     """Give the stop a network session, for as long as this process lives."""
     with open_session(link, SERVICE_START_LIMIT_S) as session:
-        stop.connect(session)
+        stop.use_session(session)
         threading.Event().wait()
 
 

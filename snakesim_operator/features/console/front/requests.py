@@ -4,7 +4,7 @@ import asyncio
 import secrets
 from dataclasses import dataclass
 
-from snakesim_operator.base.page_origin import explain_head_refusal
+from snakesim_operator.base.page_origin import explain_request_refusal
 
 MAX_HEAD_BYTES = 16 * 1024  # far above what a browser sends
 END_OF_HEAD = b"\r\n\r\n"
@@ -37,16 +37,16 @@ async def read_head(reader: asyncio.StreamReader, limit_s: float) -> bytes:
     """Return the head of the next request, with the empty line at its end.
 
     Raises:
-        TimeoutError: It did not arrive in time.
+        TimeoutError: The head did not arrive in time.
         IncompleteReadError: The client closed its connection.
-        LimitOverrunError: It is too long.
+        LimitOverrunError: The head is too long.
     """
     async with asyncio.timeout(limit_s):
         return await reader.readuntil(END_OF_HEAD)
 
 
-def check_head(head: bytes, token: str) -> FrontRequest | BadRequest:
-    """Check origin and token of an HTTP request, and remove the token from its path.
+def parse_and_authorize_head(head: bytes, token: str) -> FrontRequest | BadRequest:
+    """Parse the head of an HTTP request, check its origin and token, and remove the token from its path.
 
     Pages of other origins do not know the token. They are refused by their origin all the same, so that a token which
     became known, from a picture of a screen for example, does not help them.
@@ -56,29 +56,29 @@ def check_head(head: bytes, token: str) -> FrontRequest | BadRequest:
         token: The token of this console, which is the first part of the path.
 
     Returns:
-        The request for the page server, or why it is refused.
+        The request for the page server; a `BadRequest` with status and reason if the request is refused.
     """
     head_lines = head.removesuffix(END_OF_HEAD)
     request_line, _, header_lines = head_lines.partition(b"\r\n")
-    parts = request_line.decode("latin-1").split(" ")
-    if len(parts) != 3:
+    request_line_parts = request_line.decode("latin-1").split(" ")
+    if len(request_line_parts) != 3:
         return BadRequest(400, "no HTTP", "the first line of the request is not one of HTTP")
-    refusal = explain_head_refusal(head_lines)
+    refusal = explain_request_refusal(head_lines)
     if refusal is not None:
         return BadRequest(403, "another origin", refusal)
-    method, target, version = parts
+    method, target, version = request_line_parts
     _, _, token_and_rest = target.partition("/")
     # The token ends at a slash, at a question mark, or at the end.
     token_length = min((token_and_rest + "/").index("/"), (token_and_rest + "?").index("?"))
     requested_token = token_and_rest[:token_length]
     if not secrets.compare_digest(requested_token.encode(), token.encode()):
         return BadRequest(403, "wrong token", WRONG_TOKEN)
-    rest = token_and_rest[token_length:]
-    target_without_token = rest if rest.startswith("/") else f"/{rest}"
+    path_and_query = token_and_rest[token_length:]
+    target_without_token = path_and_query if path_and_query.startswith("/") else f"/{path_and_query}"
     new_request_line = f"{method} {target_without_token} {version}".encode("latin-1")
     return FrontRequest(
         method=method,
-        path=rest.partition("?")[0],
+        path=path_and_query.partition("?")[0],
         head=b"\r\n".join((new_request_line, header_lines)) + END_OF_HEAD,
         is_websocket=b"\r\nupgrade:" in head.lower(),
     )

@@ -34,14 +34,14 @@ class WaitingConnections:
         """Add a connection, and close the oldest one if there are too many."""
         self._since_s[connection] = asyncio.get_running_loop().time()
         if len(self._since_s) > self._max_connections:
-            self._abort(next(iter(self._since_s)))
+            self._abort_connection(next(iter(self._since_s)))
 
     def remove(self, connection: "WaitingConnection") -> None:
         """Forget a connection that was closed."""
         self._since_s.pop(connection, None)
 
     def finish(self, connection: "WaitingConnection", head: bytes, rest: bytes) -> None:
-        """Pass on a connection whose request is complete. rest: what has arrived after its head."""
+        """Pass on a connection whose request is complete. `rest` are the bytes after its head."""
         self.remove(connection)
         reader = asyncio.StreamReader(limit=MAX_HEAD_BYTES)
         protocol = asyncio.StreamReaderProtocol(reader)
@@ -55,9 +55,9 @@ class WaitingConnections:
         """Close the connections that have waited for longer."""
         before_s = asyncio.get_running_loop().time() - age_s
         for connection in [connection for connection, since_s in self._since_s.items() if since_s < before_s]:
-            self._abort(connection)
+            self._abort_connection(connection)
 
-    def _abort(self, connection: "WaitingConnection") -> None:
+    def _abort_connection(self, connection: "WaitingConnection") -> None:
         self.remove(connection)
         connection.transport.abort()
 

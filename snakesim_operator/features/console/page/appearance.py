@@ -22,14 +22,14 @@ def set_appearance(gui: viser.GuiApi, *, dark: bool) -> None:
 
 
 def add_appearance(client: viser.ClientHandle, admission: Admission, *, dark: bool) -> None:
-    """Add a checkbox with which a viewer chooses a dark page. dark: what the browser prefers, until then."""
+    """Add a checkbox with which a viewer chooses a dark page; `dark` is the browser's preference, set at first."""
     checkbox = client.gui.add_checkbox("Dark page", initial_value=dark, order=2.5)
-    admission.admit(checkbox, client.client_id)
+    admission.admit_control(checkbox, client.client_id)
     checkbox.on_update(lambda _: set_appearance(client.gui, dark=checkbox.value))
     set_appearance(client.gui, dark=dark)
 
 
-def choose_view(robot: Description, *, narrow: bool) -> tuple[Vector, Vector]:
+def choose_camera_pose(robot: Description, *, narrow: bool) -> tuple[Vector, Vector]:
     """Return a camera position, and the point that it looks at, from which the whole body is in view.
 
     Args:
@@ -54,7 +54,7 @@ def choose_view(robot: Description, *, narrow: bool) -> tuple[Vector, Vector]:
 def aim_initial_camera(server: viser.ViserServer, robot: Description) -> None:
     """Set the camera with which pages begin, so that the whole robot is in view."""
     camera = server.initial_camera
-    camera.position, camera.look_at = choose_view(robot, narrow=False)
+    camera.position, camera.look_at = choose_camera_pose(robot, narrow=False)
     camera.fov = CAMERA_FOV_RAD
 
 
@@ -62,4 +62,4 @@ def aim_phone_camera(client: viser.ClientHandle, robot: Description) -> None:
     """Aim the camera of a phone; other screens use the initial camera."""
     camera = client.camera
     if camera.image_width < camera.image_height:
-        camera.position, camera.look_at = choose_view(robot, narrow=True)
+        camera.position, camera.look_at = choose_camera_pose(robot, narrow=True)

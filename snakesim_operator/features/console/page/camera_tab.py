@@ -17,10 +17,10 @@ def draw_picture(image: DepthImage | ColorImage) -> Picture:
     """Return an image as colors that a page can show."""
     if isinstance(image, ColorImage):
         return np.frombuffer(image.rgb, np.uint8).reshape(image.height, image.width, 3)
-    return _color_depth(image)
+    return _colorize_depth(image)
 
 
-def _color_depth(image: DepthImage) -> Picture:
+def _colorize_depth(image: DepthImage) -> Picture:
     """Return a depth image with a color for each distance."""
     depth_m = np.frombuffer(image.depth, "<u2").reshape(image.height, image.width) * image.scale_m
     fraction = (depth_m - image.range_min_m) / (image.range_max_m - image.range_min_m)

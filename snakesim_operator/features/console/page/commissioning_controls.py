@@ -7,7 +7,7 @@ import viser
 
 from snakesim_hal.wire.quantities import MAX_JOINTS
 from snakesim_operator.features.console.joint_step import BACKWARDS, ENTER, FORWARDS
-from snakesim_operator.features.console.page.commissioning_tab import STEPS, Commissioning
+from snakesim_operator.features.console.page.commissioning_tab import DESCRIPTION_BY_STEP, CommissioningTab
 from snakesim_operator.features.console.page.page_html import escape_text
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import PageAction
@@ -22,7 +22,7 @@ class CommissioningControls:
         self,
         client: viser.ClientHandle,
         tab: viser.GuiFolderHandle,
-        commissioning: Commissioning,
+        commissioning: CommissioningTab,
         admission: Admission,
         is_in_control: Callable[[], bool],
         run_operation: Callable[[str, Callable[[], str]], object],
@@ -32,9 +32,9 @@ class CommissioningControls:
 
         Args:
             client: The viewer's page.
-            tab: The place of the controls.
+            tab: Folder of the page in which the controls are put.
             commissioning: Runs the step.
-            admission: Decides which messages of the page count.
+            admission: Filter that decides which messages of the page count.
             is_in_control: Returns whether this viewer has control.
             run_operation: Runs an operation, and shows its title and its result to the viewer.
             on_late_press: Called with the age of a press that was too old.
@@ -48,43 +48,45 @@ class CommissioningControls:
         with self._folder:
             self._add_controls(client.gui)
         self._admit_controls(admission, on_late_press)
-        self._verb.on_update(lambda _: self._show_chosen_step())
-        self._start_button.on_click(lambda _: self._start())
-        self._enter.on_click(lambda _: commissioning.press_key(self._viewer, ENTER))
-        self._end_button.on_click(lambda _: self._end())
+        self._step_dropdown.on_update(lambda _: self._show_chosen_step())
+        self._start_button.on_click(lambda _: self._start_step())
+        self._enter_button.on_click(lambda _: commissioning.press_key(self._viewer, ENTER))
+        self._end_button.on_click(lambda _: self._end_step())
         self._show_chosen_step()
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
-        self._verb = gui.add_dropdown("Step", tuple(STEPS), initial_value="direction")
+        self._step_dropdown = gui.add_dropdown("Step", tuple(DESCRIPTION_BY_STEP), initial_value="direction")
         self._description = gui.add_html("")
-        self._joint = gui.add_number("Joint (0: all)", 0, min=0, max=MAX_JOINTS, step=1)
+        self._joint_input = gui.add_number("Joint (0: all)", 0, min=0, max=MAX_JOINTS, step=1)
         # Limits of a jog.
         self._speed_rad_s = gui.add_slider("Speed, rad/s", 0.01, 0.5, 0.01, 0.1)
         self._travel_rad = gui.add_slider("Travel, rad", 0.05, 3.2, 0.05, 0.2)
         self._torque_fraction = gui.add_slider("Share of torque", 0.05, 1.0, 0.05, 0.3)
         # Buttons.
         self._start_button = gui.add_button("Start step", color="blue")
-        self._enter = gui.add_button("Enter")
-        self._forwards = gui.add_button("Hold: forwards (+)", color="green")
-        self._backwards = gui.add_button("Hold: backwards (-)", color="green")
+        self._enter_button = gui.add_button("Enter")
+        self._forwards_button = gui.add_button("Hold: forwards (+)", color="green")
+        self._backwards_button = gui.add_button("Hold: backwards (-)", color="green")
         self._end_button = gui.add_button("End step", color="gray")
 
     def _admit_controls(self, admission: Admission, on_late_press: Callable[[float], None]) -> None:
         """Let this viewer's page use the controls. A step ends at any age of the press; other presses may not be old.
 
         Args:
-            admission: Decides which messages of the page count.
+            admission: Filter that decides which messages of the page count.
             on_late_press: Called with the age of a press that was too old.
         """
-        jog_limits = (self._speed_rad_s, self._travel_rad, self._torque_fraction)
-        for control in (self._verb, self._joint, *jog_limits, self._end_button):
-            admission.admit(control, self._viewer, self._is_in_control)
-        for button in (self._start_button, self._enter):
-            admission.admit(button, self._viewer, self._is_in_control, max_age_s=MAX_PRESS_AGE_S, on_late=on_late_press)
-        for button, key in ((self._forwards, FORWARDS), (self._backwards, BACKWARDS)):
+        jog_inputs = (self._speed_rad_s, self._travel_rad, self._torque_fraction)
+        for control in (self._step_dropdown, self._joint_input, *jog_inputs, self._end_button):
+            admission.admit_control(control, self._viewer, self._is_in_control)
+        for button in (self._start_button, self._enter_button):
+            admission.admit_control(
+                button, self._viewer, self._is_in_control, max_age_s=MAX_PRESS_AGE_S, on_late=on_late_press
+            )
+        for button, key in ((self._forwards_button, FORWARDS), (self._backwards_button, BACKWARDS)):
             # The page repeats that a button is held only if viser has a callback for it.
             button.on_hold(lambda _: None, callback_hz=HOLD_REPEAT_HZ)
-            admission.admit(
+            admission.admit_control(
                 button,
                 self._viewer,
                 self._is_in_control,
@@ -99,30 +101,33 @@ class CommissioningControls:
 
     def _show_chosen_step(self) -> None:
         """Describe the chosen step, and show only the inputs that it has."""
-        verb = self._verb.value
-        description = escape_text(STEPS[verb])
+        step_name = self._step_dropdown.value
+        description = escape_text(DESCRIPTION_BY_STEP[step_name])
         self._description.content = f"<div style='padding:.2em .6em;font-size:.85em'>{description}</div>"
-        self._joint.visible = verb != "zero"
-        self._enter.visible = verb != "jog"
+        self._joint_input.visible = step_name != "zero"
+        self._enter_button.visible = step_name != "jog"
         jog_limits = (self._speed_rad_s, self._travel_rad, self._torque_fraction)
-        for control in (*jog_limits, self._forwards, self._backwards):
-            control.visible = verb == "jog"
+        for control in (*jog_limits, self._forwards_button, self._backwards_button):
+            control.visible = step_name == "jog"
 
     def _on_jog_held(self, key: bytes, _viewer: int, _action: PageAction) -> None:
         """Send the step the key of a button that is held; admission has checked the message's age."""
         self._commissioning.press_key(self._viewer, key)
 
-    def _start(self) -> None:
-        verb = self._verb.value
-        joint = int(self._joint.value)
+    def _start_step(self) -> None:
+        step_name = self._step_dropdown.value
+        joint_number = int(self._joint_input.value)
+        joint_name = f"joint_{joint_number}" if joint_number else None  # 0: all joints
         options: list[str] = []
-        if verb == "jog":
+        if step_name == "jog":
             options += ["--joint-speed", f"{self._speed_rad_s.value:g}"]
             options += ["--travel", f"{self._travel_rad.value:g}"]
             options += ["--torque", f"{self._torque_fraction.value:g}"]
         if self._is_in_control():
-            self._run_operation("Joints", lambda: self._commissioning.start(self._viewer, verb, joint, options))
+            self._run_operation(
+                "Joints", lambda: self._commissioning.start_step(self._viewer, step_name, joint_name, options)
+            )
 
-    def _end(self) -> None:
+    def _end_step(self) -> None:
         if self._is_in_control():
-            self._commissioning.end()
+            self._commissioning.end_step()

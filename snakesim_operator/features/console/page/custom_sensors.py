@@ -13,7 +13,7 @@ from snakesim_operator.features.console.page.joint_charts import (
     HISTORY_S,
     MAX_SAMPLES,
     add_history_chart,
-    add_sample,
+    append_sample,
 )
 from snakesim_operator.features.console.page.page_html import escape_text, format_table
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
@@ -38,7 +38,7 @@ def collect_numbers(snapshot: RobotSnapshot) -> dict[Quantity, dict[str, float]]
         if sample is None:
             continue
         sensor = key.rpartition("/")[2]
-        for name, value in kind.numbers(sample).items():
+        for name, value in kind.extract_numeric_values(sample).items():
             field, dot, part = name.partition(".")
             quantity = Quantity(field, kind.units[field])
             numbers.setdefault(quantity, {})[f"{sensor}{dot}{part}"] = value
@@ -55,7 +55,7 @@ def format_sensor_table(snapshot: RobotSnapshot) -> str:
             continue
         message_type = escape_text(kind.message.__name__)
         rows.append((escape_text(key), f"{message_type} on link {sample.link}{_format_age(snapshot, key)}"))
-        for name, value in kind.numbers(sample).items():
+        for name, value in kind.extract_numeric_values(sample).items():
             rows.append((escape_text(name), _format_value(kind, name, value)))
     return format_table(rows)
 
@@ -97,7 +97,7 @@ class CustomSensorCharts:
             return
         for quantity, numbers in collect_numbers(snapshot).items():
             history = self._history.setdefault(quantity, deque(maxlen=MAX_SAMPLES))
-            add_sample(history, (time_s, numbers))
+            append_sample(history, (time_s, numbers))
 
     def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw the table and the charts; called a few times a second."""

@@ -12,14 +12,14 @@ from snakesim_operator.features.console.operations import BUTTON_VALIDITY_NS, KE
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, Admission
 from snakesim_operator.features.console.web.message_age import PageAction
-from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, rotate_heading
+from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, compute_limited_heading
 
 HOLD_REPEAT_HZ = 10.0  # how often a page repeats that the button is held
 MAX_SPEED_M_S = 0.5  # end of the speed slider
 SLIDER_STEP_DEG = 5  # of the heading slider
 
 DriveKey = Literal["I", "J", "K", "L"]
-DRIVE_KEYS: dict[str, DriveKey] = {  # viser uses the arrow keys to turn the view
+HOTKEY_BY_DRIVE_KEY: dict[str, DriveKey] = {  # viser uses the arrow keys to turn the view
     "Ahead": "I",
     "Backwards": "K",
     "Left": "J",
@@ -48,7 +48,7 @@ class DriveControls:
 
         Args:
             client: The viewer's page.
-            admission: Decides which messages of the page count.
+            admission: Filter that decides which messages of the page count.
             is_in_control: Returns whether this viewer has control.
             get_snapshot: Returns the newest snapshot; None while there is no robot.
             send_intent: Sends an intent to the robot.
@@ -61,16 +61,16 @@ class DriveControls:
         self._key_drive_time_s = -math.inf
         # The controls.
         gui = client.gui
-        self._heading_deg = gui.add_slider("Heading, °", -180, 180, SLIDER_STEP_DEG, 0)
-        self._speed_m_s = gui.add_slider("Speed, m/s", 0.0, MAX_SPEED_M_S, 0.01, 0.1)
-        self._button = gui.add_button(
+        self._heading_slider = gui.add_slider("Heading, °", -180, 180, SLIDER_STEP_DEG, 0)
+        self._speed_slider = gui.add_slider("Speed, m/s", 0.0, MAX_SPEED_M_S, 0.01, 0.1)
+        self._drive_button = gui.add_button(
             "Hold to drive  (keys I, K; turn: J, L)", icon=viser.Icon.STEERING_WHEEL, color="green"
         )
         viewer = client.client_id
-        admission.admit(self._heading_deg, viewer, is_in_control)
-        admission.admit(self._speed_m_s, viewer, is_in_control)
-        admission.admit(
-            self._button,
+        admission.admit_control(self._heading_slider, viewer, is_in_control)
+        admission.admit_control(self._speed_slider, viewer, is_in_control)
+        admission.admit_control(
+            self._drive_button,
             viewer,
             is_in_control,
             HOLD_REPEAT_HZ,
@@ -79,21 +79,21 @@ class DriveControls:
         )
         # The page repeats that the button is held only if viser has a callback for it. `_on_button_held` gets the
         # messages, and motion ends without them.
-        self._button.on_hold(lambda _: None, callback_hz=HOLD_REPEAT_HZ)
+        self._drive_button.on_hold(lambda _: None, callback_hz=HOLD_REPEAT_HZ)
 
     def set_visible(self, visible: bool) -> None:
         """Show or hide the controls."""
-        for control in (self._heading_deg, self._speed_m_s, self._button):
+        for control in (self._heading_slider, self._speed_slider, self._drive_button):
             control.visible = visible
 
     def steer_straight_on(self) -> None:
-        """Set the heading to the direction of the body, so that a robot that is driven next does not turn."""
+        """Set the heading slider to the direction of the body, so that a robot that is driven next does not turn."""
         yaw_w_rad = self._find_body_yaw_w_rad()
         if yaw_w_rad is not None:
-            self._heading_deg.value = _round_to_slider_deg(yaw_w_rad)
+            self._heading_slider.value = _round_to_slider_deg(yaw_w_rad)
 
     def _on_button_held(self, _viewer: int, action: PageAction) -> None:
-        self._drive(self._speed_m_s.value, BUTTON_VALIDITY_NS, action)
+        self._send_drive_intent(self._speed_slider.value, BUTTON_VALIDITY_NS, action)
 
     def on_key(self, key_name: str, action: PageAction) -> None:
         """Drive or steer, because a drive key was pressed or its keyboard repeats it.
@@ -102,7 +102,7 @@ class DriveControls:
         a short time ago, and only change the heading otherwise.
 
         Args:
-            key_name: A key of DRIVE_KEYS.
+            key_name: A key of HOTKEY_BY_DRIVE_KEY.
             action: The time of the press; a press older than MAX_HOLD_AGE_S is ignored.
         """
         if not self._is_in_control() or action.age_s > MAX_HOLD_AGE_S:
@@ -114,14 +114,14 @@ class DriveControls:
             case "Backwards":
                 self._key_direction = -1
             case _:
-                self._steer(HEADING_STEP_RAD if key_name == "Left" else -HEADING_STEP_RAD)
+                self._change_heading(HEADING_STEP_RAD if key_name == "Left" else -HEADING_STEP_RAD)
                 is_driving = now_s - self._key_drive_time_s <= KEY_VALIDITY_NS * 1e-9
                 if not is_driving:
                     return
         self._key_drive_time_s = now_s
-        self._drive(self._key_direction * self._speed_m_s.value, KEY_VALIDITY_NS, action)
+        self._send_drive_intent(self._key_direction * self._speed_slider.value, KEY_VALIDITY_NS, action)
 
-    def _drive(self, speed_m_s: float, valid_ns: int, action: PageAction) -> None:
+    def _send_drive_intent(self, speed_m_s: float, valid_ns: int, action: PageAction) -> None:
         """Send the robot an intent, valid from the last moment at which the viewer is known to have acted.
 
         Without such a moment the robot gets nothing, because the message may be of any age.
@@ -130,14 +130,14 @@ class DriveControls:
             return
         self._send_intent(self._heading_w_rad, speed_m_s, action.robot_ns, valid_ns)
 
-    def _steer(self, step_rad: float) -> None:
+    def _change_heading(self, step_rad: float) -> None:
         """Change the heading by a step."""
-        heading_w_rad = rotate_heading(self._heading_w_rad, step_rad, self._find_body_yaw_w_rad())
-        self._heading_deg.value = _round_to_slider_deg(heading_w_rad)
+        heading_w_rad = compute_limited_heading(self._heading_w_rad, step_rad, self._find_body_yaw_w_rad())
+        self._heading_slider.value = _round_to_slider_deg(heading_w_rad)
 
     @property
     def _heading_w_rad(self) -> float:
-        return math.radians(self._heading_deg.value)
+        return math.radians(self._heading_slider.value)
 
     def _find_body_yaw_w_rad(self) -> float | None:
         snapshot = self._get_snapshot()

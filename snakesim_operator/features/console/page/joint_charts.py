@@ -12,20 +12,20 @@ from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import find_propulsion_joint
 from snakesim_operator.features.console.scene.scene_colors import PROPULSION_JOINT
-from snakesim_operator.results.page.palette import joint_colors
+from snakesim_operator.results.page.palette import make_joint_colors
 
 HISTORY_S = 10.0
 MAX_SAMPLES = 400  # of one chart's history
 CHART_HEIGHT_PX = 190
-MEASURED = "#0067b0"
-REFERENCE = "#c8321f"
-LIMIT = "#8b95a1"
-PROPULSION = "#" + bytes(PROPULSION_JOINT).hex()
+MEASURED_COLOR = "#0067b0"
+REFERENCE_COLOR = "#c8321f"
+LIMIT_COLOR = "#8b95a1"
+PROPULSION_COLOR = "#" + bytes(PROPULSION_JOINT).hex()
 
 SampleT = TypeVar("SampleT", bound=tuple[Any, ...])
 
 
-def add_sample(history: deque[SampleT], sample: SampleT) -> None:
+def append_sample(history: deque[SampleT], sample: SampleT) -> None:
     """Add a sample of a time in s and values, unless it follows the last one too closely.
 
     A sample that is earlier than the last one starts the history again.
@@ -46,32 +46,32 @@ class JointCharts:
             gui: The page.
             robot: Description of the robot, whose limits are the scales of the charts.
         """
-        self._names = [joint.name for joint in robot.joints]
-        self._numbers = np.arange(1.0, len(robot.joints) + 1)
+        self._joint_names = [joint.name for joint in robot.joints]
+        self._joint_numbers = np.arange(1.0, len(robot.joints) + 1)
         self._torque_limits_nm = np.array([joint.torque_limit_nm for joint in robot.joints])
         self._history: deque[tuple[float, Floats, Floats]] = deque(maxlen=MAX_SAMPLES)  # time, angles, torques
 
         max_angles_rad = np.array([max(-joint.angle_min_rad, joint.angle_max_rad) for joint in robot.joints])
-        angle_scale = _fixed_scale(max_angles_rad)
-        torque_scale = _fixed_scale(self._torque_limits_nm)
+        angle_scale = _make_fixed_scale(max_angles_rad)
+        torque_scale = _make_fixed_scale(self._torque_limits_nm)
         self._angle_chart = self._add_angle_chart(gui, angle_scale)
         self._torque_chart = self._add_torque_chart(gui, torque_scale)
         self._angle_history_chart = add_history_chart(
-            gui, self._names, "Angle of all joints, last 10 s, rad", angle_scale, legend={"show": False}
+            gui, self._joint_names, "Angle of all joints, last 10 s, rad", angle_scale, legend={"show": False}
         )
         self._torque_history_chart = add_history_chart(
-            gui, self._names, "Torque of all joints, last 10 s, N·m", torque_scale, legend={"show": False}
+            gui, self._joint_names, "Torque of all joints, last 10 s, N·m", torque_scale, legend={"show": False}
         )
 
     def _add_angle_chart(self, gui: viser.GuiApi, scale: dict[str, Any]) -> viser.GuiUplotHandle:
-        unknown = np.full(len(self._names), np.nan)
+        unknown = np.full(len(self._joint_names), np.nan)
         lines = (
             {"label": "joint"},
-            chart_line("measured", MEASURED, dots=True),
-            chart_line("reference", REFERENCE, dash=True),
+            make_chart_line("measured", MEASURED_COLOR, dots=True),
+            make_chart_line("reference", REFERENCE_COLOR, dash=True),
         )
         return gui.add_uplot(
-            (self._numbers, unknown, unknown),
+            (self._joint_numbers, unknown, unknown),
             lines,  # pyright: ignore[reportArgumentType] - dictionaries of uPlot's options
             title="Angle of each joint, rad (tail to head)",
             height=CHART_HEIGHT_PX,
@@ -79,16 +79,16 @@ class JointCharts:
         )
 
     def _add_torque_chart(self, gui: viser.GuiApi, scale: dict[str, Any]) -> viser.GuiUplotHandle:
-        unknown = np.full(len(self._names), np.nan)
+        unknown = np.full(len(self._joint_names), np.nan)
         lines = (
             {"label": "joint"},
-            chart_line("measured", MEASURED, dots=True),
-            chart_line("limit", LIMIT, dash=True),
-            chart_line("-limit", LIMIT, dash=True),
-            chart_line("propulsion", PROPULSION, dots=True, dot_size_px=12),
+            make_chart_line("measured", MEASURED_COLOR, dots=True),
+            make_chart_line("limit", LIMIT_COLOR, dash=True),
+            make_chart_line("-limit", LIMIT_COLOR, dash=True),
+            make_chart_line("propulsion", PROPULSION_COLOR, dots=True, dot_size_px=12),
         )
         return gui.add_uplot(
-            (self._numbers, unknown, self._torque_limits_nm, -self._torque_limits_nm, unknown),
+            (self._joint_numbers, unknown, self._torque_limits_nm, -self._torque_limits_nm, unknown),
             lines,  # pyright: ignore[reportArgumentType] - dictionaries of uPlot's options
             title="Torque of each joint, N·m",
             height=CHART_HEIGHT_PX,
@@ -107,7 +107,7 @@ class JointCharts:
         joints = snapshot.joints
         if joints is None or snapshot.time_s is None:
             return
-        add_sample(self._history, (snapshot.time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
+        append_sample(self._history, (snapshot.time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
 
     def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw all charts; called a few times a second."""
@@ -115,12 +115,12 @@ class JointCharts:
         if joints is None:
             return
         angles_rad = np.where(joints.valid, joints.angle_rad, np.nan)
-        self._angle_chart.data = (self._numbers, angles_rad, find_references_rad(snapshot))
+        self._angle_chart.data = (self._joint_numbers, angles_rad, find_references_rad(snapshot))
         torques_nm = np.where(joints.valid, joints.torque_nm, np.nan)
         limits_nm = self._find_torque_limits_nm(snapshot)
         is_propulsion = np.arange(len(torques_nm)) == find_propulsion_joint(snapshot)
         propulsion_nm = np.where(is_propulsion, torques_nm, np.nan)
-        self._torque_chart.data = (self._numbers, torques_nm, limits_nm, -limits_nm, propulsion_nm)
+        self._torque_chart.data = (self._joint_numbers, torques_nm, limits_nm, -limits_nm, propulsion_nm)
         if len(self._history) > 1:
             self._show_history()
 
@@ -128,7 +128,7 @@ class JointCharts:
         """Return the torque limit of each joint, reduced where the host has derated it."""
         if snapshot.status is None:
             return self._torque_limits_nm
-        fractions = [snapshot.status.derated.get(name, 1.0) for name in self._names]
+        fractions = [snapshot.status.derated.get(name, 1.0) for name in self._joint_names]
         return np.array(fractions) * self._torque_limits_nm
 
     def _show_history(self) -> None:
@@ -145,17 +145,17 @@ def find_references_rad(snapshot: RobotSnapshot) -> Floats:
 
     This is the controller's reference, else the target of joints in position mode, else NaN.
     """
-    count = len(snapshot.robot.joints)
+    joint_count = len(snapshot.robot.joints)
     control = snapshot.control
-    if control is not None and len(control.reference_rad) == count:
+    if control is not None and len(control.reference_rad) == joint_count:
         return np.array(control.reference_rad)
     applied = snapshot.applied
-    if applied is not None and len(applied.target) == len(applied.mode) == count:
+    if applied is not None and len(applied.target) == len(applied.mode) == joint_count:
         return np.where(np.array(applied.mode) == Mode.POSITION, applied.target, np.nan)
-    return np.full(count, np.nan)
+    return np.full(joint_count, np.nan)
 
 
-def _fixed_scale(limits: Floats) -> dict[str, Any]:
+def _make_fixed_scale(limits: Floats) -> dict[str, Any]:
     """Return a scale that ends just beyond the largest limit: viewers see how much is left below it."""
     end = 1.05 * float(limits.max())
     return {"range": (-end, end)}
@@ -173,8 +173,8 @@ def add_history_chart(
         scale: Scale of the values as uPlot has it; None adapts it to the values.
         **options: Further options of `add_uplot`.
     """
-    colors = joint_colors(len(names), dark=True).values()
-    lines = [chart_line(name, color) for name, color in zip(names, colors, strict=True)]
+    colors = make_joint_colors(len(names), dark=True).values()
+    lines = [make_chart_line(name, color) for name, color in zip(names, colors, strict=True)]
     no_times = np.zeros(1)
     no_values = [np.full(1, np.nan)] * len(names)
     scales: dict[str, Any] = {"x": {"time": False}}
@@ -190,7 +190,7 @@ def add_history_chart(
     )
 
 
-def chart_line(label: str, color: str, *, dash: bool = False, dots: bool = False, dot_size_px: int = 5) -> Any:
+def make_chart_line(label: str, color: str, *, dash: bool = False, dots: bool = False, dot_size_px: int = 5) -> Any:
     """Return the options of one line of a chart."""
     line: dict[str, Any] = {"label": label, "stroke": color, "width": 1.5, "points": {"show": False}}
     if dash:

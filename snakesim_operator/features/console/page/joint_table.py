@@ -16,34 +16,35 @@ AngleRange = tuple[float, float]  # lower and upper end, rad
 HEADINGS = ("", "now", "limits, rad", "sign", "zero, rad")
 
 
-def commissioning_html(
+def format_joint_table(
     snapshot: RobotSnapshot, config: RunConfig | None, moved_ranges: Sequence[AngleRange] = ()
 ) -> str:
     """Return the table of joints as HTML: angle, limits, sign and zero of each joint, and how it was checked.
 
     Args:
         snapshot: The newest snapshot of the robot.
-        config: Configuration with which the host was started; None: not known.
-        moved_ranges: The range in which each joint was moved by hand so far, tail to head; empty: not measured.
+        config: Configuration with which the host was started; None if it is not known.
+        moved_ranges: The range in which each joint was moved by hand so far, tail to head; empty if not measured.
     """
     rows: list[str] = []
     for joint_index in range(len(snapshot.robot.joints)):
         configured_joint = None if config is None else config.robot.joint_table[joint_index]
         moved_range = moved_ranges[joint_index] if moved_ranges else None
-        rows.append(_row_html(snapshot, joint_index, configured_joint, moved_range))
-    head = "".join(f"<th style='text-align:left;padding-right:.8em'>{heading}</th>" for heading in HEADINGS)
+        rows.append(_format_joint_rows(snapshot, joint_index, configured_joint, moved_range))
+    header_cells = "".join(f"<th style='text-align:left;padding-right:.8em'>{heading}</th>" for heading in HEADINGS)
     return (
-        f"<div style='padding:0 .6em .4em;font-size:.85em'>{_check_html(snapshot, config)}"
-        f"<table style='border-spacing:0;width:100%'><tr style='opacity:.7'>{head}</tr>{''.join(rows)}</table></div>"
+        f"<div style='padding:0 .6em .4em;font-size:.85em'>{_format_check_line(snapshot, config)}"
+        f"<table style='border-spacing:0;width:100%'><tr style='opacity:.7'>{header_cells}</tr>{''.join(rows)}"
+        f"</table></div>"
     )
 
 
-def _check_html(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
-    """Return one line of HTML about the start check: whether the joints were checked, by whom and how.
+def _format_check_line(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
+    """Format one line of HTML about the start check: whether the joints were checked, by whom and how.
 
     Args:
         snapshot: The newest snapshot of the robot, with its status.
-        config: Configuration with which the host was started; None: not known.
+        config: Configuration with which the host was started; None if it is not known.
     """
     status = snapshot.status
     if snapshot.robot.emulated:
@@ -63,10 +64,10 @@ def _check_html(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
     return f"<div>{escape_text(text)}</div>"
 
 
-def _row_html(
+def _format_joint_rows(
     snapshot: RobotSnapshot, joint_index: int, configured_joint: Joint | None, moved_range: AngleRange | None
 ) -> str:
-    """Return two rows of the table for a joint: its numbers, and its drive below them.
+    """Format two rows of the table for a joint as HTML: its values, and its drive below them.
 
     Args:
         snapshot: The newest snapshot of the robot.
@@ -78,8 +79,8 @@ def _row_html(
     sign = "?" if configured_joint is None else f"{configured_joint.drive.sign:+d}"
     zero = "?" if configured_joint is None else f"{configured_joint.drive.zero_rad:+.4f}"
     limits = f"{described_joint.angle_min_rad:+.2f} to {described_joint.angle_max_rad:+.2f}"
-    texts = (_format_angle(snapshot, joint_index), limits, sign, zero)
-    cells = "".join(f"<td style='padding-right:.8em'>{text}</td>" for text in texts)
+    cell_texts = (_format_angle(snapshot, joint_index), limits, sign, zero)
+    cells = "".join(f"<td style='padding-right:.8em'>{text}</td>" for text in cell_texts)
     joint_name = escape_text(described_joint.name)
     name_cell = f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{joint_name}</td>"
     drive = escape_text(_describe_drive(described_joint, configured_joint))

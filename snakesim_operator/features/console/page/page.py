@@ -2,7 +2,7 @@
 
 All viewers see the same, except that each viewer has controls of its own.
 
-Threads: the display loop calls `show_snapshot` and `start_over`, with one snapshot a frame. viser calls
+Threads: the display loop calls `show_snapshot` and `reset_for_jump`, with one snapshot a frame. viser calls
 `_on_viewer_connect` and `_on_viewer_disconnect` in threads of its own.
 
 Each viewer gets the newest value of each thing when its page has shown the one before (`pacing`). So a slow browser
@@ -17,11 +17,11 @@ from pathlib import Path
 import viser
 
 from snakesim_operator.features.console.control_token import ControlToken
-from snakesim_operator.features.console.operations import Operations, PageLog
+from snakesim_operator.features.console.operations import PageLog, RobotOperations
 from snakesim_operator.features.console.page import page_html
 from snakesim_operator.features.console.page.appearance import add_appearance, aim_phone_camera, set_appearance
-from snakesim_operator.features.console.page.commissioning_tab import Commissioning
-from snakesim_operator.features.console.page.drive_controls import DRIVE_KEYS
+from snakesim_operator.features.console.page.commissioning_tab import CommissioningTab
+from snakesim_operator.features.console.page.drive_controls import HOTKEY_BY_DRIVE_KEY
 from snakesim_operator.features.console.page.robot_display import RobotDisplay, RobotTabs
 from snakesim_operator.features.console.page.viewer_controls import ControlContext, format_viewer
 from snakesim_operator.features.console.page.viewers import Viewers, ignore_closed_page
@@ -33,8 +33,8 @@ from snakesim_operator.features.console.web.viser_server import PageServer
 # Decimation: every how many frames each part of the page is renewed, at 30 frames a second.
 TEXT_DECIMATION = 6
 CHART_DECIMATION = 5
-PICTURE_DECIMATION = 6
-QUESTION_DECIMATION = 3  # ten questions a second to the page in control, by which the age of its messages is known
+IMAGE_DECIMATION = 6
+AGE_REQUEST_DECIMATION = 3  # ten questions a second to the page in control, by which the age of its messages is known
 
 PANEL_WIDTH_PX = 490  # wide enough for all tabs in one line
 
@@ -46,30 +46,31 @@ class Page:
         self,
         server: PageServer,
         surroundings: Surroundings | None,
-        operations: Operations | None,
+        operations: RobotOperations | None,
         log: PageLog,
         recorded: str = "",
-        commission: Path | None = None,
+        robot_file: Path | None = None,
     ) -> None:
         """Lay out the page for all viewers, before a robot is known.
 
         Args:
-            server: Serves the page.
-            surroundings: The true surroundings of the robot, if they are known.
+            server: Server of the page.
+            surroundings: The true surroundings of the robot; None if they are not known.
             operations: Sends commands to the robot; None for a recording.
-            log: Lines to show.
+            log: Lines to show in the tab "Log".
             recorded: Name of the recording; empty for a live robot.
-            commission: The robot file on this computer with which the host was started; None: pages may not change it.
+            robot_file: The robot file on this computer with which the host was started; None disables commissioning
+                from the page.
         """
         self._server = server
         self._log = log
         self._recorded = recorded
-        self._token = ControlToken()
-        self._connecting = threading.Lock()  # one viewer at a time gets its controls
+        self._control_token = ControlToken()
+        self._connect_lock = threading.Lock()  # one viewer at a time gets its controls
         # What is shown.
         self._frame_count = 0
         self._snapshot: RobotSnapshot | None = None
-        self._shown_log: list[str] = []
+        self._shown_log_lines: list[str] = []
         # The panel, from top to bottom.
         gui = server.gui
         set_appearance(gui, dark=False)
@@ -77,11 +78,11 @@ class Page:
         gui.main_panel.set_width(PANEL_WIDTH_PX)
         self._header = gui.add_html(page_html.format_header(None), order=0)
         tabs = gui.add_tab_group(order=4)
-        self._display = RobotDisplay(server, surroundings, self._add_robot_tabs(tabs))
+        self._robot_display = RobotDisplay(server, surroundings, self._add_robot_tabs(tabs))
         self._viewers: Viewers | None = None  # None for a recording
-        self._commissioning: Commissioning | None = None  # None for a recording
+        self._commissioning: CommissioningTab | None = None  # None for a recording
         if operations is not None:
-            self._add_commands(tabs, operations, commission)
+            self._add_live_controls(tabs, operations, robot_file)
         with tabs.add_tab("Log"):
             self._log_text = gui.add_html("")
         gui.add_html(page_html.format_legend(LEGEND), order=3)
@@ -105,9 +106,9 @@ class Page:
         with tabs.add_tab("Forces"):
             forces = gui.add_html("")
         with tabs.add_tab("State"):
-            self._state = gui.add_html("")
+            self._state_table = gui.add_html("")
             with gui.add_folder("Rates and ages", expand_by_default=False):
-                self._streams = gui.add_html("")
+                self._stream_table = gui.add_html("")
         with tabs.add_tab("Signals"):
             gui.add_html(page_html.SIGNALS)
         with tabs.add_tab("Cameras"):
@@ -118,13 +119,18 @@ class Page:
             sensors = gui.add_folder(None)
         return RobotTabs(joints, forces, cameras, no_camera, sensors)
 
-    def _add_commands(self, tabs: viser.GuiTabGroupHandle, operations: Operations, commission: Path | None) -> None:
-        """Add the controls of a live robot: the stop, the keys that drive it, and the places of each viewer's controls.
+    def _add_live_controls(
+        self, tabs: viser.GuiTabGroupHandle, operations: RobotOperations, robot_file: Path | None
+    ) -> None:
+        """Add the controls of a live robot to the page: stop button, drive keys, and folders for viewers' controls.
+
+        The folders are empty at first. Each viewer that connects gets its own buttons and inputs in them.
 
         Args:
             tabs: The group to which tabs for parameters and commissioning are added.
             operations: Sends commands to the robot.
-            commission: The robot file on this computer with which the host was started; None: pages may not change it.
+            robot_file: The robot file on this computer with which the host was started; None disables commissioning
+                from the page.
         """
         gui = self._server.gui
         control_folder = gui.add_folder("Control", order=2)
@@ -132,9 +138,11 @@ class Page:
             parameters_tab = gui.add_folder(None)
         with tabs.add_tab("Commission"):
             commissioning_tab = gui.add_folder(None)
-        self._commissioning = Commissioning(gui, commissioning_tab, operations.link, commission, self._token, self._log)
+        self._commissioning = CommissioningTab(
+            gui, commissioning_tab, operations.link, robot_file, self._control_token, self._log
+        )
         context = ControlContext(
-            token=self._token,
+            token=self._control_token,
             operations=operations,
             admission=self._server.admission,
             commissioning=self._commissioning,
@@ -148,25 +156,25 @@ class Page:
         self._add_stop_and_drive_keys(self._viewers)
 
     def _add_stop_and_drive_keys(self, viewers: Viewers) -> None:
-        """Add the stop, and the keys that drive the robot. The thread that receives messages handles all of them."""
+        """Add the stop button and the drive keys; the thread that receives messages handles their events."""
         gui = self._server.gui
-        admit = self._server.admission.admit
+        admit = self._server.admission.admit_control
         button = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
         admit(button, handler=viewers.stop_robot)
         admit(gui.add_command("Emergency stop", hotkey="escape"), handler=viewers.stop_robot)
-        for key_name, hotkey in DRIVE_KEYS.items():
+        for key_name, hotkey in HOTKEY_BY_DRIVE_KEY.items():
             command = gui.add_command(f"Drive: {key_name.lower()}", hotkey=hotkey)
             admit(command, handler=partial(viewers.on_drive_key, key_name))
 
     # --- viewers ---------------------------------------------------------------------------------------------
 
     def _on_viewer_connect(self, client: viser.ClientHandle) -> None:
-        """Give a viewer its controls. Its page may close before this ends.
+        """Add a viewer's own controls to its page, which may close before this ends.
 
         The page shows all of it at once, so no control is shown before it can be pressed.
         """
         viewer = client.client_id
-        with self._connecting, ignore_closed_page(self._server, client), client.atomic():
+        with self._connect_lock, ignore_closed_page(self._server, client), client.atomic():
             add_appearance(client, self._server.admission, dark=self._server.prefers_dark(viewer))
             if self._viewers is not None:
                 self._viewers.add(client)
@@ -180,7 +188,7 @@ class Page:
         """Forget a viewer; if it had control, any other viewer may take it now."""
         viewer = client.client_id
         self._forget_viewer(viewer)
-        had_control = self._token.release(viewer)
+        had_control = self._control_token.release(viewer)
         line = f"{format_viewer(viewer)} left"
         if had_control:
             line += ", and with it control"
@@ -190,7 +198,7 @@ class Page:
     def _forget_viewer(self, viewer: int) -> None:
         if self._viewers is not None:
             self._viewers.remove(viewer)
-        self._server.admission.forget_viewer(viewer)
+        self._server.admission.remove_viewer(viewer)
 
     def _on_control_changed(self) -> None:
         if self._viewers is not None:
@@ -199,26 +207,26 @@ class Page:
     # --- each frame ------------------------------------------------------------------------------------------
 
     def show_snapshot(self, snapshot: RobotSnapshot | None) -> None:
-        """Show a snapshot; None while there is no robot."""
+        """Show a snapshot of the robot on all pages; None while there is no robot."""
         previous = self._snapshot
         self._snapshot = snapshot
         self._frame_count += 1
-        if self._viewers is not None and self._frame_count % QUESTION_DECIMATION == 0:
+        if self._viewers is not None and self._frame_count % AGE_REQUEST_DECIMATION == 0:
             self._viewers.ask_for_age()
         if self._commissioning is not None:
             self._commissioning.update(snapshot)
         if snapshot is not None:
             self._show_robot(previous, snapshot)
-        if self._is_due(TEXT_DECIMATION) or _urgent_state(previous) != _urgent_state(snapshot):
+        if self._is_due(TEXT_DECIMATION) or _get_urgent_state(previous) != _get_urgent_state(snapshot):
             self._show_texts(snapshot)
 
-    def start_over(self, earlier: Iterable[RobotSnapshot]) -> None:
+    def reset_for_jump(self, earlier: Iterable[RobotSnapshot]) -> None:
         """Prepare for a snapshot that does not follow the last one, because a viewer jumped in a recording.
 
         The trail starts over, and the charts begin with the snapshots of the time before the jump's target.
         """
-        self._display.add_samples(earlier)
-        self._display.clear_trail()
+        self._robot_display.add_samples(earlier)
+        self._robot_display.clear_trail()
         self._frame_count = 0
 
     def _is_due(self, decimation: int) -> bool:
@@ -226,15 +234,15 @@ class Page:
         return self._frame_count % decimation == 1
 
     def _show_robot(self, previous: RobotSnapshot | None, snapshot: RobotSnapshot) -> None:
-        """Show the scene at once, and charts, images and parameters when they are due."""
+        """Show the scene in every frame, and charts, images and parameters in the frames in which they are due."""
         if previous is None or previous.robot is not snapshot.robot:
             self._on_control_changed()  # a simulator has controls that other robots do not have
-        self._display.show_scene(snapshot)
-        self._display.add_samples([snapshot])
+        self._robot_display.show_scene(snapshot)
+        self._robot_display.add_samples([snapshot])
         if self._is_due(CHART_DECIMATION):
-            self._display.redraw_charts(snapshot)
-        if self._is_due(PICTURE_DECIMATION):
-            self._display.show_pictures(snapshot)
+            self._robot_display.redraw_charts(snapshot)
+        if self._is_due(IMAGE_DECIMATION):
+            self._robot_display.show_pictures(snapshot)
         parameters = snapshot.parameters
         if self._viewers is None or parameters is None:
             return
@@ -242,15 +250,15 @@ class Page:
             self._viewers.show_parameters(parameters)
 
     def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
-        log_lines = self._log.lines()
+        log_lines = self._log.list_lines()
         if snapshot is not None:
-            self._state.content = page_html.format_state_table(snapshot)
-            self._streams.content = page_html.format_stream_table(snapshot)
+            self._state_table.content = page_html.format_state_table(snapshot)
+            self._stream_table.content = page_html.format_stream_table(snapshot)
             if self._commissioning is not None:
                 self._commissioning.redraw(snapshot)
             log_lines = [*snapshot.log, *log_lines]
-        if log_lines != self._shown_log:
-            self._shown_log = log_lines
+        if log_lines != self._shown_log_lines:
+            self._shown_log_lines = log_lines
             self._log_text.content = page_html.format_log(log_lines)
         if self._viewers is None:
             self._header.content = page_html.format_header(snapshot, recorded=self._recorded)
@@ -259,20 +267,20 @@ class Page:
 
     def _describe_viewers(self) -> str:
         """Return which viewer has control, how many viewers there are, and how many of their messages were dropped."""
-        viewers = _count_in_words(self._server.viewers(), "viewer")
-        text = f"{format_viewer(self._token.holder)} has control; {viewers}"
+        viewers = _format_count(self._server.count_viewers(), "viewer")
+        text = f"{format_viewer(self._control_token.holder)} has control; {viewers}"
         dropped = self._server.admission.dropped.total()
         if dropped:
-            text += f"; {_count_in_words(dropped, 'message')} of browsers dropped"
+            text += f"; {_format_count(dropped, 'message')} of browsers dropped"
         return text
 
 
-def _count_in_words(count: int, noun: str) -> str:
+def _format_count(count: int, noun: str) -> str:
     plural = "" if count == 1 else "s"
     return f"{count} {noun}{plural}"
 
 
-def _urgent_state(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
+def _get_urgent_state(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
     """Return the state whose changes viewers must see at once, rather than when texts are due."""
     if snapshot is None:
         return None

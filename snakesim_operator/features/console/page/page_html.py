@@ -36,21 +36,21 @@ def escape_text(text: object) -> str:
     return escape(escape_invisible(str(text)))
 
 
-def describe_backend(robot: Description) -> tuple[str, str]:
-    """Return the words that name what moves, and their color."""
-    name = robot.backend.upper()[:MAX_BACKEND_CHARACTERS]
+def choose_backend_label(robot: Description) -> tuple[str, str]:
+    """Return the label for what moves, a real, emulated or simulated robot, and the label's color."""
+    backend_name = robot.backend.upper()[:MAX_BACKEND_CHARACTERS]
     if not robot.emulated:  # whatever the backend is called
-        return f"REAL ROBOT ON {name}", REAL_COLOR
+        return f"REAL ROBOT ON {backend_name}", REAL_COLOR
     if robot.backend == "sim":
         return "EMULATED BY A SIMULATOR", SIMULATED_COLOR
-    return f"EMULATED ROBOT ON {name}", EMULATED_COLOR
+    return f"EMULATED ROBOT ON {backend_name}", EMULATED_COLOR
 
 
 def format_header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str = "") -> str:
-    """Return the top of the page: which backend, which state, and the reason for the state.
+    """Format the header of the page as HTML: which backend, which state, and the reason for the state.
 
     Args:
-        snapshot: None while no robot is known.
+        snapshot: The newest snapshot of the robot; None while no robot is known.
         recorded: Name of the recording that is shown; empty for a live robot.
         control: Text that names the viewer in control; empty to leave it out.
     """
@@ -59,32 +59,32 @@ def format_header(snapshot: RobotSnapshot | None, *, recorded: str = "", control
     if snapshot.expected:
         name = escape_text(snapshot.robot.robot)
         return _format_bar("WAITING FOR THE ROBOT", RECORDED_COLOR, f"{name}, drawn as its scenario places it")
-    lines = [_format_backend_bar(snapshot.robot, recorded), *_list_alarms(snapshot)]
+    html_lines = [_format_backend_bar(snapshot.robot, recorded), *_list_alarms(snapshot)]
     status = snapshot.status
     if status is not None:
-        lines.append(
+        html_lines.append(
             _format_state(status.lifecycle.upper(), LIFECYCLE_COLORS[status.lifecycle], status.reason, ".45em")
         )
     control_state = snapshot.control
     if control_state is not None:
         state_color = CONTROL_STATE_COLORS[control_state.state]
-        lines.append(_format_state(control_state.state, state_color, control_state.reason, ".35em"))
+        html_lines.append(_format_state(control_state.state, state_color, control_state.reason, ".35em"))
     if control:
-        lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
-    return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
+        html_lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
+    return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(html_lines)}</div>"
 
 
 def _format_backend_bar(robot: Description, recorded: str) -> str:
     """Return the bar that distinguishes a real robot from an emulated one, and a recording from a live robot."""
-    words, color = describe_backend(robot)
-    place = escape_text(robot.robot)
+    label, color = choose_backend_label(robot)
+    robot_text = escape_text(robot.robot)
     if robot.hardware:
-        place += f" · {escape_text(robot.hardware)}"
+        robot_text += f" · {escape_text(robot.hardware)}"
     if recorded:
-        words = f"RECORDING OF: {words}"
+        label = f"RECORDING OF: {label}"
         color = RECORDED_COLOR
-        place += f" · {escape_text(recorded)}"
-    return _format_bar(words, color, place)
+        robot_text += f" · {escape_text(recorded)}"
+    return _format_bar(label, color, robot_text)
 
 
 def _list_alarms(snapshot: RobotSnapshot) -> list[str]:
@@ -103,7 +103,7 @@ def _list_alarms(snapshot: RobotSnapshot) -> list[str]:
 
 
 def _format_state(word: str, color: str, why: str, margin_top: str) -> str:
-    """Return a state as a word on a color, with the reason beside it. margin_top: CSS length above it."""
+    """Format a state as a word on a color, with the reason next to it. `margin_top` is a CSS length."""
     return (
         f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{margin_top}'>"
         f"<span style='background:{color};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"

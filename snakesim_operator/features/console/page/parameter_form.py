@@ -12,7 +12,7 @@ import msgspec
 import viser
 
 from snakesim_hal.wire.messages import ControlParameters
-from snakesim_operator.robot_commands.parameters import Parameter, read_parameters
+from snakesim_operator.robot_commands.parameters import Parameter, parse_parameters
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class InputField:
 def list_input_fields(in_force: ControlParameters) -> list[InputField]:
     """Return the inputs for the parameters that a form can change; empty for a schema that cannot be read."""
     fields: list[InputField] = []
-    for parameter in read_parameters(in_force):
+    for parameter in parse_parameters(in_force):
         field = _make_field(parameter)
         if field is not None:
             fields.append(field)
@@ -40,7 +40,7 @@ def list_input_fields(in_force: ControlParameters) -> list[InputField]:
 
 
 def _make_field(parameter: Parameter) -> InputField | None:
-    """Return the input for a parameter; None if it is of a kind that has no input."""
+    """Make the input field for a parameter; return None if its type has no input."""
     value = parameter.value
     if isinstance(value, bool):
         return InputField(parameter.name, value, hint=parameter.description)
@@ -52,33 +52,33 @@ def _make_field(parameter: Parameter) -> InputField | None:
 
 
 def _make_number_field(parameter: Parameter, value: float) -> InputField:
-    """Return the input field for a number, with the range and the step of its slider.
+    """Make the input field for a number, with the range and the step of its slider.
 
-    It allows numbers up to four times the present value in both directions, as far as the parameter's bounds allow.
+    It allows numbers up to four times the current value in both directions, as far as the parameter's bounds allow.
 
     Args:
         parameter: Name, unit and bounds of the parameter.
-        value: Its present value. An integer gets steps of 1.
+        value: Current value of the parameter. An integer gets steps of 1.
     """
-    span = 4.0 * abs(value) or 1.0
-    low = -span
+    max_magnitude = 4.0 * abs(value) or 1.0
+    slider_min = -max_magnitude
     if parameter.minimum is not None:
-        low = max(parameter.minimum, -span)
-    high = span
+        slider_min = max(parameter.minimum, -max_magnitude)
+    slider_max = max_magnitude
     if parameter.maximum is not None:
-        high = min(parameter.maximum, span)
+        slider_max = min(parameter.maximum, max_magnitude)
     step = 1.0
     if not isinstance(value, int):
         # The power of ten that divides the range into 100 to 1000 steps.
-        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-9) / 100))
-    if parameter.excludes_minimum and low == parameter.minimum:
-        low += step  # the bound itself is not allowed
+        step = 10.0 ** math.floor(math.log10(max(slider_max - slider_min, 1e-9) / 100))
+    if parameter.excludes_minimum and slider_min == parameter.minimum:
+        slider_min += step  # the bound itself is not allowed
     return InputField(
         parameter.name,
         value,
         parameter.unit,
-        low=min(low, value),
-        high=max(high, value),
+        low=min(slider_min, value),
+        high=max(slider_max, value),
         step=step,
         hint=_describe_number(parameter),
     )
@@ -89,8 +89,8 @@ def _describe_number(parameter: Parameter) -> str:
     parts: list[str] = []
     if parameter.description:
         parts.append(parameter.description)
-    if parameter.range:
-        parts.append(f"{parameter.range} {parameter.unit}".removesuffix(" 1").strip())
+    if parameter.range_text:
+        parts.append(f"{parameter.range_text} {parameter.unit}".removesuffix(" 1").strip())
     return "; ".join(parts)
 
 

@@ -20,46 +20,46 @@ class Player:
         """Add the player to the page, paused.
 
         Args:
-            server: Serves the page.
+            server: Server of the page.
             span_s: Robot time of the first and of the last instant.
-            start_s: Where to begin, in seconds after the first instant.
+            start_s: Time to show first, in seconds after the first instant.
         """
-        self._begin_s, self._end_s = span_s
-        self.time_s = self._clamp_time(self._begin_s + start_s)  # robot time that is shown
+        self._start_s, self._end_s = span_s
+        self.time_s = self._clamp_time(self._start_s + start_s)  # robot time that is shown
         self.is_playing = False
         self._has_jumped = False
         # Wall clock.
         now_s = time.monotonic()
-        self._advanced_s = now_s
-        self._slider_updated_s = now_s
+        self._last_advance_s = now_s
+        self._last_slider_update_s = now_s
         self._add_controls(server)
 
     def _add_controls(self, server: PageServer) -> None:
         gui = server.gui
-        last_s = round(max(self._end_s - self._begin_s, 0.01), 2)  # a slider needs some length
+        last_s = round(max(self._end_s - self._start_s, 0.01), 2)  # a slider needs some length
         with gui.add_folder("Recording", order=2):
-            self._slider = gui.add_slider("Time, s", 0.0, last_s, 0.01, round(self.since_begin_s, 2))
-            self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
-            self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
-        for control in (self._slider, self._play, self._speed):
-            server.admission.admit(control)
-        self._play.on_click(lambda _: self._toggle_playing())
+            self._slider = gui.add_slider("Time, s", 0.0, last_s, 0.01, round(self.elapsed_s, 2))
+            self._play_button = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+            self._speed_dropdown = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
+        for control in (self._slider, self._play_button, self._speed_dropdown):
+            server.admission.admit_control(control)
+        self._play_button.on_click(lambda _: self._toggle_playing())
         self._slider.on_update(self._on_slider)
 
-    def advance(self) -> tuple[float, bool]:
+    def advance_time(self) -> tuple[float, bool]:
         """Move the time on if the recording plays; called for each frame.
 
         Returns:
             The robot time to show now, and whether it was moved by a jump.
         """
         now_s = time.monotonic()
-        elapsed_s = now_s - self._advanced_s
-        self._advanced_s = now_s
+        elapsed_s = now_s - self._last_advance_s
+        self._last_advance_s = now_s
         if self.is_playing:
-            speed = float(self._speed.value.removesuffix("x"))
+            speed = float(self._speed_dropdown.value.removesuffix("x"))
             self.time_s = min(self.time_s + elapsed_s * speed, self._end_s)
-            if now_s - self._slider_updated_s > SLIDER_PERIOD_S:
-                self._slider_updated_s = now_s
+            if now_s - self._last_slider_update_s > SLIDER_PERIOD_S:
+                self._last_slider_update_s = now_s
                 self._update_slider()
             if self.time_s >= self._end_s:
                 self._toggle_playing()
@@ -68,13 +68,13 @@ class Player:
         return self.time_s, has_jumped
 
     @property
-    def since_begin_s(self) -> float:
+    def elapsed_s(self) -> float:
         """The time shown, in seconds after the first instant."""
-        return self.time_s - self._begin_s
+        return self.time_s - self._start_s
 
     def jump_to(self, since_begin_s: float) -> None:
         """Show another instant, given in seconds after the first one; from any thread."""
-        self._jump_to_time(self._clamp_time(self._begin_s + since_begin_s))
+        self._jump_to_time(self._clamp_time(self._start_s + since_begin_s))
         self._update_slider()
 
     def _jump_to_time(self, time_s: float) -> None:
@@ -82,19 +82,19 @@ class Player:
         self._has_jumped = True
 
     def _clamp_time(self, time_s: float) -> float:
-        return min(max(time_s, self._begin_s), self._end_s)
+        return min(max(time_s, self._start_s), self._end_s)
 
     def _update_slider(self) -> None:
-        self._slider.value = round(self.since_begin_s, 2)
+        self._slider.value = round(self.elapsed_s, 2)
 
     def _on_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
         """Jump to the time that a viewer chose. An event without a viewer comes from `_update_slider`."""
         if event.client is not None:
-            self._jump_to_time(self._begin_s + self._slider.value)
+            self._jump_to_time(self._start_s + self._slider.value)
 
     def _toggle_playing(self) -> None:
         """Play or pause; at the end of the recording, play from the beginning."""
         self.is_playing = not self.is_playing
         if self.is_playing and self.time_s >= self._end_s:
-            self._jump_to_time(self._begin_s)
-        self._play.label = "Pause" if self.is_playing else "Play"
+            self._jump_to_time(self._start_s)
+        self._play_button.label = "Pause" if self.is_playing else "Play"

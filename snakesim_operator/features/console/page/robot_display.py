@@ -9,7 +9,7 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.features.console.page.appearance import aim_initial_camera, aim_phone_camera
 from snakesim_operator.features.console.page.camera_tab import draw_picture
 from snakesim_operator.features.console.page.custom_sensors import CustomSensorCharts
-from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
+from snakesim_operator.features.console.page.force_polygon import draw_force_polygon, format_push_point_table
 from snakesim_operator.features.console.page.joint_charts import JointCharts
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import Surroundings, draw
@@ -35,7 +35,7 @@ class RobotDisplay:
         """Show nothing yet.
 
         Args:
-            server: Serves the page.
+            server: Server of the page.
             surroundings: The true surroundings of the robot, if they are known.
             tabs: The places of charts and images.
         """
@@ -50,7 +50,7 @@ class RobotDisplay:
 
     def show_scene(self, snapshot: RobotSnapshot) -> None:
         """Draw the robot and what surrounds it."""
-        self._prepare_for(snapshot.robot)
+        self._prepare_for_robot(snapshot.robot)
         assert self._scene is not None
         drawing = draw(snapshot, self._surroundings)
         if drawing is not None:
@@ -60,7 +60,7 @@ class RobotDisplay:
     def add_samples(self, snapshots: Iterable[RobotSnapshot]) -> None:
         """Keep samples for the charts. The charts start over when time goes back."""
         for snapshot in snapshots:
-            self._prepare_for(snapshot.robot)
+            self._prepare_for_robot(snapshot.robot)
             assert self._joint_charts is not None
             self._joint_charts.add_snapshot(snapshot)
             if self._sensor_charts is not None:
@@ -70,7 +70,7 @@ class RobotDisplay:
         """Draw the charts anew, from the samples that were added."""
         assert self._joint_charts is not None
         self._joint_charts.redraw(snapshot)
-        self._tabs.forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
+        self._tabs.forces.content = draw_force_polygon(snapshot) + format_push_point_table(snapshot.control)
         if self._sensor_charts is not None:
             self._sensor_charts.redraw(snapshot)
 
@@ -86,12 +86,12 @@ class RobotDisplay:
                 handle.image = draw_picture(image)
 
     def clear_trail(self) -> None:
-        """Begin the trail of the robot anew."""
+        """Clear the trail of the robot, so that it starts again at the robot's pose."""
         if self._scene is not None:
             self._scene.clear_trail()
 
-    def _prepare_for(self, robot: Description) -> None:
-        """Start scene and charts over if they are for a robot of another layout."""
+    def _prepare_for_robot(self, robot: Description) -> None:
+        """Replace scene and charts if they are for a robot of another layout, and aim the cameras at the new robot."""
         if self._robot is not None and self._robot.layout == robot.layout:
             return
         self._robot = robot

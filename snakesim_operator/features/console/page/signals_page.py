@@ -25,15 +25,15 @@ from websockets.http11 import Request, Response
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.console.robot_data.signals import Signals
-from snakesim_operator.results.page.charts import LIBRARY, rounded, thinned
-from snakesim_operator.results.page.palette import DARK, LIGHT, joint_colors, variables
+from snakesim_operator.results.page.charts import LIBRARY, round_values, select_rows_to_draw
+from snakesim_operator.results.page.palette import DARK, LIGHT, format_css_variables, make_joint_colors
 
-FOLDER = Path(__file__).parent
-PATH = "/signals"
+PAGE_FOLDER = Path(__file__).parent
+SIGNALS_PATH = "/signals"
 MAX_SIGNALS = 16  # of one request
 LINE_COLORS = 8
 MAX_BUCKETS = 1500  # of time, in each of which a line has at most three points
-OWN_PAGE_HEADER = "X-Snakesim"  # browsers do not let a page of another origin send this header
+SAME_PAGE_HEADER = "X-Snakesim"  # browsers do not let a page of another origin send this header
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self' {}; style-src 'unsafe-inline'; connect-src 'self'; "
     "img-src 'self' blob: data:; frame-ancestors 'self'"
@@ -56,27 +56,27 @@ class SignalsPage:
         """
         self._signals = signals
         self._second_stop = second_stop
-        self._policy = CONTENT_SECURITY_POLICY.format(_script_hash(second_stop))
+        self._policy = CONTENT_SECURITY_POLICY.format(_hash_script(second_stop))
         # Set by the display loop.
         self.now_s: Callable[[], float | None] = lambda: None  # the time that is shown, since the first tick
         self.jump_to: Callable[[float], None] | None = None  # None: a live robot
 
-    def answer(self, request: Request) -> Response | None:
+    def answer_request(self, request: Request) -> Response | None:
         """Return the answer to a request; None if its path is not one of this page."""
         address = urlsplit(request.path)
-        if address.path != PATH and not address.path.startswith(f"{PATH}/"):
+        if address.path != SIGNALS_PATH and not address.path.startswith(f"{SIGNALS_PATH}/"):
             return None
-        path = address.path.removeprefix(PATH)
+        path = address.path.removeprefix(SIGNALS_PATH)
         query = parse_qs(address.query, keep_blank_values=True)
         try:
-            content_type, body = self._make_content(path, query, request)
+            content_type, body = self._make_response_content(path, query, request)
         except KeyError as error:
-            return self._respond(HTTPStatus.NOT_FOUND, "text/plain", f"there is no {error}\n".encode())
+            return self._make_response(HTTPStatus.NOT_FOUND, "text/plain", f"there is no {error}\n".encode())
         except ValueError as error:
-            return self._respond(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
-        return self._respond(HTTPStatus.OK, content_type, body)
+            return self._make_response(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
+        return self._make_response(HTTPStatus.OK, content_type, body)
 
-    def _respond(self, status: HTTPStatus, content_type: str, body: bytes) -> Response:
+    def _make_response(self, status: HTTPStatus, content_type: str, body: bytes) -> Response:
         headers = Headers(
             {
                 "Content-Type": f"{content_type}; charset=utf-8",
@@ -89,8 +89,8 @@ class SignalsPage:
         )
         return Response(status.value, status.phrase, headers, body)
 
-    def _make_content(self, path: str, query: Query, request: Request) -> tuple[str, bytes]:
-        """Return content type and body of the answer to a request for the signals page, its scripts or its data.
+    def _make_response_content(self, path: str, query: Query, request: Request) -> tuple[str, bytes]:
+        """Make content type and body of the response to a request for the signals page, its scripts or its data.
 
         Args:
             path: Path of the request below PATH.
@@ -105,34 +105,34 @@ class SignalsPage:
             case "":
                 return "text/html", self._make_page(is_within_console="within" in query)
             case "/signals.js":
-                return "text/javascript", (FOLDER / "signals.js").read_bytes()
+                return "text/javascript", (PAGE_FOLDER / "signals.js").read_bytes()
             case "/plotly.js":
                 return "text/javascript", LIBRARY.read_bytes()
             case "/names":
-                return _encode_json({"recorded": self._signals.recorded, "units": self._signals.units()})
+                return _encode_json({"recorded": self._signals.recorded, "units": self._signals.get_units()})
             case "/now":
                 return _encode_json({"time_s": self.now_s()})
             case "/go":
-                self._jump(query, request)
+                self._jump_in_recording(query, request)
                 return _encode_json({})
             case "/values":
                 series = self._read_series(query)
                 return _encode_json({name: _thin_for_chart(*one_series) for name, one_series in series.items()})
             case "/values.csv":
-                return "text/csv", _write_csv(self._read_series(query), self._signals.units()).encode()
+                return "text/csv", _format_csv(self._read_series(query), self._signals.get_units()).encode()
             case _:
                 raise KeyError(path)
 
     def _make_page(self, *, is_within_console: bool) -> bytes:
-        page = (FOLDER / "signals.html").read_bytes()
-        page = page.replace(b"/*themes*/", _write_themes().encode())
+        page = (PAGE_FOLDER / "signals.html").read_bytes()
+        page = page.replace(b"/*themes*/", _format_theme_css().encode())
         if is_within_console:
             return page
         return page.replace(b"<body>", b"<body>" + self._second_stop)
 
-    def _jump(self, query: Query, request: Request) -> None:
+    def _jump_in_recording(self, query: Query, request: Request) -> None:
         """Show another time of a recording, if the request comes from this page."""
-        if self.jump_to is None or request.headers.get(OWN_PAGE_HEADER) is None:
+        if self.jump_to is None or request.headers.get(SAME_PAGE_HEADER) is None:
             raise ValueError("only the page of a recording goes to another time")
         self.jump_to(_parse_number(query, "time_s", math.nan))
 
@@ -145,7 +145,7 @@ class SignalsPage:
         to_s = _parse_number(query, "to_s", math.inf)
         series: dict[str, Series] = {}
         for name in names:
-            times_s, values = self._signals.series(name)
+            times_s, values = self._signals.read_series(name)
             is_within = (times_s >= from_s) & (times_s <= to_s)
             series[name] = times_s[is_within], values[is_within]
         return series
@@ -161,54 +161,54 @@ def _parse_number(query: Query, name: str, default: float) -> float:
 
 def _thin_for_chart(times_s: Floats, values: Floats) -> dict[str, object]:
     """Return the points of a line that can be drawn, and minimum, mean and maximum of all its values."""
-    rows = thinned(values, MAX_BUCKETS)
+    rows = select_rows_to_draw(values, MAX_BUCKETS)
     known = values[np.isfinite(values)]
     value_range = None
     if len(known):
         value_range = [float(known.min()), float(known.mean()), float(known.max())]
     return {
         "time_s": np.round(times_s[rows], 4).tolist(),
-        "values": rounded(values[rows]),
+        "values": round_values(values[rows]),
         "range": value_range,
     }
 
 
-def _write_csv(series: dict[str, Series], units: dict[str, str]) -> str:
-    """Return a table with a row for every time at which a signal has a sample.
+def _format_csv(series_by_name: dict[str, Series], unit_by_name: dict[str, str]) -> str:
+    """Format signals as CSV, with a row for every time at which a signal has a sample.
 
     A cell is empty if its signal has no sample at that time, or the value is unknown.
 
     Args:
-        series: Times in s and values of each signal, by name.
-        units: Unit of each signal, by name.
+        series_by_name: Times in s and values of each signal, by name.
+        unit_by_name: Unit of each signal, by name.
     """
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(["time_s", *(f"{name} [{units[name]}]" for name in series)])
-    columns: list[dict[float, float]] = []  # value by time
-    for times_s, values in series.values():
+    csv_text = io.StringIO()
+    writer = csv.writer(csv_text)
+    writer.writerow(["time_s", *(f"{name} [{unit_by_name[name]}]" for name in series_by_name)])
+    value_by_time_columns: list[dict[float, float]] = []  # one for each signal
+    for times_s, values in series_by_name.values():
         rounded_times_s = np.round(times_s, 6).tolist()
-        columns.append(dict(zip(rounded_times_s, values.tolist(), strict=True)))
-    all_times_s = sorted({time_s for column in columns for time_s in column})
+        value_by_time_columns.append(dict(zip(rounded_times_s, values.tolist(), strict=True)))
+    all_times_s = sorted({time_s for column in value_by_time_columns for time_s in column})
     for time_s in all_times_s:
-        numbers = [column.get(time_s, math.nan) for column in columns]
-        cells = ["" if math.isnan(number) else number for number in numbers]
+        row_values = [column.get(time_s, math.nan) for column in value_by_time_columns]
+        cells = ["" if math.isnan(row_value) else row_value for row_value in row_values]
         writer.writerow([time_s, *cells])
-    return text.getvalue()
+    return csv_text.getvalue()
 
 
 def _encode_json(value: object) -> tuple[str, bytes]:
     return "application/json", msgspec.json.encode(value)
 
 
-def _write_themes() -> str:
+def _format_theme_css() -> str:
     """Return the style of the light and of the dark page; the page's script chooses one."""
-    light = variables(LIGHT | joint_colors(LINE_COLORS, dark=False))
-    dark = variables(DARK | joint_colors(LINE_COLORS, dark=True))
+    light = format_css_variables(LIGHT | make_joint_colors(LINE_COLORS, dark=False))
+    dark = format_css_variables(DARK | make_joint_colors(LINE_COLORS, dark=True))
     return f":root{{{light}}}:root.dark{{{dark}color-scheme:dark}}"
 
 
-def _script_hash(html: bytes) -> str:
+def _hash_script(html: bytes) -> str:
     """Return the source expression of a content security policy that allows the one script in this HTML."""
     script = html.partition(b"<script>")[2].partition(b"</script>")[0]
     digest = b64encode(sha256(script).digest()).decode()

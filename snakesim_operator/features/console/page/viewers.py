@@ -26,8 +26,8 @@ class Viewers:
         """Have no viewer yet.
 
         Args:
-            server: Serves the page.
-            context: What the controls of every viewer act on.
+            server: Server of the page.
+            context: Objects that the controls of every viewer act on.
         """
         self._server = server
         self._context = context
@@ -69,7 +69,7 @@ class Viewers:
         """Send the page in control the next question by which the age of its messages is known."""
         holder = self._context.token.holder
         if holder is not None:
-            self._server.ask_for_age(holder, _robot_ns(self._context.get_snapshot()))
+            self._server.ask_for_age(holder, _find_robot_time_ns(self._context.get_snapshot()))
 
     # --- messages of browsers --------------------------------------------------------------------------------
 
@@ -78,7 +78,7 @@ class Viewers:
 
         A page that cannot draw the scene has no controls, but may stop the robot.
         """
-        stopped = self._context.operations.stop.request(format_viewer(viewer))
+        stopped = self._context.operations.stop.request_stop(format_viewer(viewer))
         controls = self._controls.get(viewer)  # without the lock: the thread that holds it may wait for this one
         if controls is not None:
             stopped.add_done_callback(partial(self._show_stop_result, controls))
@@ -95,10 +95,10 @@ class Viewers:
         """Drive the robot by a key of a viewer."""
         controls = self._controls.get(viewer)  # without the lock, as in `stop_robot`
         if controls is not None:
-            controls.drive.on_key(key_name, action)
+            controls.drive_controls.on_key(key_name, action)
 
 
-def _robot_ns(snapshot: RobotSnapshot | None) -> int | None:
+def _find_robot_time_ns(snapshot: RobotSnapshot | None) -> int | None:
     """Return the robot's time; None if it is not known."""
     if snapshot is None or snapshot.time_s is None:
         return None

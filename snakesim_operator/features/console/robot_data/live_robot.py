@@ -39,7 +39,7 @@ MAX_JOINT_STATES = 128  # enough to find the joint state of the instant of a pos
 RATE_PERIOD_S = 1.0  # over which the rates of messages are measured
 MAX_STATUS_AGE_S = 2.0  # a host that is silent for longer has ended; it does not count as a second host
 
-LATCHED_KEYS = (keys.DESCRIPTION, keys.STATUS, keys.PARAMETERS_IN_FORCE, keys.CONFIG)
+LATCHED_MESSAGE_KEYS = (keys.DESCRIPTION, keys.STATUS, keys.PARAMETERS_IN_FORCE, keys.CONFIG)
 STREAM_KEYS = (
     keys.CLOCK,
     keys.JOINTS,
@@ -87,7 +87,7 @@ class KeyBuffer:
 class LiveRobot:
     """Everything that one robot publishes, as far as the console shows it.
 
-    Zenoh's threads call `_store_described` and the `store` of each buffer; all else belongs to the display loop.
+    Zenoh's threads call `_store_sensor_arrival` and the `store` of each buffer; all else belongs to the display loop.
     """
 
     def __init__(self, session: Session) -> None:
@@ -101,38 +101,38 @@ class LiveRobot:
         now_s = time.monotonic()
         self.rejected = session.rejected
         # Messages, by key.
-        self._buffers: dict[str, KeyBuffer] = {}
-        self._newest: dict[str, Any] = {}
+        self._buffer_by_key: dict[str, KeyBuffer] = {}
+        self._newest_by_key: dict[str, Any] = {}
         self._joint_states: deque[JointState] = deque(maxlen=MAX_JOINT_STATES)
         # When a status arrived, from any host and from each host.
-        self._status_time_s = now_s
-        self._host_times_s: dict[str, float] = {}
+        self._last_status_time_s = now_s
+        self._last_status_time_by_host_s: dict[str, float] = {}
         # Rates, and the counts of arrivals from which they were measured.
-        self._rates_hz: dict[str, float] = {}
-        self._counted_s = now_s
-        self._counts: dict[str, int] = {}
-        for key in LATCHED_KEYS:
+        self._rate_by_key_hz: dict[str, float] = {}
+        self._last_count_time_s = now_s
+        self._count_by_key: dict[str, int] = {}
+        for key in LATCHED_MESSAGE_KEYS:
             buffer = self._add_buffer(key, keys.find_message(key), MAX_ARRIVALS)
             session.on_latched_arrival(key, buffer.store)
         for key in STREAM_KEYS:
             buffer = self._add_buffer(key, keys.find_message(key), MAX_ARRIVALS)
             session.on_arrival(key, buffer.store)
         for key in (*IMAGE_ROWS, keys.CUSTOM_ALL):
-            session.on_arrival(key, self._store_described)
+            session.on_arrival(key, self._store_sensor_arrival)
 
     def _add_buffer(self, key: str, message_type: Any, max_arrivals: int) -> KeyBuffer:
         buffer = KeyBuffer(message_type, max_arrivals)
-        self._buffers[key] = buffer
+        self._buffer_by_key[key] = buffer
         return buffer
 
-    def _store_described(self, arrival: Arrival) -> None:
+    def _store_sensor_arrival(self, arrival: Arrival) -> None:
         """Store an arrival of a camera or a custom sensor; called by Zenoh's threads.
 
         Each camera has a key of its own, and gets a buffer with its first image. A custom sensor has a buffer only if
         the robot describes it.
         """
-        buffer = self._buffers.get(arrival.key)
-        has_room = len(self._buffers) < len(LATCHED_KEYS) + len(STREAM_KEYS) + MAX_CAMERAS
+        buffer = self._buffer_by_key.get(arrival.key)
+        has_room = len(self._buffer_by_key) < len(LATCHED_MESSAGE_KEYS) + len(STREAM_KEYS) + MAX_CAMERAS
         if buffer is None and has_room and keys.find_row_key(arrival.key) in IMAGE_ROWS:
             buffer = self._add_buffer(arrival.key, keys.find_message(arrival.key), MAX_IMAGE_ARRIVALS)
         if buffer is not None:
@@ -141,43 +141,45 @@ class LiveRobot:
     @property
     def robot(self) -> Description | None:
         """The newest description."""
-        return self._newest.get(keys.DESCRIPTION)
+        return self._newest_by_key.get(keys.DESCRIPTION)
 
     def take_snapshot(self) -> RobotSnapshot | None:
-        """Return what is known of the robot now; None before it has described itself."""
+        """Decode what has arrived, and return what is known of the robot; None before it has described itself."""
         self._decode_arrivals()
         self._measure_rates()
         robot = self.robot
         if robot is None:
             return None
         now_s = time.monotonic()
-        newest = self._newest.get
-        clock: Clock | None = newest(keys.CLOCK)
-        world: World | None = newest(keys.WORLD)
-        body, base = self._find_body(world)
+        get_newest = self._newest_by_key.get
+        clock: Clock | None = get_newest(keys.CLOCK)
+        world: World | None = get_newest(keys.WORLD)
+        body, base = self._find_body_and_base(world)
         return RobotSnapshot(
             robot=robot,
             # Host.
             time_s=None if clock is None else clock.timestamp_ns * 1e-9,
-            silent_s=now_s - self._status_time_s,
-            status=newest(keys.STATUS),
+            silent_s=now_s - self._last_status_time_s,
+            status=get_newest(keys.STATUS),
             configuration=self._find_configuration(robot),
             hosts=self._list_hosts(now_s),
             # Robot.
-            joints=newest(keys.JOINTS),
+            joints=get_newest(keys.JOINTS),
             body=body,
             base=base,
-            contacts=newest(keys.CONTACTS),
-            applied=newest(keys.APPLIED),
-            power=newest(keys.POWER),
-            imu=newest(keys.IMU),
-            images={key: image for key, image in self._newest.items() if isinstance(image, DepthImage | ColorImage)},
-            custom={key: sample for key, sample in self._newest.items() if isinstance(sample, CustomSample)},
+            contacts=get_newest(keys.CONTACTS),
+            applied=get_newest(keys.APPLIED),
+            power=get_newest(keys.POWER),
+            imu=get_newest(keys.IMU),
+            images={
+                key: image for key, image in self._newest_by_key.items() if isinstance(image, DepthImage | ColorImage)
+            },
+            custom={key: sample for key, sample in self._newest_by_key.items() if isinstance(sample, CustomSample)},
             # Controller.
             world=world,
-            trajectory=newest(keys.TRAJECTORY),
-            control=newest(keys.CONTROL_STATE),
-            parameters=newest(keys.PARAMETERS_IN_FORCE),
+            trajectory=get_newest(keys.TRAJECTORY),
+            control=get_newest(keys.CONTROL_STATE),
+            parameters=get_newest(keys.PARAMETERS_IN_FORCE),
             # Network.
             streams=self._list_streams(clock),
         )
@@ -186,7 +188,7 @@ class LiveRobot:
 
     def _decode_arrivals(self) -> None:
         """Decode what has arrived. A message that does not fit the robot is counted and dropped."""
-        for key, buffer in list(self._buffers.items()):
+        for key, buffer in list(self._buffer_by_key.items()):
             for message in buffer.decode_all(self.rejected):
                 if key == keys.DESCRIPTION:
                     self._update_description(message)
@@ -198,12 +200,12 @@ class LiveRobot:
                     self._keep_message(key, message)
 
     def _keep_message(self, key: str, message: Any) -> None:
-        if keys.find_row_key(key) == keys.CUSTOM_ALL and key not in self._buffers:
+        if keys.find_row_key(key) == keys.CUSTOM_ALL and key not in self._buffer_by_key:
             return  # a custom sensor of a former host, whose description this host has just replaced
-        self._newest[key] = message
+        self._newest_by_key[key] = message
         if key == keys.STATUS:
-            self._status_time_s = time.monotonic()
-            self._host_times_s[message.host or ""] = self._status_time_s
+            self._last_status_time_s = time.monotonic()
+            self._last_status_time_by_host_s[message.host or ""] = self._last_status_time_s
         elif key == keys.JOINTS:
             self._joint_states.append(message)
 
@@ -212,19 +214,19 @@ class LiveRobot:
         former = self.robot
         if former is not None and former.host != robot.host:
             # The configuration has a hash, by which `_find_configuration` knows whether it is of this host.
-            self._newest = {key: message for key, message in self._newest.items() if key == keys.CONFIG}
+            self._newest_by_key = {key: message for key, message in self._newest_by_key.items() if key == keys.CONFIG}
             self._joint_states.clear()
-            self._host_times_s.clear()
+            self._last_status_time_by_host_s.clear()
         if former is None or former.custom != robot.custom:
             self._replace_sensor_buffers(robot)
-        self._newest[keys.DESCRIPTION] = robot
+        self._newest_by_key[keys.DESCRIPTION] = robot
 
     def _replace_sensor_buffers(self, robot: Description) -> None:
         """Add a buffer for each custom sensor that the robot describes, in the place of the former ones."""
-        former_keys = [key for key in self._buffers if keys.find_row_key(key) == keys.CUSTOM_ALL]
+        former_keys = [key for key in self._buffer_by_key if keys.find_row_key(key) == keys.CUSTOM_ALL]
         for key in former_keys:
-            del self._buffers[key]
-            self._newest.pop(key, None)
+            del self._buffer_by_key[key]
+            self._newest_by_key.pop(key, None)
         for key, kind in find_custom_messages(robot).items():
             self._add_buffer(key, kind.message, MAX_ARRIVALS)
 
@@ -232,21 +234,23 @@ class LiveRobot:
 
     def _find_configuration(self, robot: Description) -> Configuration | None:
         """Return the configuration of the host that describes itself, whichever of the two messages came first."""
-        configuration: Configuration | None = self._newest.get(keys.CONFIG)
+        configuration: Configuration | None = self._newest_by_key.get(keys.CONFIG)
         if configuration is None or configuration.config_hash != robot.config_hash:
             return None
         return configuration
 
     def _list_hosts(self, now_s: float) -> frozenset[str]:
         """Return the ids of all hosts that have published a status lately."""
-        return frozenset(host for host, time_s in self._host_times_s.items() if now_s - time_s < MAX_STATUS_AGE_S)
+        return frozenset(
+            host for host, time_s in self._last_status_time_by_host_s.items() if now_s - time_s < MAX_STATUS_AGE_S
+        )
 
-    def _find_body(self, world: World | None) -> tuple[JointState | None, tuple[Vector, Quaternion] | None]:
+    def _find_body_and_base(self, world: World | None) -> tuple[JointState | None, tuple[Vector, Quaternion] | None]:
         """Return the pose of the base, and the joint state that was measured nearest to the pose's time.
 
         The pose is that of guidance, else that of motion capture. Without a pose, the joint state is the newest one.
         """
-        pose: Pose | None = self._newest.get(keys.POSE)
+        pose: Pose | None = self._newest_by_key.get(keys.POSE)
         if world is not None:
             pose_ns = _find_base_time_ns(world)
             base = (world.base_position_w, world.base_orientation_wxyz)
@@ -262,21 +266,23 @@ class LiveRobot:
     def _measure_rates(self) -> None:
         """Measure the rate of each key, once a period."""
         now_s = time.monotonic()
-        elapsed_s = now_s - self._counted_s
+        elapsed_s = now_s - self._last_count_time_s
         if elapsed_s < RATE_PERIOD_S:
             return
-        counts = {key: buffer.count for key, buffer in list(self._buffers.items())}
-        self._rates_hz = {key: (count - self._counts.get(key, 0)) / elapsed_s for key, count in counts.items()}
-        self._counted_s = now_s
-        self._counts = counts
+        counts = {key: buffer.count for key, buffer in list(self._buffer_by_key.items())}
+        self._rate_by_key_hz = {
+            key: (count - self._count_by_key.get(key, 0)) / elapsed_s for key, count in counts.items()
+        }
+        self._last_count_time_s = now_s
+        self._count_by_key = counts
 
     def _list_streams(self, clock: Clock | None) -> dict[str, Stream]:
         """Return rate and age of each key that has published a message and is not latched."""
         streams: dict[str, Stream] = {}
-        for key in list(self._buffers):
-            message = self._newest.get(key)
-            if message is not None and key not in LATCHED_KEYS:
-                streams[key] = Stream(self._rates_hz.get(key, 0.0), _find_age_s(message, clock))
+        for key in list(self._buffer_by_key):
+            message = self._newest_by_key.get(key)
+            if message is not None and key not in LATCHED_MESSAGE_KEYS:
+                streams[key] = Stream(self._rate_by_key_hz.get(key, 0.0), _find_age_s(message, clock))
         return streams
 
 

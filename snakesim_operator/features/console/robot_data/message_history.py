@@ -63,7 +63,7 @@ class MessageHistory:
             return
         messages = self._messages.setdefault(message.key, _KeyMessages())
         previous_s = messages.times_s[-1] if messages.times_s else 0.0
-        messages.times_s.append(max(message.time_ns * 1e-9, previous_s))  # times are sorted, to be searched
+        messages.times_s.append(max(message.robot_time_ns * 1e-9, previous_s))  # times are sorted, to be searched
         if row in KEPT_ROWS:
             messages.kept.append(message)
         if row in IMAGE_ROWS:

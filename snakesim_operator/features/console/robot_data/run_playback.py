@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointState, Mode, Trajectory, World
 from snakesim_hal.wire.quantities import Quaternion, Vector
-from snakesim_operator.features.console.operations import LOG_LINES
+from snakesim_operator.features.console.operations import MAX_LOG_LINES
 from snakesim_operator.features.console.page_log import StateChangeLog
 from snakesim_operator.features.console.robot_data.message_history import IMAGE_ROWS, MessageHistory
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
@@ -39,9 +39,11 @@ class RunPlayback:
         self.history = MessageHistory()
         self.record = RunRecord.load(path, on_message=self.history.add)
         self.history.robot = self.record.description
-        outputs = (self.record.control, self.record.worlds, self.record.trajectories)
-        self._output_times_s = {id(messages): [timestamp_s(message) for message in messages] for messages in outputs}
-        self._log = self._write_log()
+        outputs = (self.record.control_states, self.record.worlds, self.record.trajectories)
+        self._output_times_s = {
+            id(messages): [get_timestamp_s(message) for message in messages] for messages in outputs
+        }
+        self._log = self._make_log()
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -51,17 +53,17 @@ class RunPlayback:
             return 0.0, 0.0
         return float(times_s[0]), float(times_s[-1])
 
-    def snapshot_at(self, time_s: float) -> RobotSnapshot:
-        """Return what was known of the robot at a time of the recorded run, from its newest messages up to then.
+    def make_snapshot(self, time_s: float) -> RobotSnapshot:
+        """Make a snapshot of what was known of the robot at a time of the recorded run, from its newest messages.
 
         Args:
-            time_s: Robot time.
+            time_s: Robot time of the snapshot in s; later messages are not used.
         """
         record = self.record
         history = self.history
         if not len(record.time_s):
             return RobotSnapshot(robot=record.description)
-        row = record.row_at(time_s)
+        row = record.find_nearest_row(time_s)
         joints = self._read_joints(row)
         return RobotSnapshot(
             robot=record.description,
@@ -74,7 +76,7 @@ class RunPlayback:
             # From the controller's output.
             world=self._find_newest(record.worlds, time_s, MAX_CONTROL_AGE_S),
             trajectory=self._find_newest(record.trajectories, time_s),
-            control=self._find_newest(record.control, time_s, MAX_CONTROL_AGE_S),
+            control=self._find_newest(record.control_states, time_s, MAX_CONTROL_AGE_S),
             # From the other messages of the recording.
             status=history.find_newest(keys.STATUS, time_s),
             power=history.find_newest(keys.POWER, time_s),
@@ -89,7 +91,7 @@ class RunPlayback:
         """Yield the snapshots before a time, oldest first, as far back as charts show them."""
         first_s = max(time_s - CHART_HISTORY_S, self.span_s[0])
         times_s = np.linspace(first_s, time_s, CHART_SAMPLES, endpoint=False).tolist()
-        return (self.snapshot_at(earlier_s) for earlier_s in times_s)
+        return (self.make_snapshot(earlier_s) for earlier_s in times_s)
 
     def _find_newest(
         self, messages: Sequence[MessageT], time_s: float, max_age_s: float | None = None
@@ -111,32 +113,32 @@ class RunPlayback:
 
     # --- the log ---------------------------------------------------------------------------------------------
 
-    def _write_log(self) -> list[tuple[float, str]]:
-        """Return the log that a live page would have had, as robot times and lines.
+    def _make_log(self) -> list[tuple[float, str]]:
+        """Make the log that a live page would have had, as pairs of robot time and line.
 
-        The time in a line is that since the first tick.
+        The time in the text of a line is the time since the first tick.
         """
         messages: list[tuple[float, Any]] = [
             *self.history.iterate_messages(keys.STATUS),
             *self.history.iterate_messages(keys.PARAMETERS_IN_FORCE),
-            *((timestamp_s(state), state) for state in self.record.control),
+            *((get_timestamp_s(state), state) for state in self.record.control_states),
         ]
         messages.sort(key=lambda timed_message: timed_message[0])
-        begin_s, _ = self.span_s
+        start_s, _ = self.span_s
         log: list[tuple[float, str]] = []
         new_lines: list[str] = []
-        changes = StateChangeLog(new_lines.append)
+        state_change_log = StateChangeLog(new_lines.append)
         for time_s, message in messages:
-            changes.note(message)
+            state_change_log.log_change(message)
             for line in new_lines:
-                log.append((time_s, f"{time_s - begin_s:8.2f} s  {line}"))
+                log.append((time_s, f"{time_s - start_s:8.2f} s  {line}"))
             new_lines.clear()
         return log
 
     def _read_log(self, time_s: float) -> list[str]:
         """Return the newest lines of the log at a time, newest first."""
         lines = [line for line_time_s, line in self._log if line_time_s <= time_s]
-        newest = lines[-LOG_LINES:]
+        newest = lines[-MAX_LOG_LINES:]
         newest.reverse()
         return newest
 
@@ -178,7 +180,7 @@ class RunPlayback:
         return (x, y, z), (qw, qx, qy, qz)
 
 
-def timestamp_s(message: ControlState | World | Trajectory) -> float:
+def get_timestamp_s(message: ControlState | World | Trajectory) -> float:
     """Return the robot time of a controller's message in s; 0 if it has none."""
     return (message.timestamp_ns or 0) * 1e-9
 

@@ -46,11 +46,11 @@ class Signals(Protocol):
 
     recorded: bool
 
-    def units(self) -> dict[str, str]:
+    def get_units(self) -> dict[str, str]:
         """Return the unit of every signal, by the signal's name."""
         ...
 
-    def series(self, name: str) -> tuple[Floats, Floats]:
+    def read_series(self, name: str) -> tuple[Floats, Floats]:
         """Return the times and the values of a signal.
 
         Returns:
@@ -88,7 +88,7 @@ class LiveSignals:
             return
         if self._samples and 0 <= time_s - self._samples[-1].time_s < LIVE_PERIOD_S:
             return
-        numbers = collect_numbers(snapshot)
+        numbers = collect_signal_values(snapshot)
         values = np.fromiter(numbers.values.values(), dtype=float, count=len(numbers.values))
         with self._lock:
             if self._samples and time_s < self._samples[-1].time_s:  # the robot was reset, or is another one
@@ -102,11 +102,11 @@ class LiveSignals:
         with self._lock:
             return self._samples[-1].time_s if self._samples else None
 
-    def units(self) -> dict[str, str]:
+    def get_units(self) -> dict[str, str]:
         with self._lock:
             return dict(self._units)
 
-    def series(self, name: str) -> tuple[Floats, Floats]:
+    def read_series(self, name: str) -> tuple[Floats, Floats]:
         with self._lock:
             if name not in self._units:
                 raise KeyError(name)
@@ -123,7 +123,7 @@ def list_message_numbers(message: Message, robot: Description) -> dict[str, floa
     numbers: dict[str, float] = {}
     prefix = type(message).__name__.removesuffix("State").lower()
     for field_name in find_units(type(message)):
-        _flatten(f"{prefix}.{field_name}", getattr(message, field_name), robot, numbers)
+        _flatten_fields(f"{prefix}.{field_name}", getattr(message, field_name), robot, numbers)
     return numbers
 
 
@@ -158,7 +158,7 @@ def _find_first_unit(schemas: Iterable[Any]) -> str | None:
     return None
 
 
-def _flatten(name: str, value: Any, robot: Description, numbers: dict[str, float]) -> None:
+def _flatten_fields(name: str, value: Any, robot: Description, numbers: dict[str, float]) -> None:
     """Add each number of a field to `numbers`, under the field's name and the name of each part."""
     if isinstance(value, dict):
         parts = list(value.items())
@@ -168,7 +168,7 @@ def _flatten(name: str, value: Any, robot: Description, numbers: dict[str, float
         numbers[name] = np.nan if value is None else float(value)
         return
     for part, element in parts:
-        _flatten(f"{name}.{part}", element, robot, numbers)
+        _flatten_fields(f"{name}.{part}", element, robot, numbers)
 
 
 def _name_parts(values: list[Any] | tuple[Any, ...], robot: Description) -> Iterable[object]:
@@ -181,7 +181,7 @@ def _name_parts(values: list[Any] | tuple[Any, ...], robot: Description) -> Iter
 
 
 @dataclass
-class Numbers:
+class SignalValues:
     """Values and units, by signal."""
 
     values: dict[str, float] = field(default_factory=dict[str, float])
@@ -193,30 +193,30 @@ class Numbers:
         self.units[name] = unit
 
     def add_axes(self, name: str, axes: str, values: Iterable[float]) -> None:
-        """Add a signal for each axis of a vector. name: a key of OTHER_UNITS."""
+        """Add a signal for each axis of a vector. `name` is a key of OTHER_UNITS."""
         for axis, value in zip(axes, values, strict=True):
             self.add(f"{name}.{axis}", value, OTHER_UNITS[name])
 
 
-def collect_numbers(snapshot: RobotSnapshot) -> Numbers:
-    """Return all numbers of a snapshot, under the names that they have in a recording."""
-    numbers = Numbers()
-    _add_joint_numbers(numbers, snapshot)
+def collect_signal_values(snapshot: RobotSnapshot) -> SignalValues:
+    """Collect the values of all signals of a snapshot, under the names that the signals have in a recording."""
+    signal_values = SignalValues()
+    _add_joint_numbers(signal_values, snapshot)
     if snapshot.base is not None:
         position_w, orientation_wxyz = snapshot.base
-        numbers.add_axes("position_w_m", "xyz", position_w)
-        numbers.add_axes("orientation_wxyz", "wxyz", orientation_wxyz)
+        signal_values.add_axes("position_w_m", "xyz", position_w)
+        signal_values.add_axes("orientation_wxyz", "wxyz", orientation_wxyz)
     if snapshot.contacts is not None:
-        peak_n, count = summarize_contacts(snapshot.contacts)
-        numbers.add("contact_peak_n", peak_n, OTHER_UNITS["contact_peak_n"])
-        numbers.add("contact_count", float(count), OTHER_UNITS["contact_count"])
+        peak_n, contact_count = summarize_contacts(snapshot.contacts)
+        signal_values.add("contact_peak_n", peak_n, OTHER_UNITS["contact_peak_n"])
+        signal_values.add("contact_count", float(contact_count), OTHER_UNITS["contact_count"])
     for message in (snapshot.control, snapshot.power, snapshot.imu):
         if message is not None:
-            message_numbers = list_message_numbers(message, snapshot.robot)
-            for name, value in message_numbers.items():
-                numbers.add(name, value, find_signal_unit(name, type(message)))
-    _add_sensor_numbers(numbers, snapshot)
-    return numbers
+            values_by_name = list_message_numbers(message, snapshot.robot)
+            for name, value in values_by_name.items():
+                signal_values.add(name, value, find_signal_unit(name, type(message)))
+    _add_sensor_numbers(signal_values, snapshot)
+    return signal_values
 
 
 def find_signal_unit(name: str, message_type: type[Message]) -> str:
@@ -230,7 +230,7 @@ def find_signal_unit(name: str, message_type: type[Message]) -> str:
     return find_units(message_type)[field_name]
 
 
-def _add_joint_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
+def _add_joint_numbers(signal_values: SignalValues, snapshot: RobotSnapshot) -> None:
     for message in (snapshot.joints, snapshot.applied):
         if message is None:
             continue
@@ -238,16 +238,16 @@ def _add_joint_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
         for field_name in JOINT_FIELDS[type(message)]:
             values = getattr(message, field_name)
             for joint, value in zip(snapshot.robot.joints, values, strict=False):
-                numbers.add(f"{field_name}.{joint.name}", float(value), units[field_name])
+                signal_values.add(f"{field_name}.{joint.name}", float(value), units[field_name])
 
 
-def _add_sensor_numbers(numbers: Numbers, snapshot: RobotSnapshot) -> None:
+def _add_sensor_numbers(signal_values: SignalValues, snapshot: RobotSnapshot) -> None:
     """Add the numbers of custom sensors: field, sensor, and part of a list."""
     for key, kind in find_custom_messages(snapshot.robot).items():
         sample = snapshot.custom.get(key)
         if sample is None:
             continue
         sensor = key.rpartition("/")[2]
-        for name, value in kind.numbers(sample).items():
+        for name, value in kind.extract_numeric_values(sample).items():
             field_name, dot, part = name.partition(".")
-            numbers.add(f"{field_name}.{sensor}{dot}{part}", value, kind.units[field_name])
+            signal_values.add(f"{field_name}.{sensor}{dot}{part}", value, kind.units[field_name])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.robot import describe_robot
-from snakesim_hal.model.scenario import RunConfig, config_hash, find_start_pose
+from snakesim_hal.model.scenario import RunConfig, compute_config_hash, compute_start_pose
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     ColorImage,
@@ -71,25 +71,31 @@ class RobotSnapshot:
 
 
 def make_expected_snapshot(config: RunConfig) -> RobotSnapshot:
-    """Return the robot of a run that is starting, as its scenario places it on flat ground."""
+    """Make a snapshot of the robot of a run that is starting, as its scenario places it on flat ground.
+
+    The page shows it until the host of the run describes itself.
+
+    Args:
+        config: Configuration of the run.
+    """
     robot = describe_robot(
         config.robot,
         backend=config.backend,
         period_ns=config.period_ns,
         lease_ns=config.lease_ns,
-        config_hash=config_hash(config),
+        config_hash=compute_config_hash(config),
     )
-    start = find_start_pose(config)
-    zeros = [0.0] * len(robot.joints)
+    start_pose = compute_start_pose(config)
+    zero_per_joint = [0.0] * len(robot.joints)
     joints = JointState(
         tick=0,
         timestamp_ns=0,
-        angle_rad=start.angles_rad.tolist(),
-        velocity_rad_s=zeros,
-        torque_nm=zeros,
+        angle_rad=start_pose.angles_rad.tolist(),
+        velocity_rad_s=zero_per_joint,
+        torque_nm=zero_per_joint,
         valid=[True] * len(robot.joints),
         age_ns=[0] * len(robot.joints),
     )
-    position_w = (*start.position_w, config.robot.module.radius_m)
-    base = position_w, quaternion_from_yaw(start.yaw_rad)
+    position_w = (*start_pose.position_w, config.robot.module.radius_m)
+    base = position_w, quaternion_from_yaw(start_pose.yaw_rad)
     return RobotSnapshot(robot=robot, expected=True, joints=joints, body=joints, base=base)

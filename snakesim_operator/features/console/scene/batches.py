@@ -7,7 +7,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 
 from snakesim_operator.features.console.scene.meshes import Mesh
-from snakesim_operator.features.console.scene.scene_colors import Color, linear_colors
+from snakesim_operator.features.console.scene.scene_colors import Color, convert_to_linear_colors
 
 
 def to_float32(values: ArrayLike) -> NDArray[np.float32]:
@@ -27,7 +27,7 @@ def add_batch(
         batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
         batched_positions=np.zeros((count, 3)),
         batched_scales=np.ones((count, 3)),
-        batched_colors=linear_colors([color] * count),
+        batched_colors=convert_to_linear_colors([color] * count),
         lod="off",
         **options,
     )

@@ -11,18 +11,18 @@ from functools import cached_property
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
+from snakesim_hal.model.kinematics import compute_link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
 from snakesim_hal.physics.hills import make_heights
 from snakesim_hal.wire.messages import ColorImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.results.metrics.force_tracking import is_measured
+from snakesim_operator.results.metrics.force_tracking import is_contact_measured
 
 M_PER_N = 0.02  # length of a force arrow
-LONGEST_M = 0.5  # of a force arrow
+MAX_FORCE_ARROW_M = 0.5  # of a force arrow
 ABOVE_M = 0.02  # forces are drawn above the body, which would hide most of them at the height of the contacts
-NORMAL_M = 0.08  # length of a contact's normal
-TANGENT_M = 0.05
+NORMAL_ARROW_M = 0.08  # length of a contact's normal
+TANGENT_ARROW_M = 0.05
 PATH_ABOVE_M = 0.006  # the path is drawn just above the ground
 MIN_FORCE_N = 0.3  # weaker forces are not drawn
 # A camera looks along its x, z up; a frustum of the viewer along z, y down.
@@ -31,11 +31,11 @@ LINK_FROM_FRUSTUM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 AT_ORIGIN_WXYZ = (1.0, 0.0, 0.0, 0.0)
 
 
-def _no_points() -> Floats:
+def _make_no_points() -> Floats:
     return np.zeros((0, 3))
 
 
-def _no_arrows() -> Floats:
+def _make_no_arrows() -> Floats:
     return np.zeros((0, 2, 3))
 
 
@@ -86,13 +86,13 @@ class CameraFrustum:
 class ForceArrows:
     """Contacts and forces of one snapshot, as points (n, 3) and arrows (n, 2, 3) from start to end."""
 
-    contacts_w: Floats = field(default_factory=_no_points)
-    normals: Floats = field(default_factory=_no_arrows)
-    tangents: Floats = field(default_factory=_no_arrows)
-    measured_forces: Floats = field(default_factory=_no_arrows)  # on the body
-    resultant: Floats = field(default_factory=_no_arrows)  # of the measured forces, at the body's center
-    desired_forces: Floats = field(default_factory=_no_arrows)  # of the controller, at push-points with contact
-    forces_without_contact: Floats = field(default_factory=_no_arrows)  # likewise, at push-points without contact
+    contacts_w: Floats = field(default_factory=_make_no_points)
+    normals: Floats = field(default_factory=_make_no_arrows)
+    tangents: Floats = field(default_factory=_make_no_arrows)
+    measured_forces: Floats = field(default_factory=_make_no_arrows)  # on the body
+    resultant: Floats = field(default_factory=_make_no_arrows)  # of the measured forces, at the body's center
+    desired_forces: Floats = field(default_factory=_make_no_arrows)  # of the controller, at push-points with contact
+    forces_without_contact: Floats = field(default_factory=_make_no_arrows)  # likewise, at push-points without contact
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,7 +109,7 @@ class Drawing(ForceArrows):
     propulsion_joint: int | None = None
 
     # What it moves among.
-    path_w: Floats = field(default_factory=_no_points)
+    path_w: Floats = field(default_factory=_make_no_points)
     perceived: tuple[Obstacle, ...] = ()  # by guidance
     pushed_obstacles: frozenset[str] = frozenset()  # names; the body pushes off these
     obstacles_ahead: frozenset[str] = frozenset()  # names; navigation expects push-points there along the path
@@ -122,7 +122,7 @@ def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing 
     If the pose of the robot is unknown, its tail is drawn at the origin.
 
     Args:
-        snapshot: What is known of the robot at one time.
+        snapshot: Snapshot of the robot at one time.
         surroundings: The true surroundings of the robot; None if they are unknown.
 
     Returns:
@@ -137,22 +137,22 @@ def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing 
     base_rotation = rotation_from_quaternion(orientation_wxyz)
     axes = [joint.axis for joint in robot.joints]
     lengths_m = [link.length_m for link in robot.links]
-    origins_w, rotations = link_frames(position_w, base_rotation, body.angle_rad, axes, lengths_m)
+    origins_w, rotations = compute_link_frames(position_w, base_rotation, body.angle_rad, axes, lengths_m)
     middles_w = origins_w + rotations[:, :, 0] * (np.array(lengths_m)[:, None] / 2)
     center_w = middles_w.mean(axis=0)
-    path_w = _no_points()
+    path_w = _make_no_points()
     obstacles_ahead = frozenset[str]()
     if snapshot.trajectory is not None:
         path_w = _lay_on_ground(np.array(snapshot.trajectory.path_w), surroundings)
         obstacles_ahead = frozenset(snapshot.trajectory.push_points)
-    cameras = [_camera_frustum(key, image, origins_w, rotations) for key, image in snapshot.images.items()]
+    cameras = [_make_camera_frustum(key, image, origins_w, rotations) for key, image in snapshot.images.items()]
     return Drawing(
         # The snake.
         center_w=center_w,
         links_w=middles_w,
         links_wxyz=quaternions_from_rotations(rotations),
         hinges_w=origins_w[1:],
-        hinges_wxyz=quaternions_from_rotations(_hinge_rotations(rotations[:-1], axes)),
+        hinges_wxyz=quaternions_from_rotations(_compute_hinge_rotations(rotations[:-1], axes)),
         failed_joints=_find_failed_joints(snapshot),
         propulsion_joint=find_propulsion_joint(snapshot),
         # What it moves among.
@@ -162,12 +162,12 @@ def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing 
         obstacles_ahead=obstacles_ahead,
         cameras=tuple(cameras),
         # Contacts and forces.
-        **_contact_arrows(snapshot, center_w),
-        **_desired_force_arrows(snapshot),
+        **_make_contact_arrows(snapshot, center_w),
+        **_make_desired_force_arrows(snapshot),
     )
 
 
-def _hinge_rotations(rotations: Floats, axes: Sequence[str]) -> Floats:
+def _compute_hinge_rotations(rotations: Floats, axes: Sequence[str]) -> Floats:
     """Return rotations whose z is the axis about which each joint turns."""
     hinges = rotations.copy()
     for i, axis in enumerate(axes):
@@ -218,20 +218,20 @@ def _find_pushed_obstacles(snapshot: RobotSnapshot) -> frozenset[str]:
     contacts = _list_contacts(snapshot)
     names: set[str] = set()
     for push_point in snapshot.control.push_points:
-        if push_point.obstacle and is_measured(push_point, contacts):
+        if push_point.obstacle and is_contact_measured(push_point, contacts):
             names.add(push_point.obstacle)
     return frozenset(names)
 
 
-def _contact_arrows(snapshot: RobotSnapshot, center_w: Floats) -> dict[str, Floats]:
-    """Return contacts, measured forces and their resultant as fields of ForceArrows.
+def _make_contact_arrows(snapshot: RobotSnapshot, center_w: Floats) -> dict[str, Floats]:
+    """Make the arrows of contacts, measured forces and their resultant, as fields of `ForceArrows`.
 
     Args:
         snapshot: The newest snapshot of the robot, with its contacts.
         center_w: (3,) center of the body in the world, where the resultant is drawn, m.
 
     Returns:
-        Points (n, 3) or arrows (n, 2, 3) by the name of the field; no fields without contacts.
+        Points (n, 3) or arrows (n, 2, 3) by the name of the field; an empty dict without contacts.
     """
     contacts = _list_contacts(snapshot)
     if not contacts:
@@ -241,19 +241,19 @@ def _contact_arrows(snapshot: RobotSnapshot, center_w: Floats) -> dict[str, Floa
     tangents_w = np.array([contact.tangent_w for contact in contacts])
     forces_n = np.array([contact.force_w for contact in contacts])
     is_strong = np.linalg.norm(forces_n, axis=1) > MIN_FORCE_N
-    arrows = {
+    arrows_by_field = {
         "contacts_w": positions_w,
-        "normals": _arrows(positions_w, NORMAL_M * normals_w),
-        "tangents": _arrows(positions_w, TANGENT_M * tangents_w),
-        "measured_forces": _force_arrows(snapshot, positions_w[is_strong], forces_n[is_strong]),
+        "normals": _arrows(positions_w, NORMAL_ARROW_M * normals_w),
+        "tangents": _arrows(positions_w, TANGENT_ARROW_M * tangents_w),
+        "measured_forces": _make_force_arrows(snapshot, positions_w[is_strong], forces_n[is_strong]),
     }
     total_n = forces_n.sum(axis=0)
     if np.linalg.norm(total_n) > MIN_FORCE_N:
-        arrows["resultant"] = _force_arrows(snapshot, center_w[None], total_n[None])
-    return arrows
+        arrows_by_field["resultant"] = _make_force_arrows(snapshot, center_w[None], total_n[None])
+    return arrows_by_field
 
 
-def _desired_force_arrows(snapshot: RobotSnapshot) -> dict[str, Floats]:
+def _make_desired_force_arrows(snapshot: RobotSnapshot) -> dict[str, Floats]:
     """Return the controller's desired forces, with and without contact, as fields of ForceArrows."""
     control = snapshot.control
     if control is None or not control.push_points or len(control.push_points) != len(control.desired_force_n):
@@ -262,15 +262,15 @@ def _desired_force_arrows(snapshot: RobotSnapshot) -> dict[str, Floats]:
     positions_w = np.array([point.position_w for point in control.push_points])
     normals_w = np.array([point.normal_w for point in control.push_points])
     forces_n = np.array(control.desired_force_n)[:, None] * normals_w
-    arrows = _force_arrows(snapshot, positions_w, forces_n)
-    has_contact = np.array([is_measured(point, contacts) for point in control.push_points])
+    arrows = _make_force_arrows(snapshot, positions_w, forces_n)
+    has_contact = np.array([is_contact_measured(point, contacts) for point in control.push_points])
     return {"desired_forces": arrows[has_contact], "forces_without_contact": arrows[~has_contact]}
 
 
-def _force_arrows(snapshot: RobotSnapshot, positions_w: Floats, forces_n: Floats) -> Floats:
+def _make_force_arrows(snapshot: RobotSnapshot, positions_w: Floats, forces_n: Floats) -> Floats:
     """Return arrows of limited length for forces (n, 3), above the places where they act."""
     magnitude_n = np.linalg.norm(forces_n, axis=1, keepdims=True)
-    scale = np.minimum(M_PER_N, LONGEST_M / np.maximum(magnitude_n, 1e-9))
+    scale = np.minimum(M_PER_N, MAX_FORCE_ARROW_M / np.maximum(magnitude_n, 1e-9))
     above_m = max(link.radius_m for link in snapshot.robot.links) + ABOVE_M
     return _arrows(positions_w + np.array([0.0, 0.0, above_m]), scale * forces_n)
 
@@ -287,7 +287,7 @@ def _lay_on_ground(points_w: Floats, surroundings: Surroundings | None) -> Float
     return np.column_stack([points_w, heights_m + PATH_ABOVE_M])
 
 
-def _camera_frustum(key: str, image: DepthImage | ColorImage, origins: Floats, rotations: Floats) -> CameraFrustum:
+def _make_camera_frustum(key: str, image: DepthImage | ColorImage, origins: Floats, rotations: Floats) -> CameraFrustum:
     """Return where a camera of the robot is, from the pose of its link and the mounting in its image."""
     link_rotation = rotations[image.link]
     rotation = link_rotation @ rotation_from_quaternion(image.orientation_l_wxyz) @ LINK_FROM_FRUSTUM

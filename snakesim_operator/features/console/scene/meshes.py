@@ -14,12 +14,12 @@ ROUND_SIDES = 32  # sides of the polygon that is drawn for a circle
 
 
 def make_capsule(length_m: float, radius_m: float) -> Mesh:
-    """Return a capsule along x about the origin. length_m: between the centers of its two spheres."""
+    """Make a capsule along x about the origin. `length_m` is the distance between the centers of its two spheres."""
     angles_rad = np.linspace(0.0, np.pi / 2, ROUND_SIDES // 4)
     upper_cap = np.column_stack([radius_m * np.sin(angles_rad), length_m / 2 + radius_m * np.cos(angles_rad)])
     lower_cap = upper_cap * [1.0, -1.0]
     profile = np.vstack([lower_cap, upper_cap[::-1]])
-    vertices, faces = _revolve(profile)
+    vertices, faces = _revolve_profile(profile)
     along_x = vertices[:, [2, 0, 1]]
     return along_x, faces
 
@@ -34,14 +34,14 @@ def make_cylinder(radius_m: float, height_m: float) -> Mesh:
     half_m = height_m / 2
     lower_edge = (radius_m, -half_m)
     upper_edge = (radius_m, half_m)
-    bottom = _revolve(np.array([(0.0, -half_m), lower_edge]))
-    side = _revolve(np.array([lower_edge, upper_edge]))
-    top = _revolve(np.array([upper_edge, (0.0, half_m)]))
-    return _merge([bottom, side, top])
+    bottom = _revolve_profile(np.array([(0.0, -half_m), lower_edge]))
+    side = _revolve_profile(np.array([lower_edge, upper_edge]))
+    top = _revolve_profile(np.array([upper_edge, (0.0, half_m)]))
+    return _merge_meshes([bottom, side, top])
 
 
 def make_box(half_m: float) -> Mesh:
-    """Return a cube about the origin. half_m: half the length of an edge."""
+    """Make a cube about the origin. `half_m` is half the length of an edge."""
     square = np.array([(-1.0, -1.0, 1.0), (1.0, -1.0, 1.0), (1.0, 1.0, 1.0), (-1.0, 1.0, 1.0)])
     faces = np.array([(0, 1, 2), (0, 2, 3)])
     positive_sides = [np.roll(square, axis, axis=1) * half_m for axis in range(3)]
@@ -49,7 +49,7 @@ def make_box(half_m: float) -> Mesh:
     # A side that is mirrored at the origin shows its inside, until the order of its vertices is reversed.
     parts = [(side, faces) for side in positive_sides]
     parts += [(side, faces[:, ::-1]) for side in negative_sides]
-    return _merge(parts)
+    return _merge_meshes(parts)
 
 
 def make_hoops(corners: NDArray[np.float64], half_m: float, width_m: float) -> Mesh:
@@ -62,14 +62,14 @@ def make_hoops(corners: NDArray[np.float64], half_m: float, width_m: float) -> M
     """
     lower_band = _make_band(corners, -half_m, width_m - half_m)
     upper_band = _make_band(corners, half_m - width_m, half_m)
-    return _merge([lower_band, upper_band])
+    return _merge_meshes([lower_band, upper_band])
 
 
 def _make_band(corners: NDArray[np.float64], low_m: float, high_m: float) -> Mesh:
     count = len(corners)
     low_ring = np.column_stack([corners, np.full(count, low_m)])
     high_ring = np.column_stack([corners, np.full(count, high_m)])
-    return np.vstack([low_ring, high_ring]), np.vstack(_ring_faces(count))
+    return np.vstack([low_ring, high_ring]), np.vstack(_make_ring_faces(count))
 
 
 def make_circle() -> NDArray[np.float64]:
@@ -78,7 +78,7 @@ def make_circle() -> NDArray[np.float64]:
     return np.column_stack([np.cos(angles_rad), np.sin(angles_rad)])
 
 
-def _revolve(profile: NDArray[np.float64]) -> Mesh:
+def _revolve_profile(profile: NDArray[np.float64]) -> Mesh:
     """Return the surface that a profile sweeps when it is turned about z.
 
     Args:
@@ -91,11 +91,11 @@ def _revolve(profile: NDArray[np.float64]) -> Mesh:
     faces: list[NDArray[np.int64]] = []
     for ring_index in range(len(profile) - 1):
         first_vertex = ring_index * ROUND_SIDES
-        faces += [triangles + first_vertex for triangles in _ring_faces(ROUND_SIDES)]
+        faces += [triangles + first_vertex for triangles in _make_ring_faces(ROUND_SIDES)]
     return np.vstack(rings), np.vstack(faces)
 
 
-def _ring_faces(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _make_ring_faces(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the triangles between two rings of `count` vertices: two sets of (count, 3).
 
     The vertices of the lower ring come first, those of the upper ring follow.
@@ -107,7 +107,7 @@ def _ring_faces(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return lower_triangles, upper_triangles
 
 
-def _merge(parts: list[Mesh]) -> Mesh:
+def _merge_meshes(parts: list[Mesh]) -> Mesh:
     """Return several meshes as one."""
     all_vertices: list[NDArray[np.float64]] = []
     all_faces: list[NDArray[np.int64]] = []

@@ -24,7 +24,7 @@ from snakesim_operator.features.console.scene.scene_colors import (
     PERCEIVED,
     PUSHED_OBSTACLE,
     Color,
-    linear_colors,
+    convert_to_linear_colors,
 )
 
 SQUARE = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
@@ -76,18 +76,18 @@ class ObstacleMeshes:
             name = f"{self._name}/{shape}"
             batch = add_batch(self._scene, name, self._shapes[shape], count, self._color, **self._options)
             self.batches[shape] = batch
-        sizes = np.array([_mesh_scale(obstacle) for obstacle in obstacles])
+        sizes = np.array([_compute_mesh_scale(obstacle) for obstacle in obstacles])
         batch.batched_positions = to_float32([obstacle.position_w for obstacle in obstacles])
         batch.batched_wxyzs = to_float32([quaternion_from_yaw(obstacle.yaw_rad) for obstacle in obstacles])
         batch.batched_scales = to_float32(scale * sizes)
         if len(batch.batched_colors) != count:
-            batch.batched_colors = linear_colors([self._color] * count)
+            batch.batched_colors = convert_to_linear_colors([self._color] * count)
 
     def set_colors(self, shape: str, colors: Sequence[Color]) -> None:
         """Color the obstacles of a shape, one color each."""
         batch = self.batches.get(shape)
         if batch is not None:
-            batch.batched_colors = linear_colors(colors)
+            batch.batched_colors = convert_to_linear_colors(colors)
 
     def set_opacities(self, shape: str, opacities: Sequence[float]) -> None:
         """Make the obstacles of a shape more or less transparent, 0 to 1 each."""
@@ -109,7 +109,7 @@ class TrueObstacles:
         for shape in TRUE_SHAPES:
             names = [obstacle.name for obstacle in self._obstacles if obstacle.shape == shape]
             if names:
-                self._meshes.set_colors(shape, [_obstacle_color(name, drawing) for name in names])
+                self._meshes.set_colors(shape, [_choose_obstacle_color(name, drawing) for name in names])
 
 
 class PerceivedObstacles:
@@ -129,7 +129,7 @@ class PerceivedObstacles:
                 self.meshes.set_opacities(shape, opacities)
 
 
-def _obstacle_color(name: str, drawing: Drawing) -> Color:
+def _choose_obstacle_color(name: str, drawing: Drawing) -> Color:
     if name in drawing.pushed_obstacles:
         return PUSHED_OBSTACLE
     if name in drawing.obstacles_ahead:
@@ -137,7 +137,7 @@ def _obstacle_color(name: str, drawing: Drawing) -> Color:
     return OBSTACLE
 
 
-def _mesh_scale(obstacle: Obstacle) -> tuple[float, float, float]:
+def _compute_mesh_scale(obstacle: Obstacle) -> tuple[float, float, float]:
     """Return the factors by which the unit mesh of the obstacle's shape is stretched along x, y and z."""
     match obstacle.shape:
         case "box":

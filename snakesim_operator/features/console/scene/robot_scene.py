@@ -18,7 +18,7 @@ from snakesim_operator.features.console.scene.batches import add_batch, to_float
 from snakesim_operator.features.console.scene.drawing import CameraFrustum, Drawing, Surroundings
 from snakesim_operator.features.console.scene.meshes import make_capsule, make_cylinder
 from snakesim_operator.features.console.scene.obstacle_meshes import PerceivedObstacles, TrueObstacles
-from snakesim_operator.features.console.scene.scene_colors import Color, linear_colors
+from snakesim_operator.features.console.scene.scene_colors import Color, convert_to_linear_colors
 
 TRAIL_STEP_M = 0.02
 TRAIL_MAX_POINTS = 1000
@@ -96,12 +96,12 @@ class RobotScene:
         for (length_m, radius_m), indices in links_by_size.items():
             name = f"snake/links_{len(batches)}"
             batch = add_batch(self._scene, name, make_capsule(length_m, radius_m), len(indices), scene_colors.LINK)
-            batch.batched_scales = to_float32([_link_scale(i) for i in indices])
-            batch.batched_colors = linear_colors([self._link_color(i) for i in indices])
+            batch.batched_scales = to_float32([_compute_link_scale(i) for i in indices])
+            batch.batched_colors = convert_to_linear_colors([self._choose_link_color(i) for i in indices])
             batches.append((batch, indices))
         return batches
 
-    def _link_color(self, index: int) -> Color:
+    def _choose_link_color(self, index: int) -> Color:
         if index == len(self._robot.links) - 1:
             return scene_colors.HEAD
         if index % 2:
@@ -118,7 +118,11 @@ class RobotScene:
         )
 
     def _add_ground(self, surroundings: Surroundings | None) -> None:
-        """Add the heightfield, if there is one, and a grid below the lowest point of the ground."""
+        """Add the ground to the scene: its heightfield, if it has one, and a grid below its lowest point.
+
+        Args:
+            surroundings: The true surroundings of the robot; None if they are not known.
+        """
         grid_height_m = -0.002
         heightfield = None if surroundings is None else surroundings.heights_m
         if heightfield is not None:
@@ -141,24 +145,24 @@ class RobotScene:
 
         Args:
             along_m: (n,) coordinates of the samples, the same along x and along y.
-            heights_m: (n, n) heights; a row has one y.
+            heights_m: (n, n) heights in m; all samples of a row have the same y.
         """
-        step = max(1, math.ceil(len(along_m) / MAX_HEIGHTFIELD_ROWS))
-        along_m = along_m[::step]
-        heights_m = heights_m[::step, ::step]
-        n = len(along_m)
+        stride = max(1, math.ceil(len(along_m) / MAX_HEIGHTFIELD_ROWS))
+        along_m = along_m[::stride]
+        heights_m = heights_m[::stride, ::stride]
+        row_length = len(along_m)
         x, y = np.meshgrid(along_m, along_m)
         vertices = np.column_stack([x.ravel(), y.ravel(), heights_m.ravel() - HEIGHTFIELD_DROP_M])
         # Each cell of the grid is two triangles. `corner` is the index of the cell's vertex with the smallest x and y.
-        row = np.arange(n - 1)[:, None]
-        column = np.arange(n - 1)[None, :]
-        corner = (row * n + column).ravel()
-        lower = np.stack([corner, corner + 1, corner + n], axis=1)
-        upper = np.stack([corner + 1, corner + n + 1, corner + n], axis=1)
+        row = np.arange(row_length - 1)[:, None]
+        column = np.arange(row_length - 1)[None, :]
+        corner = (row * row_length + column).ravel()
+        lower_triangles = np.stack([corner, corner + 1, corner + row_length], axis=1)
+        upper_triangles = np.stack([corner + 1, corner + row_length + 1, corner + row_length], axis=1)
         self._scene.add_mesh_simple(
             "/world/hills",
             vertices,
-            np.concatenate([lower, upper]),
+            np.concatenate([lower_triangles, upper_triangles]),
             color=scene_colors.HILLS,
             side="double",
             cast_shadow=False,
@@ -205,7 +209,7 @@ class RobotScene:
         if propulsion_joint is not None:
             colors[propulsion_joint] = scene_colors.PROPULSION_JOINT
             scales[propulsion_joint] = (1.9, 1.9, 1.25)
-        self._hinges.batched_colors = linear_colors(colors)
+        self._hinges.batched_colors = convert_to_linear_colors(colors)
         self._hinges.batched_scales = scales
 
     def _show_contacts(self, drawing: Drawing) -> None:
@@ -222,7 +226,7 @@ class RobotScene:
         self._show_arrows("forces/resultant", drawing.resultant, scene_colors.RESULTANT, 0.30)
 
     def _show_arrows(self, name: str, arrows_w: Floats, color: Color, relative_radius: float) -> None:
-        """Show arrows (n, 2, 3) as one node. relative_radius: of a shaft, as a fraction of the body's radius."""
+        """Show arrows (n, 2, 3) as one node. `relative_radius` is the radius of a shaft divided by that of the body."""
         handle = self._arrows.get(name)
         if handle is not None:
             handle.visible = len(arrows_w) > 0
@@ -233,7 +237,7 @@ class RobotScene:
             self._arrows[name] = self._scene.add_arrows(
                 f"/world/{name}",
                 to_float32(arrows_w),
-                linear_colors([color])[0],
+                convert_to_linear_colors([color])[0],
                 shaft_radius=radius_m,
                 head_radius=2.2 * radius_m,
                 head_length=5 * radius_m,
@@ -301,7 +305,7 @@ class RobotScene:
         self._world.position = (-float(view_center_w[0]), -float(view_center_w[1]), 0.0)
 
 
-def _link_scale(index: int) -> tuple[float, float, float]:
+def _compute_link_scale(index: int) -> tuple[float, float, float]:
     """Return the scale of a link: every second one is a little thinner.
 
     Neighbors share a sphere at their joint, which would flicker if both drew it at the same place.

@@ -52,7 +52,7 @@ LEGEND = (
 )
 
 
-def linear_colors(colors: Sequence[Color]) -> NDArray[np.uint8]:
+def convert_to_linear_colors(colors: Sequence[Color]) -> NDArray[np.uint8]:
     """Convert sRGB colors to linear light, (n, 3): viser expects this for instances of batches and for arrows only.
 
     Source: transfer function of IEC 61966-2-1.

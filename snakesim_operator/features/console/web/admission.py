@@ -116,7 +116,7 @@ class Admission:
     """Holds the controls that viewers may use, and checks each message of a browser. Thread-safe."""
 
     def __init__(self, report: Callable[[str], None] = lambda _: None) -> None:
-        """Admit no control yet. report: called with a text for the first message dropped of each kind."""
+        """Start without controls. `report` is called with a text for the first dropped message of each kind."""
         self.report = report
         self.dropped: Counter[str] = Counter()
         self._lock = threading.Lock()
@@ -125,7 +125,7 @@ class Admission:
             msgspec.msgpack.Decoder(ViewerCamera | ControlMessage | QuestionAnswer)
         )
 
-    def admit(
+    def admit_control(
         self,
         handle: HandleT,
         viewer: int | None = None,
@@ -141,9 +141,9 @@ class Admission:
 
         Args:
             handle: The control.
-            viewer: The only viewer that may use it; None: every viewer.
+            viewer: The only viewer that may use the control; None for every viewer.
             is_allowed: Returns whether the control may be used now.
-            hold_hz: How often its page repeats that it is held, for a button.
+            hold_hz: Rate at which the page repeats that a button is held; 0 for other controls.
             handler: Called for each message that is admitted, in the thread that receives: it must not wait. None:
                 viser gets the message.
             max_age_s: An older message is dropped.
@@ -154,7 +154,7 @@ class Admission:
             The control.
 
         Raises:
-            TypeError: It is not known which values this kind of control takes.
+            TypeError: The valid values of this kind of control are not known.
         """
         control: Any = handle
         if isinstance(control, viser.GuiButtonHandle | viser.CommandHandle):
@@ -165,7 +165,7 @@ class Admission:
             name=name,
             viewer=viewer,
             is_allowed=is_allowed,
-            accepts=_make_value_check(control, hold_hz),
+            accepts=_make_message_validator(control, hold_hz),
             handler=handler,
             max_age_s=max_age_s,
             at_any_age=frozenset(at_any_age),
@@ -175,36 +175,36 @@ class Admission:
             self._controls[control._impl.uuid] = admitted
         return handle
 
-    def forget(self, handle: Any) -> None:
+    def remove_control(self, handle: Any) -> None:
         """Refuse messages for a control from now on, because it is removed from the page."""
         with self._lock:
             self._controls.pop(handle._impl.uuid, None)
 
-    def forget_viewer(self, viewer: int) -> None:
+    def remove_viewer(self, viewer: int) -> None:
         """Forget all controls of a viewer whose page is closed."""
         with self._lock:
             self._controls = {uuid: control for uuid, control in self._controls.items() if control.viewer != viewer}
 
-    def check_message(self, viewer: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
-        """Check a message of a browser, and handle it if its control has a handler.
+    def filter_message(self, viewer: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
+        """Check a message of a browser, and handle it here if its control has a handler.
 
-        A message is dropped if it cannot be decoded, if its control does not allow it, or if it is too old.
+        A message is dropped and counted if it cannot be decoded, if its control does not allow it, or if it is too old.
 
         Args:
-            viewer: The viewer that sent it; None while viser has not numbered the viewer.
+            viewer: Client id of the viewer that sent the message; None while viser has not numbered the viewer.
             data: The message as it was received.
             age: Measures how old the messages of this page are.
 
         Returns:
-            The message that viser may read, encoded anew; None if viser gets nothing.
+            The message that is passed on to viser, encoded anew; None if it was dropped or handled here.
         """
         if viewer is None or isinstance(data, str):
-            self.drop(viewer, "no message", "a text, or of no viewer")
+            self.count_dropped_message(viewer, "no message", "a text, or of no viewer")
             return None
         try:
             message = self._decoder.decode(data)
         except (msgspec.DecodeError, RecursionError) as error:  # a ValidationError is a DecodeError
-            self.drop(viewer, "unknown", str(error))
+            self.count_dropped_message(viewer, "unknown", str(error))
             return None
         if isinstance(message, QuestionAnswer):
             age.note_answer(message.request_uuid)
@@ -215,7 +215,7 @@ class Admission:
             action = age.date_action(time.monotonic())
             if control.is_late(message, action):
                 control.on_late(action.age_s)
-                self.drop(viewer, "too old", f"{control.name}: {format_age(action.age_s)}")
+                self.count_dropped_message(viewer, "too old", f"{control.name}: {format_age(action.age_s)}")
                 return None
             if control.handler is not None:
                 control.handler(viewer, action)
@@ -227,17 +227,17 @@ class Admission:
         with self._lock:
             control = self._controls.get(message.uuid)
         if control is None or control.viewer not in (None, viewer):
-            self.drop(viewer, "no control of this viewer", type(message).__name__)
+            self.count_dropped_message(viewer, "no control of this viewer", type(message).__name__)
             return None
         if not control.is_allowed():
-            self.drop(viewer, "without control of the robot", control.name)
+            self.count_dropped_message(viewer, "without control of the robot", control.name)
             return None
         if not control.accepts(message):
-            self.drop(viewer, "not what the control is for", f"{control.name}: {message}")
+            self.count_dropped_message(viewer, "not what the control is for", f"{control.name}: {message}")
             return None
         return control
 
-    def drop(self, viewer: int | None, kind: str, detail: str) -> None:
+    def count_dropped_message(self, viewer: int | None, kind: str, detail: str) -> None:
         """Count a message or connection that is not passed on, and report the first of its kind."""
         with self._lock:
             self.dropped[kind] += 1
@@ -255,37 +255,37 @@ def format_age(age_s: float) -> str:
     return f"it came {age_s:.1f} s late"
 
 
-def _make_value_check(handle: Any, hold_hz: float) -> Callable[[ControlMessage], bool]:
+def _make_message_validator(control: Any, hold_hz: float) -> Callable[[ControlMessage], bool]:
     """Return a function that reports whether a message is valid for a control of the page.
 
     Args:
-        handle: The control, as viser has it; its type, options and bounds decide which values are valid.
-        hold_hz: Rate at which the page may repeat that a button is held; 0 if it may not.
+        control: The control, as viser has it; its type, options and bounds decide which values are valid.
+        hold_hz: Rate at which the page may repeat that a button is held; 0 if a hold is not allowed.
 
     Raises:
-        TypeError: It is not known which values this kind of control takes.
+        TypeError: The control is of a kind for which the valid values are not known.
     """
-    match handle:
+    match control:
         case viser.CommandHandle():
             return lambda message: isinstance(message, Trigger)
         case viser.GuiButtonHandle():
             return lambda message: _is_press_or_hold(message, hold_hz)
         case viser.GuiCheckboxHandle():
-            return _check_value(lambda value: isinstance(value, bool))
+            return _make_value_validator(lambda value: isinstance(value, bool))
         case viser.GuiTextHandle():
-            return _check_value(lambda value: isinstance(value, str))
+            return _make_value_validator(lambda value: isinstance(value, str))
         case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
-            options = frozenset(handle.options)
-            return _check_value(lambda value: isinstance(value, str) and value in options)
+            options = frozenset(control.options)
+            return _make_value_validator(lambda value: isinstance(value, str) and value in options)
         case viser.GuiSliderHandle() | viser.GuiNumberHandle():
-            number_types = (int,) if isinstance(handle.value, int) else (int, float)
-            low = handle.min
-            high = handle.max
-            return _check_value(lambda value: _is_number_within(value, number_types, low, high))
-    raise TypeError(f"{type(handle).__name__}: which values viewers may give it is not known")
+            number_types = (int,) if isinstance(control.value, int) else (int, float)
+            min_value = control.min
+            max_value = control.max
+            return _make_value_validator(lambda value: _is_number_within(value, number_types, min_value, max_value))
+    raise TypeError(f"{type(control).__name__}: which values viewers may give it is not known")
 
 
-def _check_value(is_valid: Callable[[Any], bool]) -> Callable[[ControlMessage], bool]:
+def _make_value_validator(is_valid: Callable[[Any], bool]) -> Callable[[ControlMessage], bool]:
     """Return a function that accepts updates whose value is valid, and no other messages."""
     return lambda message: isinstance(message, Update) and is_valid(message.updates.value)
 
@@ -297,9 +297,11 @@ def _is_press_or_hold(message: ControlMessage, hold_hz: float) -> bool:
     return isinstance(message, Hold) and hold_hz > 0 and message.frequency == hold_hz
 
 
-def _is_number_within(value: Any, number_types: tuple[type, ...], low: float | None, high: float | None) -> bool:
+def _is_number_within(
+    value: Any, number_types: tuple[type, ...], min_value: float | None, max_value: float | None
+) -> bool:
     if isinstance(value, bool) or not isinstance(value, number_types):
         return False
-    is_above_low = low is None or value >= low
-    is_below_high = high is None or value <= high
+    is_above_low = min_value is None or value >= min_value
+    is_below_high = max_value is None or value <= max_value
     return is_above_low and is_below_high

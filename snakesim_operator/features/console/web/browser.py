@@ -5,7 +5,7 @@ import time
 
 from websockets.http11 import Request
 
-from snakesim_hal.base.workers import ErrorReport
+from snakesim_hal.base.workers import ErrorReporter
 from snakesim_operator.features.console.web.added_html import DARK_COOKIE
 from snakesim_operator.features.console.web.admission import Admission
 from snakesim_operator.features.console.web.message_age import MessageAge
@@ -18,7 +18,7 @@ class Browser:
     """A browser whose page is open. The event loop of the page server calls its methods."""
 
     def __init__(self, request: Request, admission: Admission) -> None:
-        """Begin without a number. request: the one with which the browser opened its websocket."""
+        """Start without a viewer number. `request` is the one with which the browser opened its websocket."""
         cookies = "; ".join(request.headers.get_all("Cookie"))
         self.prefers_dark = DARK_COOKIE in cookies.split("; ")
         self.age = MessageAge()
@@ -26,7 +26,7 @@ class Browser:
         self._loop = asyncio.get_running_loop()
         self._is_numbered = asyncio.Event()
         self._admission = admission
-        self._errors = ErrorReport("a page")
+        self._errors = ErrorReporter("a page")
         # Token bucket: the messages that may arrive now, and when that was computed.
         self._allowance = MAX_BURST
         self._allowance_time_s = time.monotonic()
@@ -52,11 +52,11 @@ class Browser:
     def check_message(self, data: bytes | str) -> bytes | None:
         """Return the message that viser may read; None if it was dropped or handled."""
         try:
-            return self._admission.check_message(self.viewer, data, self.age)
+            return self._admission.filter_message(self.viewer, data, self.age)
         except Exception as error:  # noqa: BLE001 - a handler has failed, but the next message may be a stop
-            self._errors.write(error)
+            self._errors.print_error(error)
             return None
 
     def drop(self, kind: str, detail: str) -> None:
         """Count something of this browser that is not passed on."""
-        self._admission.drop(self.viewer, kind, detail)
+        self._admission.count_dropped_message(self.viewer, kind, detail)

@@ -35,20 +35,21 @@ AnswerRequest = Callable[[Request], Response | None]
 class BrowserRelay:
     """Serves browsers in a thread of its own, for as long as its context lasts."""
 
-    def __init__(self, listening: socket.socket, viser: PageServer, page: bytes, answer_first: AnswerRequest) -> None:
+    def __init__(
+        self, listening_socket: socket.socket, page_server: PageServer, page_html: bytes, answer_first: AnswerRequest
+    ) -> None:
         """Prepare the relay between browsers and viser, whose thread starts with the context.
 
         Args:
-            listening: The Unix socket at which the front server connects.
-            viser: Gets the messages of browsers.
-            page: The console's page, as HTML.
-            answer_first: Answers requests for pages beside the console's; returns None for a page that it does not
-                have.
+            listening_socket: The Unix socket at which the front server connects.
+            page_server: Receives the messages of browsers.
+            page_html: The console's page.
+            answer_first: Answers requests for other pages than the console's; returns None for an unknown page.
         """
-        self._listening = listening
-        self._viser = viser
-        self._page = page
-        self._answer_first = answer_first
+        self._listening_socket = listening_socket
+        self._page_server = page_server
+        self._page = page_html
+        self._handle_first = answer_first
         self._open_browsers: set[Browser] = set()
         # Bytes that are no websocket are no errors of the console.
         self._quiet_logger = logging.getLogger(f"{__name__}.websockets")
@@ -56,9 +57,9 @@ class BrowserRelay:
         self._quiet_logger.propagate = False
         # The thread.
         self._loop = asyncio.new_event_loop()
-        self._ended = asyncio.Event()
+        self._stop_event = asyncio.Event()
         self._thread = threading.Thread(
-            target=self._loop.run_until_complete, args=(self._serve(),), name="page server", daemon=True
+            target=self._loop.run_until_complete, args=(self._serve_browsers(),), name="page server", daemon=True
         )
 
     def __enter__(self) -> "BrowserRelay":
@@ -66,29 +67,29 @@ class BrowserRelay:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._loop.call_soon_threadsafe(self._ended.set)
+        self._loop.call_soon_threadsafe(self._stop_event.set)
         self._thread.join()
         self._loop.close()
 
-    async def _serve(self) -> None:
+    async def _serve_browsers(self) -> None:
         """Serve until the context ends."""
         server = await unix_serve(
             self._serve_browser,
-            sock=self._listening,
+            sock=self._listening_socket,
             process_request=self._answer_request,
             select_subprotocol=_select_viser_protocol,
             max_size=MAX_MESSAGE_BYTES,
             compression=None,
             logger=self._quiet_logger,
         )
-        await self._ended.wait()
+        await self._stop_event.wait()
         server.close()
         await server.wait_closed()
 
     # --- pages -----------------------------------------------------------------------------------------------
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a page; return None for a websocket, which then connects.
+        """Answer an HTTP request for a page; return None for a websocket, which the library then connects.
 
         Args:
             connection: The connection of the browser.
@@ -96,7 +97,7 @@ class BrowserRelay:
         """
         if "Upgrade" in request.headers:
             return None
-        response = self._answer_first(request)
+        response = self._handle_first(request)
         if response is not None:
             return response
         if request.path.partition("?")[0] not in PAGE_PATHS:
@@ -116,7 +117,7 @@ class BrowserRelay:
     async def _serve_browser(self, connection: ServerConnection) -> None:
         """Relay the messages of one browser until it leaves."""
         assert connection.request is not None
-        browser = Browser(connection.request, self._viser.admission)
+        browser = Browser(connection.request, self._page_server.admission)
         if len(self._open_browsers) >= MAX_VIEWERS:
             reason = f"more than {MAX_VIEWERS} pages are open"
             browser.drop("too many viewers", reason)
@@ -134,7 +135,7 @@ class BrowserRelay:
     async def _connect_to_viser(self, connection: ServerConnection, browser: Browser) -> None:
         """Open a connection to viser for a browser, and relay messages in both directions until either side ends."""
         protocols = None if connection.subprotocol is None else [connection.subprotocol]
-        with self._viser.expect_browser(browser) as address:
+        with self._page_server.expect_browser(browser) as address:
             opening = connect(
                 address, subprotocols=protocols, compression=None, max_size=None, ping_interval=None, proxy=None
             )

@@ -13,29 +13,29 @@ from snakesim_operator.features.console.web.admission import Admission
 from snakesim_operator.features.console.web.page_server import AnswerRequest, BrowserRelay
 from snakesim_operator.features.console.web.viser_server import PageServer
 
-PAGE_LIMIT_S = 30.0  # for viser to serve its page, on a busy computer
+PAGE_TIMEOUT_S = 30.0  # for viser to serve its page, on a busy computer
 
 
 @contextlib.contextmanager
 def serve_pages(
-    listening: socket.socket,
+    listening_socket: socket.socket,
     report: Callable[[str], None] = lambda _: None,
     answer_first: AnswerRequest = lambda _: None,
     *,
     has_stop: bool,
 ) -> Iterator[PageServer]:
-    """Serve pages for as long as the context lasts.
+    """Start viser and the page server, and stop them at the end of the `with` block.
 
     Args:
-        listening: The Unix socket at which the front server connects.
-        report: Called with what was dropped, once of each kind.
-        answer_first: Answers requests for pages beside the console's; returns None for a page that it does not have.
+        listening_socket: The Unix socket at which the front server connects.
+        report: Called with a line for the first dropped message of each kind.
+        answer_first: Answers requests for other pages than the console's; returns None for an unknown page.
         has_stop: Whether there is a robot that can be stopped.
     """
     with _ignore_output():
         server = PageServer(Admission(report))
     page = add_html(_read_page(server.get_port()), has_stop=has_stop)
-    with BrowserRelay(listening, server, page, answer_first):
+    with BrowserRelay(listening_socket, server, page, answer_first):
         try:
             yield server
         finally:
@@ -45,7 +45,7 @@ def serve_pages(
 
 def _read_page(port: int) -> bytes:
     """Return viser's page, from viser's own server. It is not compressed, so HTML can be added."""
-    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=PAGE_LIMIT_S)
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=PAGE_TIMEOUT_S)
     with contextlib.closing(connection):
         connection.request("GET", "/")
         return connection.getresponse().read()

@@ -53,9 +53,11 @@ class PageServer(viser.ViserServer):
     async def _check_connection(self, client: Any) -> None:
         """Number the browser of a connection, before any of its messages is read. Close a connection without one."""
         connection = self._websock_server._live_connections[client.client_id]
-        browser = self._expected.pop(_path_of(connection), None)
+        browser = self._expected.pop(_get_request_path(connection), None)
         if browser is None:
-            self.admission.drop(None, "not of the page server", "a connection to viser's own port was closed")
+            self.admission.count_dropped_message(
+                None, "not of the page server", "a connection to viser's own port was closed"
+            )
             await _close_unread(connection)
             return
         self._browsers[client.client_id] = browser
@@ -69,7 +71,7 @@ class PageServer(viser.ViserServer):
         browser = self._browsers.get(viewer)
         return browser is not None and browser.prefers_dark
 
-    def viewers(self) -> int:
+    def count_viewers(self) -> int:
         """Return how many pages are open, also of those that cannot draw the scene."""
         return len(self._browsers)
 
@@ -93,7 +95,7 @@ class PageServer(viser.ViserServer):
         return None
 
 
-def _path_of(connection: ServerConnection) -> str:
+def _get_request_path(connection: ServerConnection) -> str:
     return "" if connection.request is None else connection.request.path
 
 

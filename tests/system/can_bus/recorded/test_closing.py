@@ -76,7 +76,7 @@ def test_closing_pose_of_emulators_has_age_of_robot_file(delay_s: float) -> None
         late = [
             (s.joints.timestamp_ns, pose.timestamp_ns)
             for s in run.samples
-            if isinstance(pose := s.others.get(keys.POSE), Pose)
+            if isinstance(pose := s.by_key.get(keys.POSE), Pose)
         ]
         assert {now_ns - captured_ns for now_ns, captured_ns in late} == {round(delay_s * 1e9)}
         assert len(late) == 20 - round(delay_s / 0.01)

@@ -9,9 +9,9 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.driver.modules import answer_limit_s
+from snakesim_can_backend.driver.modules import compute_response_timeout_s
 from snakesim_can_backend.emulator.firmware import ModuleFirmware
-from snakesim_can_backend.emulator.server import InProcessEmulators, make_local_emulators
+from snakesim_can_backend.emulator.server import InProcessEmulators, make_in_process_emulators
 from snakesim_can_backend.protocol.commands import make_command, make_emergency
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
@@ -27,8 +27,8 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.scenario import load as load_scenario
-from snakesim_hal.model.scenario import parse_set
+from snakesim_hal.model.scenario import load_scenario as load_scenario
+from snakesim_hal.model.scenario import parse_set_option
 from snakesim_hal.wire.messages import Mode
 from snakesim_testing.can.driver_loop import JOINTS, config, loop
 from snakesim_testing.can.frames import read
@@ -85,11 +85,11 @@ def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[Modul
     """When a driver opens its bus, one of the emulators is not as new."""
 
     def emulators(*given: Any, **more: Any) -> InProcessEmulators:
-        end = make_local_emulators(*given, **more)
+        end = make_in_process_emulators(*given, **more)
         change(end.server.chain.slots[node - 1].module)
         return end
 
-    monkeypatch.setattr(modules, "start_local_emulators", emulators)
+    monkeypatch.setattr(modules, "start_in_process_emulators", emulators)
 
 
 def left_behind(module: ModuleFirmware, kind: str) -> None:
@@ -134,7 +134,7 @@ def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest
     with raises_error(ConfigError, code="bus/not-available", field="nocan7"):
         CanBackend.check(config(), CanSettings(channels=["nocan7"]))
     asked: list[str] = []
-    monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", asked.append)
+    monkeypatch.setattr("snakesim_can_backend.bus.adapter.validate_interface", asked.append)
     assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
     assert CanBackend.check(config(), CanSettings(channels=["vcan0"], emulators="process")) == ("lockstep", "realtime")
     assert asked == ["can0", "can1", "vcan0"]
@@ -154,10 +154,10 @@ def test_opening_describes_joints_with_serials_and_firmware() -> None:
 
 
 def test_opening_waits_for_answers_as_long_as_fullest_bus() -> None:
-    triplet = load_scenario("triplet", [parse_set("clock_mode=realtime")]).config
-    assert answer_limit_s(triplet, CanSettings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
+    triplet = load_scenario("triplet", [parse_set_option("clock_mode=realtime")]).config
+    assert compute_response_timeout_s(triplet, CanSettings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
     two = CanSettings(channels=["can0", "can1"])
-    assert answer_limit_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
+    assert compute_response_timeout_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
 
 
 # --- a period ----------------------------------------------------------------------------------------------

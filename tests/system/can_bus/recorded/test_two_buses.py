@@ -48,7 +48,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     real = CanSettings(channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia")
     chain = ModuleChain(run, real, InertiaModel(run, InertiaSettings()), stepped=True)
     end = InProcessEmulators(EmulatorServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
-    monkeypatch.setattr("snakesim_can_backend.bus.adapter.check_interface", lambda _channel: None)
+    monkeypatch.setattr("snakesim_can_backend.bus.adapter.validate_interface", lambda _channel: None)
     monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
     monkeypatch.setattr(modules, "EmulatorProcess", NoProcess)
     opened: list[CanBackend] = []
@@ -101,7 +101,7 @@ def test_two_buses_in_lockstep_have_no_frames_left_in_flight(
     for wire, node in zip(WIRES, (1, 4), strict=True):
         asked = [parse_opcode(f.id) for f in wire.sent if f == make_query(node) or parse_opcode(f.id) == Opcode.SYNC]
         assert asked == [Opcode.SYNC, Opcode.PARAMETER_REQUEST] * 20
-    assert run.backend.modules.reading.answers_missing == 0
+    assert run.backend.modules.module_reports.answers_missing == 0
     run.backend.close()
 
 

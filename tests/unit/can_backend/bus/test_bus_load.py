@@ -10,24 +10,24 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.bus.load import (
-    MAX_EVERY,
     MAX_LOAD,
+    MAX_SYNCS_PER_REPORT,
     ReportSchedule,
-    bus_load,
     busiest_period_s,
-    check_load,
-    joints_per_bus,
+    compute_bus_load,
+    compute_max_frame_bits,
+    count_joints_per_bus,
     list_streams,
     max_rate_hz,
     plan_reports,
     syncs_per_report,
-    worst_frame_bits,
+    validate_bus_load,
 )
 from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.scenario import load as load_scenario
+from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_testing.messages import raises_error
 
 TRIPLET = load_scenario("triplet").config
@@ -82,7 +82,7 @@ def frame_bits(identifier: int, data: bytes) -> int:
 @example(0x078, b"\x87\x87\x87\x87\x87\x87\x87\x87")
 @example(0x787, b"\x0f\x0f\x0f\x0f\x0f\x0f\x0f\x0f")
 def test_no_frame_is_ever_longer_than_the_worst_case(identifier: int, data: bytes) -> None:
-    assert 47 + 8 * len(data) <= frame_bits(identifier, data) <= worst_frame_bits(len(data))
+    assert 47 + 8 * len(data) <= frame_bits(identifier, data) <= compute_max_frame_bits(len(data))
 
 
 def test_bus_load_worst_case_is_nearly_reached() -> None:
@@ -96,8 +96,8 @@ def test_bus_load_worst_case_is_nearly_reached() -> None:
 def test_bus_load_of_absent_reports_is_zero() -> None:
     kinds = {s.opcode for s in list_streams(13, ReportSchedule(100.0, 0, 0)) if s.frames_per_s}
     assert kinds == {Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.HEARTBEAT, Opcode.HEALTH}
-    without_tail = bus_load(13, ReportSchedule(100.0, tail=False))
-    assert bus_load(13, ReportSchedule(100.0)) - without_tail == pytest.approx(100 * 135 / 1e6)
+    without_tail = compute_bus_load(13, ReportSchedule(100.0, tail=False))
+    assert compute_bus_load(13, ReportSchedule(100.0)) - without_tail == pytest.approx(100 * 135 / 1e6)
 
 
 def test_the_busiest_period_is_one_with_forces() -> None:
@@ -110,8 +110,8 @@ def test_the_busiest_period_is_one_with_forces() -> None:
 @given(st.floats(20, 5000), st.floats(0.001, 1e4))
 def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(rate_hz: float, wanted_hz: float) -> None:
     apart = syncs_per_report(rate_hz, wanted_hz)
-    assert 1 <= apart <= MAX_EVERY
-    if 1 < apart < MAX_EVERY:
+    assert 1 <= apart <= MAX_SYNCS_PER_REPORT
+    if 1 < apart < MAX_SYNCS_PER_REPORT:
         assert abs(rate_hz / wanted_hz - apart) <= 0.5
     assert syncs_per_report(rate_hz, 0.0) == 0
 
@@ -134,7 +134,7 @@ def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
 def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> None:
     if buses > joints:
         return
-    found = joints_per_bus(run_of(joints), CanSettings(channels=channels(buses)))
+    found = count_joints_per_bus(run_of(joints), CanSettings(channels=channels(buses)))
     assert sum(found) == joints
     assert len(found) == max(buses, 1)
     assert max(found) - min(found) <= 1
@@ -142,7 +142,7 @@ def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> Non
 
 
 def test_given_shares_are_kept() -> None:
-    assert joints_per_bus(run_of(13), CanSettings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
+    assert count_joints_per_bus(run_of(13), CanSettings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_given_shares_are_kept() -> None:
 )
 def test_shares_that_cannot_be_are_refused(joints: int, settings: CanSettings) -> None:
     with raises_error(ConfigError, code=("bus/invalid-channel", "drive/unsupported-setting")):
-        joints_per_bus(run_of(joints), settings)
+        count_joints_per_bus(run_of(joints), settings)
 
 
 # --- refusal -----------------------------------------------------------------------------------------------
@@ -165,7 +165,7 @@ def test_shares_that_cannot_be_are_refused(joints: int, settings: CanSettings) -
 
 def refusal(config: RunConfig, settings: CanSettings) -> str | None:
     try:
-        check_load(config, settings)
+        validate_bus_load(config, settings)
     except ConfigError as error:
         return str(error)
     return None
@@ -185,7 +185,7 @@ def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[
             continue
         if more := re.fullmatch(r"(\d+) channels with up to (\d+) joints each", way):
             changes = {"channels": channels(int(more[1])), "joints_per_channel": []}
-            assert max(joints_per_bus(config, CanSettings(channels=channels(int(more[1]))))) == int(more[2])
+            assert max(count_joints_per_bus(config, CanSettings(channels=channels(int(more[1]))))) == int(more[2])
         elif fewer := re.fullmatch(r"backends\.can\.contact_rate_hz = (\S+)", way):
             changes = {"contact_rate_hz": float(fewer[1])}
         assert changes, way
@@ -223,7 +223,7 @@ def test_bus_load_suggestions_all_fit(
     config = run_of(joints, rate_hz)
     text = refusal(config, settings)
     if text is None:
-        assert all(share <= MAX_LOAD for share in check_load(config, settings))
+        assert all(share <= MAX_LOAD for share in validate_bus_load(config, settings))
         return
     for way in ways_out(text, config, settings):
         assert refusal(*way) is None

@@ -12,7 +12,7 @@ from snakesim_can_backend.cia402.backend import Cia402Backend
 from snakesim_can_backend.cia402.eds import BUNDLED
 from snakesim_can_backend.cia402.frames import Emergency, Function, NmtCommand, NmtState, encode_emergency
 from snakesim_can_backend.cia402.objects import MODE_PDO, POSITION_PDO, TORQUE_PDO
-from snakesim_can_backend.cia402.scan import describe_node, read_nodes
+from snakesim_can_backend.cia402.scan import make_scan_row, read_nodes
 from snakesim_can_backend.cia402.settings import MountedCia402
 from snakesim_can_backend.cia402.state_machine import Control, PowerState
 from snakesim_can_backend.protocol.definitions import Frame
@@ -167,7 +167,7 @@ def test_end_of_the_driver_ends_the_watch_of_its_heartbeat() -> None:
     robot.run(10, "armed")
     emulator = robot.driver._emulator
     robot.backend.close()
-    emulator._handle_arrivals = lambda: None
+    emulator._handle_received_frames = lambda: None
     assert robot.sent[-1].data[1:4] == b"\x16\x10\x01"
 
 
@@ -236,12 +236,12 @@ def test_scan_lists_identity_modes_and_state_of_every_node() -> None:
     channel = make_virtual_channel()
     settings = Cia402Backend.Settings(physics_model="inertia")
     clock = DriverClock(CONFIG)
-    emulator: Any = Cia402Backend.emulator_on(CONFIG, settings, [VirtualWire(channel)], clock, None)
+    emulator: Any = Cia402Backend.make_emulator(CONFIG, settings, [VirtualWire(channel)], clock, None)
     wire = VirtualWire(channel, emulator)
     found = read_nodes(wire)
     wire.close()
     assert list(found) == [1, 2]
-    assert describe_node("can0", 2, found[2]) == {
+    assert make_scan_row("can0", 2, found[2]) == {
         "channel": "can0",
         "node": "2",
         "profile": "402",

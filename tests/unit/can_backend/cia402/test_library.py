@@ -91,7 +91,7 @@ class Master:
         self.wire = LibraryWire()
         self.clock = DriverClock(CONFIG)
         settings = Cia402Backend.Settings(physics_model="inertia")
-        self.emulator: Any = Cia402Backend.emulator_on(CONFIG, settings, [self.wire], self.clock, None)
+        self.emulator: Any = Cia402Backend.make_emulator(CONFIG, settings, [self.wire], self.clock, None)
         self.wire.when_arrived = self.emulator
         self.node: Any = BaseNode402(1, EDS)
         self.wire.network.add_node(self.node)
@@ -102,7 +102,7 @@ class Master:
         return self.emulator.drives[0]
 
     def pass_time(self, seconds: float) -> None:
-        self.clock.robot_ns += round(seconds * 1e9)
+        self.clock.robot_time_ns += round(seconds * 1e9)
         self.emulator()
 
     def enable(self, mode: str) -> None:
@@ -253,8 +253,8 @@ class LibraryDrives:
                 readings=self.readings,
                 emulator=None,
                 emulated=False,
-                answer_s=0.1,
-                bring_up_s=2.0,
+                response_timeout_s=0.1,
+                bring_up_timeout_s=2.0,
                 cycle_ns=10_000_000,
                 report_period_ns=100_000_000,
                 clock_ns=lambda: 0,
@@ -316,7 +316,7 @@ def test_our_setpoints_are_decoded_by_drives_of_the_library() -> None:
     command = BusCommand(everybody, [Mode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False)
     for word in (0x0040, 0x0021, 0x0023, 0x0027):
         drives.words = [word] * JOINTS
-        drives.readings.count_request()
+        drives.readings.start_request()
         drives.driver.read()
         drives.driver.send_setpoints(command)
     controls = [values[0] for values in received]

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.cia402.configuration import encode_cycle, list_configuration
+from snakesim_can_backend.cia402.configuration import encode_cycle_period, list_configuration_steps
 from snakesim_can_backend.cia402.eds import BUNDLED, read_all_eds, read_eds
-from snakesim_can_backend.cia402.limits import find_objections, read_scaling
+from snakesim_can_backend.cia402.limits import determine_scaling, find_incompatibilities
 from snakesim_can_backend.cia402.objects import (
     DEVICE_TYPE,
     ENCODER_INCREMENTS,
@@ -47,9 +47,9 @@ def joint(**dotted: Any) -> Joint:
 def objections(changed: dict[Entry, int], one: Joint | None = None, **settings: Any) -> list[str]:
     values = FITTING | changed
     used = Cia402Settings(**settings)
-    scaling = read_scaling(values, used, one or joint())
+    scaling = determine_scaling(values, used, one or joint())
     assert not isinstance(scaling, str), scaling
-    return list(find_objections(values, scaling, used, one or joint()))
+    return list(find_incompatibilities(values, scaling, used, one or joint()))
 
 
 def test_drive_with_fitting_limits_has_no_objections() -> None:
@@ -57,9 +57,9 @@ def test_drive_with_fitting_limits_has_no_objections() -> None:
     assert objections({MIN_POSITION: 0, MAX_POSITION: 0}) == [], "equal limits mean that there are none"
     without_speed = dict(FITTING)
     del without_speed[MAX_SPEED]
-    scaling = read_scaling(without_speed, Cia402Settings(), joint())
+    scaling = determine_scaling(without_speed, Cia402Settings(), joint())
     assert not isinstance(scaling, str)
-    assert list(find_objections(without_speed, scaling, Cia402Settings(), joint())) == []
+    assert list(find_incompatibilities(without_speed, scaling, Cia402Settings(), joint())) == []
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_gear_sign_and_zero_of_a_joint_apply_to_its_limits() -> None:
 
 
 def test_units_of_a_drive_convert_both_ways() -> None:
-    scaling = read_scaling(FITTING, Cia402Settings(velocity_units_per_turn_s=60), joint())
+    scaling = determine_scaling(FITTING, Cia402Settings(velocity_units_per_turn_s=60), joint())
     assert not isinstance(scaling, str)
     assert scaling.to_position(3.141592653589793) == 5000
     assert scaling.to_velocity(6.283185307179586) == 60
@@ -104,18 +104,18 @@ def test_units_of_a_drive_convert_both_ways() -> None:
 
 def test_rated_torque_comes_from_rated_current_if_the_drive_has_no_other() -> None:
     values = {entry: value for entry, value in FITTING.items() if entry != RATED_TORQUE} | {RATED_CURRENT: 8_000}
-    of_current = read_scaling(values, Cia402Settings(), joint(robot__motor__torque_constant_nm_per_a=0.25))
+    of_current = determine_scaling(values, Cia402Settings(), joint(robot__motor__torque_constant_nm_per_a=0.25))
     assert not isinstance(of_current, str)
     assert of_current.rated_torque_nm == pytest.approx(2.0)
-    unknown = read_scaling(values, Cia402Settings(), joint())
+    unknown = determine_scaling(values, Cia402Settings(), joint())
     assert isinstance(unknown, str) and "rated_torque_nm" in unknown
     no_counts = {entry: value for entry, value in FITTING.items() if entry != ENCODER_INCREMENTS}
-    unknown = read_scaling(no_counts, Cia402Settings(), joint())
+    unknown = determine_scaling(no_counts, Cia402Settings(), joint())
     assert isinstance(unknown, str) and "counts_per_turn" in unknown
 
 
 def test_each_mapping_is_written_while_off_and_read_back() -> None:
-    steps = list_configuration(5, Cia402Settings(), 0.01)
+    steps = list_configuration_steps(5, Cia402Settings(), 0.01)
     writes = [step for step in steps if isinstance(step, Write) and step.entry.index in (0x1400, 0x1600)]
     assert [(step.entry.index, step.entry.sub, step.value) for step in writes] == [
         (0x1400, 1, 0x8000_0205),
@@ -137,14 +137,14 @@ def test_each_mapping_is_written_while_off_and_read_back() -> None:
     [(0.01, (10, -3)), (0.02, (20, -3)), (0.0025, (25, -4)), (1 / 30, (33, -3)), (0.5, (50, -2))],
 )
 def test_control_period_is_encoded_as_value_and_exponent(period_s: float, encoded: tuple[int, int]) -> None:
-    assert encode_cycle(period_s) == encoded
+    assert encode_cycle_period(period_s) == encoded
 
 
 # --- EDS files -------------------------------------------------------------------------------------------------
 
 
 def test_bundled_eds_has_all_that_the_driver_needs() -> None:
-    assert list(read_eds(BUNDLED).find_objections()) == []
+    assert list(read_eds(BUNDLED).find_missing_objects()) == []
     assert len(read_all_eds([str(BUNDLED)])) == 1
 
 

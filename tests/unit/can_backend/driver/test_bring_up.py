@@ -12,12 +12,12 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.load import plan_reports
 from snakesim_can_backend.driver.bring_up import (
-    ASK_EVERY_S,
-    LISTEN_ON_S,
+    DUPLICATE_WAIT_S,
+    REQUEST_PERIOD_S,
     ModuleBus,
     ModuleIdentity,
     configure_modules,
-    discovery_errors,
+    find_discovery_errors,
     find_modules,
 )
 from snakesim_can_backend.driver.parameters import plan_parameters
@@ -68,7 +68,7 @@ class Modules:
             self.heard.append(frame)
             for passed in self.to_modules(frame):
                 self.chain.receive(0, passed)
-        for frame in self.chain.take_frames(0):
+        for frame in self.chain.pop_frames(0):
             for passed in self.to_host(frame):
                 self.far.send(passed)
         self.beside()
@@ -109,7 +109,7 @@ def test_bring_up_finds_every_module_with_identity_requests_only(modules: Module
     assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {("1.0", 1, True, True)}
     assert set(actions(modules.heard)) == {CommandAction.IDENTIFY}
     assert {parse_opcode(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
-    assert discovery_errors([modules.bus], found, NAMES, lockstep=True) == []
+    assert find_discovery_errors([modules.bus], found, NAMES, lockstep=True) == []
 
 
 def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Modules) -> None:
@@ -121,7 +121,7 @@ def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Mo
         return [frame]
 
     def later() -> None:
-        if answered_at and time.monotonic() > answered_at[0] + LISTEN_ON_S / 2:
+        if answered_at and time.monotonic() > answered_at[0] + DUPLICATE_WAIT_S / 2:
             modules.far.send(load_layouts()[Opcode.IDENTITY].encode(2, serial=0xBAD, protocol=1))
 
     modules.to_host, modules.beside = watch_the_last, later
@@ -177,7 +177,7 @@ def two_buses() -> list[ModuleBus]:
 
 
 def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[str]:
-    return discovery_errors(two_buses(), found, NAMES, lockstep=lockstep)
+    return find_discovery_errors(two_buses(), found, NAMES, lockstep=lockstep)
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,7 @@ def test_bring_up_lost_parameter_answer_is_requested_again(modules: Modules, way
     in_force = configure_modules([modules.bus], wanted(), 5.0)
     assert all(set(values) == set(ModuleParameter) for values in in_force.values())
     assert len(modules.heard) == 4 * len(ModuleParameter) + 1
-    assert time.monotonic() - began > ASK_EVERY_S
+    assert time.monotonic() - began > REQUEST_PERIOD_S
 
 
 def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(modules: Modules) -> None:
@@ -294,7 +294,7 @@ def test_bring_up_value_out_of_range_names_node_and_range(modules: Modules) -> N
 
 def test_an_armed_module_refuses(modules: Modules) -> None:
     modules.chain.receive(0, make_command(CommandAction.ARM))
-    modules.chain.take_frames(0)
+    modules.chain.pop_frames(0)
     with raises_error(BackendError, code="drive/parameter-refused"):
         configure_modules([modules.bus], wanted(), 5.0)
 

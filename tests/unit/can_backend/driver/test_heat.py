@@ -18,7 +18,7 @@ from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.can.driver_loop import chain_of
 from snakesim_testing.contract.rig import Rig
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 
 RATED_NM = 4.0
 STEP_NM = 0.003  # of the bus, and what a joint at its stop still sways by
@@ -30,7 +30,7 @@ CURVES = {"usual": (80.0, 105.0), "cool": (50.0, 70.0)}
 def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[Rig]:
     """The winding of joint_1 stays at a temperature, and the robot is armed."""
     derate_from_c, stop_at_c = CURVES[curve]
-    config = run_config(
+    config = make_run_config(
         backend=backend,
         rate_hz=100,
         robot__sensors__power__rate_hz=2.0,
@@ -41,7 +41,7 @@ def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[Rig]:
     )
     opened = SimBackend(config, SimSettings()) if backend == "sim" else CanBackend(config, CanSettings())
     try:
-        windings(opened).winding_c[0] = celsius
+        windings(opened).winding_temperature_c[0] = celsius
         yield Rig(opened, "lockstep", config.period_ns)
     finally:
         opened.close()
@@ -56,8 +56,8 @@ def windings(backend: SimBackend | CanBackend) -> Thermal:
 def until_told(rig: Rig, celsius: float) -> None:
     """Until the robot's power samples tell the temperature."""
     for _ in range(100):
-        rig.idle()
-        power = rig.record_since(rig.tick - 1).samples[-1].others.get(keys.POWER)
+        rig.wait_periods()
+        power = rig.record_since(rig.tick - 1).samples[-1].by_key.get(keys.POWER)
         if isinstance(power, Power) and power.motor_c[0] == pytest.approx(celsius, abs=0.5):
             return
     raise AssertionError(f"{celsius} °C were not told")
@@ -65,8 +65,8 @@ def until_told(rig: Rig, celsius: float) -> None:
 
 def pushes_nm(rig: Rig, limit_nm: float) -> float:
     """What the joint gives at its stop when that much is allowed."""
-    limits = [limit_nm, *[RATED_NM] * (rig.count - 1)]
-    record = rig.press({0: (Mode.TORQUE, 2 * RATED_NM)}, AT_STOP_TICKS, torque_limit_nm=limits)
+    limits = [limit_nm, *[RATED_NM] * (rig.joint_count - 1)]
+    record = rig.command_without_limiter({0: (Mode.TORQUE, 2 * RATED_NM)}, AT_STOP_TICKS, torque_limit_nm=limits)
     assert np.abs(record.velocity_rad_s[-5:, 0]).max() < 0.05, "it is at its stop"
     return float(record.torque_nm[-5:, 0].mean())
 
@@ -83,7 +83,7 @@ def test_heat_derates_once(backend: str, curve: str, over: float) -> None:
         until_told(rig, celsius)
         rig.arm()
         assert rig.authority.derated_joints.get("joint_1", 1.0) == pytest.approx(share, abs=1e-4), "in the status"
-        from_gate_nm = rig.authority.decide().setpoints.torque_limit_nm[0]
+        from_gate_nm = rig.authority.compute_setpoints().setpoints.torque_limit_nm[0]
         assert from_gate_nm == pytest.approx(share * RATED_NM, abs=1e-3)
         assert pushes_nm(rig, from_gate_nm) == pytest.approx(share * RATED_NM, abs=STEP_NM), "at the joint"
         assert pushes_nm(rig, RATED_NM) == pytest.approx(share * RATED_NM, abs=STEP_NM), "by the motor's own protection"
@@ -98,7 +98,7 @@ def test_a_winding_at_the_stop_temperature_stops_the_robot(backend: str, curve: 
     with hot_robot(backend, curve, stop_at_c - 1.0) as rig:
         until_told(rig, stop_at_c - 1.0)
         rig.arm()
-        windings(rig.backend).winding_c[0] = stop_at_c + 0.1  # pyright: ignore[reportArgumentType]
-        rig.drive({}, 60)
+        windings(rig.backend).winding_temperature_c[0] = stop_at_c + 0.1  # pyright: ignore[reportArgumentType]
+        rig.command_joints({}, 60)
         assert rig.authority.state == "fault"
         assert {fault.joint for fault in rig.authority.faults} == {"joint_1"}

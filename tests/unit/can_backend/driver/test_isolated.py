@@ -11,7 +11,7 @@ import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.driver.module_monitor import CONCERNS_ALL
+from snakesim_can_backend.driver.module_monitor import ROBOT_FAULT_KINDS
 from snakesim_can_backend.emulator.firmware import PASSIVE
 from snakesim_can_backend.protocol.commands import make_command, make_emergency
 from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleFault, ModuleState
@@ -36,20 +36,20 @@ class Lame(Rig):
         return self.backend
 
     def states(self) -> list[ModuleState]:
-        return [module.state for module in self.can.modules.reading.modules]
+        return [module.state for module in self.can.modules.module_reports.modules]
 
     def inject(self, text: str, *, begins: bool = True) -> None:
         assert self.can.inject(parse_injection(f"{text}@0"), begins=begins)
 
     def ask(self, action: Literal["disarm", "reset"]) -> None:
-        answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
+        answer = self.authority.handle_lifecycle_request(LifecycleRequest(action=action), self._now_ns)
         assert answer.ok, answer.reason
 
     def wave(self, periods: int) -> None:
         """The others turn at a steady speed, and back."""
         for _ in range(periods):
             there = 0.5 if self.tick // 50 % 2 else -0.5
-            self.drive(dict.fromkeys(OTHERS, (Mode.VELOCITY, there)))
+            self.command_joints(dict.fromkeys(OTHERS, (Mode.VELOCITY, there)))
 
     def turning(self) -> list[bool]:
         return [abs(self.newest_joints.velocity_rad_s[i]) > 0.2 for i in OTHERS]
@@ -76,7 +76,7 @@ def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within:
         assert all(robot.turning())
         robot.inject(f"{kind}:joint_{FAILS + 1}")
         robot.wave(within + 1)
-        if what in CONCERNS_ALL:
+        if what in ROBOT_FAULT_KINDS:
             assert robot.authority.state == "fault"
             assert robot.authority.isolated_joints == []
             return
@@ -100,9 +100,9 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         assert robot.states()[FAILS] != ModuleState.ARMED, "its motor is on"
         reported = len(robot.faults)
         robot.ask("disarm")
-        robot.idle(5)
+        robot.wait_periods(5)
         robot.ask("reset")
-        robot.idle(20)
+        robot.wait_periods(20)
         robot.arm()
         robot.wave(30)
         robot.assert_armed()
@@ -116,7 +116,7 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
         robot.inject(f"reboot:joint_{FAILS + 1}")
         robot.wave(60)
         robot.disarm()
-        robot.idle(10)
+        robot.wait_periods(10)
         robot.arm()
         robot.wave(30)
         robot.assert_armed()
@@ -133,7 +133,7 @@ def test_one_joint_too_many_stops_all() -> None:
         robot.inject("mute:joint_1")
         robot.wave(DEADLINE)
         assert robot.authority.state == "fault"
-        robot.idle(30)
+        robot.wait_periods(30)
         assert robot.states()[1] == robot.states()[3] == ModuleState.DISARMED
 
 
@@ -145,11 +145,11 @@ def swallowed(robot: Lame, *joints: int) -> None:
     for _ in range(20):
         if robot.authority.isolated_joints or robot.authority.state == "fault":
             break
-        (robot.wave if robot.authority.state == "armed" else robot.idle)(1)
+        (robot.wave if robot.authority.state == "armed" else robot.wait_periods)(1)
     if robot.authority.state == "armed":
         robot.ask("disarm")
     robot.ask("reset")
-    robot.idle(20)
+    robot.wait_periods(20)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_isolated_joint_reset_within_one_period_still_clears(
     with lame_robot(max_isolated) as robot:
         if not driven:
             robot.ask("disarm")
-            robot.idle(20)
+            robot.wait_periods(20)
         swallowed(robot, *joints)
         assert robot.authority.state == "disarmed"
         assert robot.states() == [ModuleState.DISARMED] * JOINTS
@@ -195,9 +195,9 @@ def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch
             robot.ask("disarm")
         robot.ask("reset")
         if then == "estop":
-            robot.estop()
+            robot.trigger_estop()
         monkeypatch.setattr(VirtualWire, "send", overheard)
-        robot.idle()
+        robot.wait_periods()
     stops = [make_command(CommandAction.DISARM), make_command(CommandAction.STOP), make_emergency()]
     assert sent[0] == (make_emergency() if then == "estop" else stops[0])
     assert sent[0] in stops
@@ -207,7 +207,7 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
     """Not braked: its own sensor may be what is wrong."""
     with lame_robot() as robot:
         robot.arm()
-        robot.drive({FAILS: (Mode.VELOCITY, 0.5)}, 30)
+        robot.command_joints({FAILS: (Mode.VELOCITY, 0.5)}, 30)
         robot.isolate_joint(FAILS)
         robot.wave(3)
         robot.assert_armed()

@@ -6,19 +6,24 @@ import msgspec
 import pytest
 
 from snakesim_can_backend.bus.load import ReportSchedule
-from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_drives, check_ratings, plan_parameters
+from snakesim_can_backend.driver.parameters import (
+    SPEED_RANGE_FACTOR,
+    plan_parameters,
+    validate_joint_drives,
+    validate_ratings,
+)
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParameter, Opcode, SafeMotion
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.mounted import Mounted, check_mounted
+from snakesim_drivers.emulation.mounted import Mounted, validate_mounting_overrides
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.files import decode, list_shipped, read_part
+from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
 from snakesim_hal.model.joints import JointExceptions
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import load
+from snakesim_hal.model.scenario import load_scenario
 from snakesim_testing.messages import raises_error
 
-ROBOT = load("triplet").config.robot
+ROBOT = load_scenario("triplet").config.robot
 RATED = (ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED)
 
 
@@ -31,9 +36,9 @@ def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[ModuleParamete
     return {4: {ModuleParameter.RATED_TORQUE: torque_nm, ModuleParameter.RATED_SPEED: speed_rad_s}}
 
 
-@pytest.mark.parametrize("name", list_shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped_names("robots"))
 def test_parameters_of_every_module_exclude_ratings_and_stay_in_range(name: str) -> None:
-    robot = decode(read_part(name, "robots"), RobotFile)
+    robot = decode_table(read_table_with_base(name, "robots"), RobotFile)
     wanted = plan_parameters(robot, CanSettings(), ReportSchedule(100.0))
     assert list(wanted) == list(range(1, robot.chain.modules + 1))
     for values in wanted.values():
@@ -53,7 +58,7 @@ def test_parameters_of_a_geared_module_describe_its_own_shaft() -> None:
     assert second[ModuleParameter.TORQUE_LIMIT] == 3.0
     assert second[ModuleParameter.SPEED_LIMIT] == 15.0
     assert second[ModuleParameter.ANGLE_LIMIT] == pytest.approx(1.9), "from 0.5 - 2.4 to 0.5 + 0.8 rad"
-    check_ratings(robot, {2: {ModuleParameter.RATED_TORQUE: 3.0, ModuleParameter.RATED_SPEED: 15.0}})
+    validate_ratings(robot, {2: {ModuleParameter.RATED_TORQUE: 3.0, ModuleParameter.RATED_SPEED: 15.0}})
 
 
 MISPLACED = {
@@ -74,9 +79,11 @@ def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
     settings = CanSettings(**given)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
     with raises_error(ConfigError, code=("bus/invalid-channel", "config/conflict", "drive/unsupported-setting")):
-        check_drives(robot, settings)
-        check_mounted(robot, "backends.can", settings.mounted, emulators=settings.emulators_run != "none")
-        check_ratings(robot)
+        validate_joint_drives(robot, settings)
+        validate_mounting_overrides(
+            robot, "backends.can", settings.mounted, are_emulated=settings.emulators_run != "none"
+        )
+        validate_ratings(robot)
 
 
 @pytest.mark.parametrize("tail", [True, False])
@@ -96,19 +103,19 @@ def test_parameters_take_stop_mode_from_robot_and_watchdog_from_settings(action:
         ModuleParameter.IMU_EVERY,
     )
     assert [told[name] for name in names] == [motion, 0.05, 3.0, 17.0]
-    check_ratings(robot)
+    validate_ratings(robot)
 
 
 def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        check_ratings(changed("safety", action="hold"))
+        validate_ratings(changed("safety", action="hold"))
 
 
 @pytest.mark.parametrize(
     ("field", "opcode", "signal", "room"),
     [
         ("angle_rad", Opcode.JOINT_STATE, "angle", 1.0),
-        ("speed_rad_s", Opcode.JOINT_STATE, "velocity", SPEED_ROOM),
+        ("speed_rad_s", Opcode.JOINT_STATE, "velocity", SPEED_RANGE_FACTOR),
         ("torque_nm", Opcode.JOINT_STATE, "torque", 1.0),
         ("stop_at_c", Opcode.HEALTH, "motor_temperature", 1.0),
     ],
@@ -116,9 +123,9 @@ def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
 def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, room: float) -> None:
     most = load_layouts()[opcode].signals[signal].high / room
     if field != "angle_rad" or most <= 3.1:
-        check_ratings(changed("limits", **{field: most * 0.999}))
+        validate_ratings(changed("limits", **{field: most * 0.999}))
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        check_ratings(changed("limits", **{field: most * 1.001}))
+        validate_ratings(changed("limits", **{field: most * 1.001}))
 
 
 @pytest.mark.parametrize(
@@ -131,4 +138,4 @@ def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, 
 )
 def test_a_weaker_module_is_named_with_what_to_do(torque_nm: float, speed_rad_s: float) -> None:
     with raises_error(BackendError, code="drive/unsupported-setting", field="joint_4"):
-        check_ratings(ROBOT, rated(torque_nm, speed_rad_s))
+        validate_ratings(ROBOT, rated(torque_nm, speed_rad_s))

@@ -18,7 +18,7 @@ def test_reading_states_up_to_three_syncs_late_are_accepted() -> None:
         made.process_frame(joint_state(2, made.sync - late, 0.9))
         assert (angles(made)[1] == pytest.approx(0.9)) is taken
         assert made.modules[1].sync == (made.sync - 3 if taken else 1)
-        assert made.modules[1].wrong_counts == (not taken)
+        assert made.modules[1].wrong_counter_count == (not taken)
         assert (made.states_missing == 1) is taken, "the newest Sync is not answered by it"
 
 
@@ -38,14 +38,14 @@ def test_reading_two_answers_to_one_sync_count_once() -> None:
     for expected in (1, 2, 3):
         begin(made)
         answer(made, [1, 2, 2, 2, 3])
-        assert module.answered_twice(made.sync) == expected
+        assert module.count_double_answers(made.sync) == expected
     begin(made)
-    assert module.answered_twice(made.sync) == 3, "this Sync may still be answered twice"
+    assert module.count_double_answers(made.sync) == 3, "this Sync may still be answered twice"
     answer(made)
     begin(made)
-    assert module.answered_twice(made.sync) == 0
+    assert module.count_double_answers(made.sync) == 0
     answer(made, [1, 2, 2, 3])
-    assert module.answered_twice(made.sync) == 1
+    assert module.count_double_answers(made.sync) == 1
 
 
 def test_an_unknown_state_is_a_fault() -> None:
@@ -68,11 +68,11 @@ def test_reading_is_complete_when_every_module_has_answered() -> None:
     begin(made)
     for node in (1, 2):
         answer(made, [node])
-        assert not made.complete
+        assert not made.is_complete
     answer(made, [2])
-    assert not made.complete, "an answer that comes twice is not somebody else's"
+    assert not made.is_complete, "an answer that comes twice is not somebody else's"
     answer(made, [3])
-    assert made.complete
+    assert made.is_complete
 
 
 def test_reading_waits_for_forces_only_at_requested_syncs() -> None:
@@ -80,17 +80,17 @@ def test_reading_waits_for_forces_only_at_requested_syncs() -> None:
     begin(made, contacts=True, tail=True)
     answer(made)
     for node in (1, 2, 3):
-        assert not made.complete
+        assert not made.is_complete
         made.process_frame(contact(node, made.sync))
     made.process_frame(contact(3, made.sync))
-    assert not made.complete, "the tail's own is missing"
+    assert not made.is_complete, "the tail's own is missing"
     made.process_frame(contact(1, made.sync, tail=True))
-    assert made.complete
+    assert made.is_complete
     begin(made, contacts=True)
     answer(made)
     for node in (1, 2, 3):
         made.process_frame(contact(node, made.sync))
-    assert made.complete
+    assert made.is_complete
 
 
 def test_reading_does_not_wait_for_a_silent_module() -> None:
@@ -98,13 +98,13 @@ def test_reading_does_not_wait_for_a_silent_module() -> None:
     syncs(made, MAX_LATE_SYNCS, [1, 3])
     begin(made, contacts=True, tail=True)
     answer(made, [1, 3])
-    assert not made.complete and made.states_missing == 1, "three Syncs are not long"
+    assert not made.is_complete and made.states_missing == 1, "three Syncs are not long"
     begin(made, contacts=True, tail=True)
     answer(made, [1, 3])
     for node in (1, 3):
         made.process_frame(contact(node, made.sync))
     made.process_frame(contact(1, made.sync, tail=True))
-    assert made.complete
+    assert made.is_complete
 
 
 def test_reading_without_tail_does_not_wait_for_its_link() -> None:
@@ -120,7 +120,7 @@ def test_reading_waits_for_a_module_never_received() -> None:
     syncs(made, 10, [1, 3])
     begin(made)
     answer(made, [1, 3])
-    assert not made.complete
+    assert not made.is_complete
 
 
 def test_reading_returned_module_does_not_replace_another() -> None:
@@ -134,6 +134,6 @@ def test_reading_returned_module_does_not_replace_another() -> None:
     assert made.contacts_missing == 1
     answer(made, [3])
     made.process_frame(contact(3, made.sync))
-    assert made.complete
+    assert made.is_complete
     begin(made)
     assert made.states_missing == JOINTS

@@ -45,10 +45,10 @@ def test_an_imus_halves_are_of_one_sync() -> None:
     made = reading()
     made.process_frame(gyro(2, 7, 1.0))
     made.process_frame(accelerometer(2, 27, 9.81))  # between them two frames were lost
-    assert made.take_imu_reports() == []
+    assert made.pop_imu_reports() == []
     made.process_frame(gyro(2, 47, 2.0))
     made.process_frame(accelerometer(2, 47, 9.81))
-    assert [list(rates) for _, rates, _ in made.take_imu_reports()] == [[2000, 0, 0]]
+    assert [list(rates) for _, rates, _ in made.pop_imu_reports()] == [[2000, 0, 0]]
 
 
 # --- heartbeats --------------------------------------------------------------------------------------------
@@ -84,11 +84,11 @@ def test_a_heartbeat_tells_state_faults_and_reason() -> None:
     assert module.state == ModuleState.FAULT
     assert module.last_stop == LastStop.LEAK
     assert module.fault_names() == ["leak", "voltage"]
-    assert module.needs_clearing
+    assert module.is_clear_required
     assert module.heartbeat_sync == made.sync
     made.process_frame(heartbeat(2, 1.1))
     assert module.fault_names() == []
-    assert not module.needs_clearing
+    assert not module.is_clear_required
 
 
 @pytest.mark.parametrize("state", [ModuleState.FAULT, ModuleState.EMERGENCY])
@@ -96,9 +96,9 @@ def test_latched_state_without_reason_needs_clearing_after_three_syncs(state: Mo
     made = reading()
     for needed in (False, False, True):
         syncs(made, 1, state=state)
-        assert made.modules[0].needs_clearing is needed
+        assert made.modules[0].is_clear_required is needed
     syncs(made, 1, state=ModuleState.DISARMED)
-    assert not made.modules[0].needs_clearing
+    assert not made.modules[0].is_clear_required
 
 
 # --- others ------------------------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
         made.process_frame(Frame(frame.id, frame.data[:-1]))
         made.process_frame(Frame(frame.id, b""))
         assert made.malformed == 2 * (i + 1)
-    before[1].frames = made.modules[1].frames
+    before[1].frame_count = made.modules[1].frame_count
     assert made.modules == before
     assert made.health() == [None] * JOINTS
 
@@ -121,8 +121,8 @@ def test_strangers_are_counted_by_node() -> None:
     made = reading()
     for node in (4, 4, LAST_NODE, 0):
         made.process_frame(Frame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
-    assert made.unknown_nodes == {4: 2, LAST_NODE: 1, 0: 1}
-    assert not made.from_other_host
+    assert made.unknown_node_frame_counts == {4: 2, LAST_NODE: 1, 0: 1}
+    assert not made.other_host_frame_counts
 
 
 # --- whatever comes ----------------------------------------------------------------------------------------
@@ -148,9 +148,9 @@ def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(frames: list[F
         is_state = parse_opcode(frame.id) == Opcode.JOINT_STATE and len(frame.data) == 8 and has_valid_checksum(frame)
         changed = np.flatnonzero((made.shaft_values() != before).any(axis=0)).tolist()
         assert changed in ([], [parse_node(frame.id) - 1] if is_state else [])
-        assert made.complete in (True, False)
+        assert made.is_complete in (True, False)
         assert made.list_contacts() is not None
-        assert made.take_imu_reports() is not None
+        assert made.pop_imu_reports() is not None
         assert len(made.health()) == JOINTS
 
 
@@ -161,4 +161,4 @@ def test_no_single_wrong_bit_moves_a_joint(node: int, bit: int) -> None:
     whole = int.from_bytes(joint_state(node, made.sync, 0.9).data, "little") ^ 1 << bit
     made.process_frame(Frame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
     assert angles(made) == pytest.approx([0.1] * JOINTS)
-    assert made.modules[node - 1].corrupt == 1
+    assert made.modules[node - 1].corrupt_state_count == 1

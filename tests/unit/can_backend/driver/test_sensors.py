@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from snakesim_can_backend.bus.load import ReportSchedule, plan_reports
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.driver.sensors import (
-    NO_STATE_AGE_NS,
+    NEVER_RECEIVED_AGE_NS,
     SampleBuilder,
-    contacts_due,
+    are_contacts_due,
     describe_sensors,
     locate_on_capsule,
 )
@@ -45,7 +45,7 @@ def sensors_of(run: RunConfig, reports: ReportSchedule | None = None) -> tuple[M
 
 
 def contacts_of(samples: Samples) -> Contacts:
-    found = samples.others[keys.CONTACTS]
+    found = samples.by_key[keys.CONTACTS]
     assert isinstance(found, Contacts)
     return found
 
@@ -83,7 +83,7 @@ def test_joint_state_never_received_is_invalid() -> None:
     syncs(reading, 1, [1, 2, 4])
     joints = sensors.make_samples(0, 0).joints
     assert joints.valid == [True, True, False, True]
-    assert joints.age_ns[2] == NO_STATE_AGE_NS
+    assert joints.age_ns[2] == NEVER_RECEIVED_AGE_NS
     assert joints.angle_rad == pytest.approx([0.1, 0.1, 0.0, 0.1]), "a zero that nobody may believe"
 
 
@@ -95,11 +95,11 @@ def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
     reports = ReportSchedule(100.0, contact_every=3)
     reading, sensors = sensors_of(run, reports)
     for tick in range(300):
-        sync = begin(reading, contacts=contacts_due(reports, reading.sync + 1))
+        sync = begin(reading, contacts=are_contacts_due(reports, reading.sync + 1))
         answer(reading)
-        assert contacts_due(reports, sync) is (sync % 256 % 3 == 0)
-        assert (keys.CONTACTS in sensors.make_samples(tick, 0).others) is contacts_due(reports, sync)
-    assert not any(contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300))
+        assert are_contacts_due(reports, sync) is (sync % 256 % 3 == 0)
+        assert (keys.CONTACTS in sensors.make_samples(tick, 0).by_key) is are_contacts_due(reports, sync)
+    assert not any(are_contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300))
 
 
 def test_contacts_without_touch_are_an_empty_list() -> None:
@@ -192,24 +192,24 @@ def test_contact_position_is_on_the_capsule(along_m: float, bearing: float, leng
 def test_imu_sample_has_only_new_and_complete_reports() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     syncs(reading, 1)
-    assert keys.IMU not in sensors.make_samples(0, 0).others
+    assert keys.IMU not in sensors.make_samples(0, 0).by_key
     reading.process_frame(gyro(3, 0, 0.5))
     reading.process_frame(accelerometer(3, 0, 9.81))
     reading.process_frame(gyro(1, 0, 0.5))  # incomplete: without its acceleration
-    imu = sensors.make_samples(1, 10).others[keys.IMU]
+    imu = sensors.make_samples(1, 10).by_key[keys.IMU]
     assert isinstance(imu, Imu)
     assert imu.tick == 1
     assert imu.timestamp_ns == 10
     assert imu.link == [3]
     assert imu.angular_velocity_rad_s[0] == pytest.approx((0.5, 0.0, 0.0))
     assert imu.acceleration_m_s2[0] == pytest.approx((0.0, 0.0, 9.81))
-    assert keys.IMU not in sensors.make_samples(2, 0).others
+    assert keys.IMU not in sensors.make_samples(2, 0).by_key
 
 
 def test_power_sample_is_made_every_half_second() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
-    ticks_with_power = [tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).others]
+    ticks_with_power = [tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).by_key]
     assert ticks_with_power == [0, 50, 100]  # at 100 Hz
 
 
@@ -218,7 +218,7 @@ def test_power_sample_of_modules_without_report_is_invalid() -> None:
     syncs(reading, 1)
     reading.process_frame(health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1))
     reading.process_frame(health(4, voltage=24.0))
-    power = sensors.make_samples(50, 7).others[keys.POWER]
+    power = sensors.make_samples(50, 7).by_key[keys.POWER]
     assert isinstance(power, Power)
     assert power.tick == 50
     assert power.timestamp_ns == 7
@@ -237,7 +237,7 @@ def test_power_values_of_a_module_expire() -> None:
     reading.process_frame(health(2, voltage=23.5))
 
     def valid(tick: int) -> list[bool]:
-        power = sensors.make_samples(tick, 0).others[keys.POWER]
+        power = sensors.make_samples(tick, 0).by_key[keys.POWER]
         assert isinstance(power, Power)
         return power.valid
 

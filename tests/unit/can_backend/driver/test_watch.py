@@ -3,10 +3,10 @@
 import pytest
 
 from snakesim_can_backend.driver.module_monitor import (
-    ARM_GRACE,
-    CLEAR_GRACE,
-    CONCERNS_ALL,
-    MAX_FRAMES,
+    ARM_GRACE_SYNCS,
+    CLEAR_GRACE_SYNCS,
+    MAX_FRAMES_PER_CYCLE,
+    ROBOT_FAULT_KINDS,
     Finding,
     ModuleMonitor,
 )
@@ -49,7 +49,7 @@ def doubled(reading: ModuleReports) -> None:
 
 def babbling(reading: ModuleReports) -> None:
     reading.process_frame(joint_state(2, reading.sync))
-    for _ in range(MAX_FRAMES):
+    for _ in range(MAX_FRAMES_PER_CYCLE):
         reading.process_frame(heartbeat(2, 1.0))
 
 
@@ -59,7 +59,7 @@ WRONGS = [
     (miscounting, 3, "wrong_counter", "answers Syncs that were not sent: 3 wrong counters in a row"),
     (corrupt, 3, "bad_checksum", "sends corrupt states: 3 wrong checksums in a row"),
     (doubled, 3, "duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id"),
-    (babbling, 1, "module_babbling", f"floods the bus: {MAX_FRAMES + 1} frames within one period"),
+    (babbling, 1, "module_babbling", f"floods the bus: {MAX_FRAMES_PER_CYCLE + 1} frames within one period"),
 ]
 
 
@@ -67,10 +67,10 @@ WRONGS = [
 def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, after: int, what: str, cause: str) -> None:
     bench = Bench()
     assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
-    assert bench.tick(speak) == [Finding(what, WHO + cause, 1, alone=what not in CONCERNS_ALL)]
+    assert bench.tick(speak) == [Finding(what, WHO + cause, 1, affects_only_joint=what not in ROBOT_FAULT_KINDS)]
     assert bench.ticks(40, speak) == []
     bench.reset()
-    assert (what, 1) in list_findings(bench.ticks(CLEAR_GRACE + 1, speak))
+    assert (what, 1) in list_findings(bench.ticks(CLEAR_GRACE_SYNCS + 1, speak))
     assert bench.ticks(40, speak) == []
 
 
@@ -125,8 +125,8 @@ def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
     assert list_findings(found) == [("module_restarted", 1)]
     assert found[0].cause.startswith(WHO + "has restarted")
     assert "0.20 s" in found[0].cause
-    assert bench.watch.take_changed() == {1}
-    assert bench.watch.take_changed() == set()
+    assert bench.watch.pop_changed_joints() == {1}
+    assert bench.watch.pop_changed_joints() == set()
     bench.reset()
     assert bench.ticks(10) == []
     assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
@@ -138,7 +138,7 @@ def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
     (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured={1})
     assert list_findings([found]) == [("module_not_configured", 1)]
-    assert not found.alone
+    assert not found.affects_only_joint
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}) == []
 
 
@@ -150,7 +150,7 @@ def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
 
     bench = Bench()
     assert list_findings(bench.ticks(30, two_hearts)) == [("duplicate_node", 1)]
-    assert bench.watch.take_changed() == set()
+    assert bench.watch.pop_changed_joints() == set()
 
 
 def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
@@ -167,7 +167,7 @@ def test_watch_isolated_joint_reports_only_robot_wide_faults() -> None:
     (found,) = bench.ticks(9, HOT_AND_WET)
     assert found.what == "module_overheat"
     assert found.joint == 1
-    assert not found.alone
+    assert not found.affects_only_joint
 
 
 def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
@@ -176,15 +176,15 @@ def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
     stopped = reporting(ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1)
     (found,) = bench.ticks(9, stopped)
     assert found.what == "module_overheat"
-    assert not found.alone
+    assert not found.affects_only_joint
 
 
 def test_water_after_heat_is_told_again_with_all_reasons() -> None:
     bench = Bench()
     (found,) = bench.ticks(9, HOT)
-    assert found.alone
+    assert found.affects_only_joint
     reasons = "reports overheat, leak; it stopped because of overheat"
-    assert bench.ticks(9, HOT_AND_WET) == [Finding("module_overheat", WHO + reasons, 1, alone=False)]
+    assert bench.ticks(9, HOT_AND_WET) == [Finding("module_overheat", WHO + reasons, 1, affects_only_joint=False)]
 
 
 def test_watch_fault_without_heartbeat_is_reported_from_state() -> None:
@@ -197,11 +197,11 @@ def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
     bench = Bench()
     bench.tick(HOT_AND_WET)
     bench.reset()
-    assert bench.ticks(CLEAR_GRACE - 1, HOT_AND_WET) == []
+    assert bench.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
     bench.tick(reporting())
     assert bench.ticks(10) == []
     bench.reset()
-    assert bench.ticks(CLEAR_GRACE - 1, HOT_AND_WET) == []
+    assert bench.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
     assert list_findings(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], "and is told again when it stays"
 
 
@@ -219,7 +219,7 @@ def test_watch_module_that_does_not_arm_is_reported_after_grace() -> None:
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     found = [bench.tick(answering(ModuleState.DISARMED)) for _ in range(20)]
     first = next(i for i, reported in enumerate(found) if reported)
-    assert ARM_GRACE < first <= ARM_GRACE + 3
+    assert ARM_GRACE_SYNCS < first <= ARM_GRACE_SYNCS + 3
     assert [f for reported in found for f in reported] == [
         Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1)
     ]
@@ -228,7 +228,7 @@ def test_watch_module_that_does_not_arm_is_reported_after_grace() -> None:
 def test_watch_module_armed_within_grace_is_not_reported() -> None:
     bench = Bench()
     bench.lifecycle = "armed"
-    assert bench.ticks(ARM_GRACE) == []
+    assert bench.ticks(ARM_GRACE_SYNCS) == []
     bench.state = ModuleState.ARMED
     assert bench.ticks(10) == []
     assert bench.ticks(2, answering(ModuleState.STOPPING)) == []
@@ -240,7 +240,9 @@ def test_watch_module_that_disarms_itself_is_reported_at_once() -> None:
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     assert bench.ticks(2) == [], "within the grace"
     found = bench.tick(answering(ModuleState.DISARMED))
-    assert found == [Finding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1, alone=True)]
+    assert found == [
+        Finding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1, affects_only_joint=True)
+    ]
 
 
 def test_the_grace_begins_with_every_arming() -> None:
@@ -250,4 +252,4 @@ def test_the_grace_begins_with_every_arming() -> None:
     bench.lifecycle, bench.state = "disarmed", ModuleState.DISARMED
     assert bench.ticks(20) == [], "disarmed modules of a disarmed robot"
     bench.lifecycle = "armed"
-    assert bench.ticks(ARM_GRACE) == []
+    assert bench.ticks(ARM_GRACE_SYNCS) == []

@@ -100,14 +100,14 @@ def test_what_another_host_may_have_changed_is_written_anew() -> None:
     bench = Bench()
     bench.reading.process_frame(load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1))
     assert list_findings(bench.tick()) == [("second_host", None)]
-    assert bench.watch.take_changed() == {0, 1, 2}
+    assert bench.watch.pop_changed_joints() == {0, 1, 2}
 
 
 def test_bus_watch_identity_request_is_no_second_host() -> None:
     bench = Bench()
     bench.reading.process_frame(make_command(CommandAction.IDENTIFY))
     assert bench.tick() == []
-    assert bench.watch.take_changed() == set()
+    assert bench.watch.pop_changed_joints() == set()
 
 
 def test_a_module_is_not_silent_that_was_not_asked() -> None:

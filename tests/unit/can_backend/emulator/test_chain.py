@@ -15,10 +15,10 @@ from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.can.module_rig import Host, chain, only, setpoint
-from snakesim_testing.hal.small_robots import pose
+from snakesim_testing.hal.small_robots import make_pose
 
 G = 9.81
-POSE = pose(position_w=(1.0, 2.0, 0.1), velocity_w=(0.1, 0.0, 0.0), angular_velocity_w=(0.0, 0.0, 0.5))
+POSE = make_pose(position_w=(1.0, 2.0, 0.1), velocity_w=(0.1, 0.0, 0.0), angular_velocity_w=(0.0, 0.0, 0.5))
 
 
 class Pushed:
@@ -102,18 +102,18 @@ def test_chain_two_buses_with_same_sync_share_one_step():
             made.receive(channel, make_sync(tick, tick * 10_000))
     assert physics_model.steps == 20
     assert made.modules_per_bus == [3, 2]
-    assert [s["count"] for s in only(made.take_frames(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
+    assert [s["count"] for s in only(made.pop_frames(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
     made.receive(1, make_command(CommandAction.ARM))
     assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
     made.receive(0, setpoint(0, node=4))
-    assert made.slots[3].module._pending is None, "node 4 is on the other bus"
+    assert made.slots[3].module._pending_demand is None, "node 4 is on the other bus"
 
 
 def test_chain_contact_force_is_measured_by_neighbor_links():
     made = chain(config(**SENSORS), physics_model=Pushed(4))
     made.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     made.receive(0, make_sync(0, 0))
-    frames = made.take_frames(0)
+    frames = made.pop_frames(0)
     contacts = only(frames, Opcode.CONTACT)
     assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
     assert contacts[1]["force_y"] == pytest.approx(12.0)
@@ -132,11 +132,11 @@ def test_neighbours_take_turns_with_their_imus():
         slot.module.parameters.values[ModuleParameter.IMU_EVERY] = 4.0
     for tick in range(4):
         made.receive(0, make_sync(tick, 0))
-        gyros = only(made.take_frames(0), Opcode.GYRO)
+        gyros = only(made.pop_frames(0), Opcode.GYRO)
         assert len(gyros) == 1
         assert gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
     made.receive(0, make_sync(4, 0))
-    frames = made.take_frames(0)
+    frames = made.pop_frames(0)
     assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
     assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
 
@@ -195,7 +195,7 @@ def test_chain_in_real_time_catches_up_only_short_pauses():
 def test_overheating_fades_torque_before_it_stops():
     host = Host(chain(physics_model=Pushed(4)))
     host.arm()
-    host.chain.thermal.winding_c[1] = 95.0
+    host.chain.thermal.winding_temperature_c[1] = 95.0
     frames = host.ticks(10, 4.0, Mode.TORQUE)
     states = only(frames, Opcode.JOINT_STATE)
     assert [s["derated"] for s in states] == [0, 1, 0, 0]

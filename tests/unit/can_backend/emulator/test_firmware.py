@@ -39,7 +39,7 @@ WITHOUT_KEY = load_layouts()[Opcode.COMMAND].encode(BROADCAST, action=CommandAct
 def drive(module: ModuleFirmware, count: int, now_us: float, **how: Any) -> None:
     """A setpoint, and the Sync that enacts it."""
     module.receive_setpoint(setpoint(count, **how), now_us)
-    module.sync(count, QUIET)
+    module.handle_sync(count, QUIET)
 
 
 def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
@@ -47,7 +47,7 @@ def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
     module.poll(0.0)
     module.receive(make_command(CommandAction.IDENTIFY), 50 * MS)
     module.receive(make_command(CommandAction.ARM), 50 * MS)
-    module.sync(1, QUIET)
+    module.handle_sync(1, QUIET)
     module.poll(99 * MS)
     assert module.frames == []
     assert module.state == ModuleState.BOOT
@@ -108,7 +108,7 @@ def test_firmware_out_of_sequence_setpoint_is_dropped_and_counting_continues(fir
     drive(module, first, BOOTED, target=1.0)
     drive(module, count, BOOTED, target=2.0)
     assert module.demand.target == pytest.approx(2.0 if taken else 1.0)
-    assert module.refused == (not taken)
+    assert module.rejected_frame_count == (not taken)
     drive(module, count + 1, BOOTED, target=3.0)
     assert module.demand.target == pytest.approx(3.0)
     assert module.state == ModuleState.ARMED
@@ -129,10 +129,10 @@ def test_a_wrong_checksum_is_as_if_nothing_had_come():
     module = armed()
     drive(module, 0, BOOTED, target=1.0)
     module.receive_setpoint(corrupted(setpoint(1, target=2.0)), BOOTED + 50 * MS)
-    module.sync(1, QUIET)
+    module.handle_sync(1, QUIET)
     assert module.demand.target == pytest.approx(1.0)
-    assert module._fed_us == BOOTED
-    assert module.refused == 1
+    assert module._watchdog_fed_us == BOOTED
+    assert module.rejected_frame_count == 1
 
 
 def test_stopping_damps_until_at_rest():
@@ -188,7 +188,7 @@ def test_a_reboot_forgets_what_was_not_saved():
 def test_firmware_uptime_saturates_at_end_of_range() -> None:
     """The protocol forbids a number that wraps around: an uptime of 0 would look like a restart."""
     module = booted()
-    module._booted_us = -(2**32 - 50) * MS
+    module._boot_start_us = -(2**32 - 50) * MS
     beats = [
         load_layouts()[Opcode.HEARTBEAT].decode(module.heartbeat(at_us).data) for at_us in (0.0, 100 * MS, 500 * MS)
     ]
@@ -198,7 +198,7 @@ def test_firmware_uptime_saturates_at_end_of_range() -> None:
 def test_every_sync_is_answered_with_its_own_count():
     module = booted(contact_every=4, imu_every=5, tail=1)
     for count in range(20):
-        module.sync(count, QUIET)
+        module.handle_sync(count, QUIET)
     states = only(module.frames, Opcode.JOINT_STATE)
     assert [s["count"] for s in states] == [c % 16 for c in range(20)]
     assert [c["count"] for c in only(module.frames, Opcode.CONTACT)] == [0, 4, 8, 12, 0]
@@ -208,9 +208,9 @@ def test_every_sync_is_answered_with_its_own_count():
 def test_firmware_hanging_module_repeats_state_until_hardware_watchdog_opens_bridge():
     module = armed()
     drive(module, 3, BOOTED)
-    module.hangs = True
+    module.is_hanging = True
     module.frames.clear()
-    module.sync(4, QUIET)
+    module.handle_sync(4, QUIET)
     [state] = only(module.frames, Opcode.JOINT_STATE)
     assert state["count"] == 3
     assert module.demand.mode == Mode.TORQUE
@@ -218,7 +218,7 @@ def test_firmware_hanging_module_repeats_state_until_hardware_watchdog_opens_bri
         module.poll(BOOTED + k * MS)
         assert (module.demand.mode == Mode.PASSIVE) == (k >= 100)
     assert not only(module.frames, Opcode.HEARTBEAT)
-    module.hangs = False
+    module.is_hanging = False
     module.poll(BOOTED + 301 * MS)
     assert module.last_stop == LastStop.WATCHDOG
 
@@ -240,7 +240,7 @@ PAUSES = st.sampled_from([0.0, 1.0 * MS, 20 * MS, 120 * MS])
 def give(module: ModuleFirmware, frame, now_us: float) -> None:
     opcode = frame.id >> 6
     if opcode == Opcode.SYNC:
-        module.sync(frame.data[0], QUIET)
+        module.handle_sync(frame.data[0], QUIET)
     elif opcode == Opcode.SET_POINT:
         module.receive_setpoint(frame, now_us)
     else:
@@ -256,11 +256,11 @@ def test_firmware_drives_only_when_armed_with_valid_setpoints(sent):
         now_us += pause_us
         module.health.leak = leak and pause_us > 0
         module.poll(now_us)
-        before, state, refused = module._fed_us, module.state, module.refused
+        before, state, refused = module._watchdog_fed_us, module.state, module.rejected_frame_count
         give(module, frame, now_us)
-        if module._fed_us != before and state == ModuleState.ARMED and module.state == ModuleState.ARMED:
+        if module._watchdog_fed_us != before and state == ModuleState.ARMED and module.state == ModuleState.ARMED:
             assert frame.id >> 6 == Opcode.SET_POINT
-            assert module.refused == refused
+            assert module.rejected_frame_count == refused
         if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):
             assert module.demand.mode == Mode.PASSIVE
 

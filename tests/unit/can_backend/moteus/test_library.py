@@ -11,7 +11,12 @@ from moteus.protocol import parse_message, parse_registers
 from snakesim_can_backend.bus.bus import VirtualWire, to_python_can
 from snakesim_can_backend.moteus import protocol
 from snakesim_can_backend.moteus.backend import MoteusBackend
-from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION, configured_gains
+from snakesim_can_backend.moteus.controllers import (
+    HEALTH_REQUESTS,
+    IDENTITY_REQUESTS,
+    MOTION_REQUESTS,
+    get_configured_gains,
+)
 from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_drivers.kit.drive_backend import DriverClock
@@ -89,13 +94,13 @@ def test_moteus_command_frame_equals_that_of_its_library(law: dict[str, float]) 
 def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
     stop = protocol.encode_subframe(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.STOPPED)
     assert protocol.make_frame(0, 1, stop) == as_frame(theirs().make_stop())
-    asked = protocol.make_frame(0, 1, *MOTION, reply=True)
+    asked = protocol.make_frame(0, 1, *MOTION_REQUESTS, reply=True)
     assert asked.id == as_frame(theirs().make_query()).id == 0x8001
     assert to_python_can(asked, fd=True).is_extended_id
     assert not to_python_can(Frame(0x100, b""), fd=True).is_extended_id
-    assert len(protocol.make_frame(0, 1, *HEALTH).data) == 6
-    assert len(protocol.make_frame(0, 1, *MOTION).data) == 5
-    assert parse_registers(protocol.make_frame(0, 1, *IDENTITY).data).query == [
+    assert len(protocol.make_frame(0, 1, *HEALTH_REQUESTS).data) == 6
+    assert len(protocol.make_frame(0, 1, *MOTION_REQUESTS).data) == 5
+    assert parse_registers(protocol.make_frame(0, 1, *IDENTITY_REQUESTS).data).query == [
         (0x102, moteus.INT32),
         (0x00C, moteus.INT8),
     ]
@@ -105,7 +110,7 @@ def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
 def bus() -> Any:
     """Emulated controllers of a robot, and their bus."""
     wire, clock = VirtualWire("moteus-theirs", fd=True), DriverClock(CONFIG)
-    emulator = MoteusBackend.emulator_on(CONFIG, MoteusSettings(physics_model="inertia"), [wire], clock, None)
+    emulator = MoteusBackend.make_emulator(CONFIG, MoteusSettings(physics_model="inertia"), [wire], clock, None)
     with can.Bus(interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD) as ours:
         yield ours, emulator, clock
     emulator.close()
@@ -128,7 +133,7 @@ def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
     for _ in range(100):
         ask(client.make_position(position=0.05, velocity=0.0, watchdog_timeout=0.1))
-        clock.robot_ns += 10_000_000
+        clock.robot_time_ns += 10_000_000
         emulator()
     for kind, close in zip(TYPES, (0.01, 0.0002, 0.0002, 0.0002), strict=True):
         fields = dict.fromkeys((0, 1, 2, 3, 13, 14, 15), kind)
@@ -137,7 +142,7 @@ def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
         assert said[moteus.Register.FAULT] == 0
         assert said[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(close, 0.003))
         assert said[moteus.Register.VOLTAGE] == pytest.approx(emulator.body.read_supply(2)[0], abs=0.3)
-    clock.robot_ns += 150_000_000
+    clock.robot_time_ns += 150_000_000
     emulator()
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT
     ask(client.make_position(position=0.1, velocity=0.0))
@@ -168,7 +173,7 @@ def test_moteus_library_reads_every_frame_of_a_run() -> None:
     assert not any(one.errors for one in read)
     command = next(one.command for one in read if len(one.command) > 2)
     motor = CONFIG.robot.joint_table[0].motor
-    kp = command[moteus.Register.COMMAND_KP_SCALE] * configured_gains(CONFIG.robot.joint_table, MoteusSettings())[0]
+    kp = command[moteus.Register.COMMAND_KP_SCALE] * get_configured_gains(CONFIG.robot.joint_table, MoteusSettings())[0]
     assert command[moteus.Register.COMMAND_POSITION] == pytest.approx(0.2 / (2 * math.pi))
     assert kp == pytest.approx(motor.stiffness_nm_per_rad * 2 * math.pi)
     assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5

@@ -18,7 +18,7 @@ from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 3
@@ -40,7 +40,7 @@ class Robot(DriveRig):
 
     @staticmethod
     def configuration() -> RunConfig:
-        return run_config(
+        return make_run_config(
             backend="odrive",
             rate_hz=100,
             robot__chain__modules=JOINTS,
@@ -111,7 +111,7 @@ def test_odrive_lowered_limit_is_restored_when_idle_or_named(
     robot.run(30, "disarmed")
     assert axes[0].current_soft_max_a == pytest.approx(NEEDED_A)
     robot.run(30, "armed")
-    robot.backend._clock.robot_ns += 190_000_000  # the driver is gone, and the watchdogs stop the axes
+    robot.backend._clock.robot_time_ns += 190_000_000  # the driver is gone, and the watchdogs stop the axes
     with raises_error(BackendError, code="drive/not-complete", field="joint_1"):
         robot.backend._drives.bring_up()
     for i in range(JOINTS):
@@ -139,7 +139,7 @@ def test_odrive_unread_axis_is_capped_and_logged_as_unknown(
         made(drives, replace(context, emulated=False))
 
     monkeypatch.setattr(CanDrives, "__init__", as_if_real)
-    monkeypatch.setattr(OdriveBackend, "check_current", lambda *_: None)
+    monkeypatch.setattr(OdriveBackend, "validate_current_limit", lambda *_: None)
     robot = Robot(max_current_a=max_current_a)
     robot.limit_nm = TORQUE_NM
     robot.run(20, "armed")
@@ -194,9 +194,11 @@ def test_a_file_of_another_firmware_is_refused(tmp_path: Path) -> None:
 def test_odrive_file_of_another_kind_is_refused_before_start(tmp_path: Path, changed: dict[str, Any]) -> None:
     path = endpoints_file(tmp_path / "flat_endpoints.json", **changed)
     with raises_error(ConfigError, code="file/not-readable"):
-        OdriveBackend.check(run_config(backend="odrive"), OdriveSettings(endpoints=[path]))
+        OdriveBackend.check(make_run_config(backend="odrive"), OdriveSettings(endpoints=[path]))
     with raises_error(ConfigError, code="file/not-readable", field="backends.odrive.endpoints"):
-        OdriveBackend.check(run_config(backend="odrive"), OdriveSettings(endpoints=[str(tmp_path / "nothing.json")]))
+        OdriveBackend.check(
+            make_run_config(backend="odrive"), OdriveSettings(endpoints=[str(tmp_path / "nothing.json")])
+        )
 
 
 def test_odrive_axis_without_readable_configuration_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,7 +98,7 @@ def test_commands_repeat_state_to_a_module_that_differs(lifecycle: LifecycleStat
         expected = EMERGENCY
     elif lifecycle in ("disarmed", "fault") and state == ModuleState.ARMED:
         expected = commands.make_command(CommandAction.STOP, 3)
-    assert commands.make_reminder(lifecycle, state, 3) == expected
+    assert commands.make_repeated_command(lifecycle, state, 3) == expected
 
 
 # --- frames ------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_can_backend.bus.load import bus_load, plan_reports_at, worst_frame_bits
+from snakesim_can_backend.bus.load import compute_bus_load, compute_max_frame_bits, plan_reports_at
 from snakesim_can_backend.emulator.firmware import BOOT_US, ModuleFirmware
 from snakesim_can_backend.emulator.parameters import ParameterStore, make_factory_defaults
 from snakesim_can_backend.protocol import commands
@@ -24,7 +24,7 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.model.scenario import load as load_scenario
+from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_hal.physics.thermal import HeatLimits
 
 REFERENCE = Path(__file__).parents[4] / "docs" / "reference"
@@ -131,7 +131,7 @@ def test_the_worked_example_of_the_checksum() -> None:
 def test_the_bits_of_a_frame() -> None:
     table = rows("Bus load")
     assert table[0][1:] == [str(47 + 8 * length) for length in (1, 3, 4, 5, 6, 7, 8)]
-    assert table[1][1:] == [str(worst_frame_bits(length)) for length in (1, 3, 4, 5, 6, 7, 8)]
+    assert table[1][1:] == [str(compute_max_frame_bits(length)) for length in (1, 3, 4, 5, 6, 7, 8)]
 
 
 def test_the_table_of_loads() -> None:
@@ -139,7 +139,9 @@ def test_the_table_of_loads() -> None:
     found = rows("What fits")
     assert [row[0] for row in found] == ["13", "18", "30"]
     for row in found:
-        loads = [100 * bus_load(int(row[0]), plan_reports_at(rate, config, CanSettings())) for rate in (50, 100, 200)]
+        loads = [
+            100 * compute_bus_load(int(row[0]), plan_reports_at(rate, config, CanSettings())) for rate in (50, 100, 200)
+        ]
         assert row[1:] == [f"{share:.1f} %" + (" refused" if share > 80 else "") for share in loads]
 
 

@@ -7,22 +7,22 @@ import pytest
 
 from snakesim_gnc.control.gaits.axis_waves import RaisedHead, Rolling, Sidewinding
 from snakesim_hal.controller import Controller
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import Result, simulate
 from snakesim_testing.gnc.stage import make_stage
 
 
 def on_flat_ground(*sets: str) -> Result:
-    result = simulate(load("mamba_flat", [parse_set(text) for text in sets]).config)
+    result = simulate(load_scenario("mamba_flat", [parse_set_option(text) for text in sets]).config)
     assert result.summary.ended == "complete"
     return result
 
 
 def moved_m(record: RunRecord) -> np.ndarray:
     """Of the middle of the body, x and y; it lies along x at first."""
-    rows = np.flatnonzero(record.posed)[[0, -1]]
-    first, last = (record.nodes_w(int(row)) for row in rows)
+    rows = np.flatnonzero(record.has_pose)[[0, -1]]
+    first, last = (record.find_body_points_w(int(row)) for row in rows)
     assert first is not None
     assert last is not None
     return (last - first).mean(axis=0)[:2]
@@ -43,7 +43,7 @@ def test_rolling_travels_sideways() -> None:
 @pytest.mark.slow
 def test_raised_head_is_level_above_ground_and_looks_around() -> None:
     record = on_flat_ground("controller=raised_head", "duration_s=7").record
-    shapes = [record.nodes_w(k) for k in range(400, 650)]
+    shapes = [record.find_body_points_w(k) for k in range(400, 650)]
     heads = np.array([nodes[-2:] for nodes in shapes if nodes is not None])
     assert heads[..., 2].min() > 0.09
     assert np.abs(heads[:, 1, 2] - heads[:, 0, 2]).max() < 0.03
@@ -60,7 +60,7 @@ def test_at_speed_zero_a_gait_stands() -> None:
 def test_gait_of_bent_robot_keeps_shape_and_states_reason(gait: type[Controller[Any]]) -> None:
     stage = make_stage()
     controller = gait(stage.robot, gait.Parameters())
-    commands = [controller.update(stage.observe(tick, 0.3)) for tick in range(200)]
+    commands = [controller.update(stage.make_observation(tick, 0.3)) for tick in range(200)]
     targets = [command.setpoints.target for command in commands]
     assert all("no joints that turn up and down" in command.telemetry.reason for command in commands)
     assert np.abs(targets[0]).max() > 0.2

@@ -8,13 +8,13 @@ from snakesim_gnc.control.gaits.backbones import (
     BackboneRollingParameters,
     BackboneSidewinding,
     BackboneSidewindingParameters,
-    find_arc,
-    find_helix,
-    find_node_fractions,
+    compute_arc,
+    compute_helix,
+    compute_node_fractions,
 )
 from snakesim_gnc.control.gaits.chain_fit import Backbone, ChainFit, KeyframeWaves
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Description
 from snakesim_testing.gnc.stage import make_robot
 from snakesim_testing.messages import raises_error
@@ -32,9 +32,9 @@ def measure_length_m(robot: Description) -> float:
 
 
 def fit_helix(robot: Description, phases: int = 16) -> KeyframeWaves:
-    places, length_m = find_node_fractions(robot), measure_length_m(robot)
-    waves = KeyframeWaves(robot, lambda phase: find_helix(places, length_m, PARAMETERS, phase), phases)
-    assert waves.fit()
+    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
+    waves = KeyframeWaves(robot, lambda phase: compute_helix(places, length_m, PARAMETERS, phase), phases)
+    assert waves.advance_fit()
     return waves
 
 
@@ -42,7 +42,7 @@ def fit_helix(robot: Description, phases: int = 16) -> KeyframeWaves:
 def test_the_same_helix_fits_robots_of_any_length(modules: int) -> None:
     robot = make_alternating_robot(modules)
     waves = fit_helix(robot)
-    assert waves.max_distance_m < MAX_DISTANCE * measure_length_m(robot)
+    assert waves.max_deviation_m < MAX_DISTANCE * measure_length_m(robot)
 
 
 def test_a_chain_that_lies_on_a_curve_already_is_found() -> None:
@@ -51,19 +51,19 @@ def test_a_chain_that_lies_on_a_curve_already_is_found() -> None:
     axes = [joint.axis for joint in robot.joints]
     lengths_m = [link.length_m for link in robot.links]
     angles = 0.3 * np.sin(np.arange(10.0))
-    origins, rotations = link_frames(np.zeros(3), np.eye(3), angles, axes, lengths_m)
+    origins, rotations = compute_link_frames(np.zeros(3), np.eye(3), angles, axes, lengths_m)
     nodes = np.vstack([origins, origins[-1] + lengths_m[-1] * rotations[-1][:, 0]])
     chain = ChainFit(robot)
     for _ in chain.fit_first(Backbone(nodes, np.cross(rotations[5][:, 0], rotations[5][:, 1]))):
         pass
-    assert np.linalg.norm(chain.find_nodes() - nodes, axis=1).max() < 0.02 * measure_length_m(robot)
+    assert np.linalg.norm(chain.compute_node_positions() - nodes, axis=1).max() < 0.02 * measure_length_m(robot)
 
 
 def test_overlapping_groups_are_better_than_one_link_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every second link cannot follow the curve if links are laid one by one."""
     robot = make_alternating_robot()
-    places, length_m = find_node_fractions(robot), measure_length_m(robot)
-    backbone = find_helix(places, length_m, PARAMETERS, 0.0)
+    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
+    backbone = compute_helix(places, length_m, PARAMETERS, 0.0)
     distances_m: list[float] = []
     for group in (6, 1):
         monkeypatch.setattr("snakesim_gnc.control.gaits.chain_fit.GROUP_LINKS", group)
@@ -71,7 +71,9 @@ def test_overlapping_groups_are_better_than_one_link_at_a_time(monkeypatch: pyte
         chain = ChainFit(robot)
         for _ in chain.fit_first(backbone):
             pass
-        distances_m.append(float(np.linalg.norm(chain.find_nodes() - backbone.nodes, axis=1).max()))
+        distances_m.append(
+            float(np.linalg.norm(chain.compute_node_positions() - backbone.node_positions, axis=1).max())
+        )
     together_m, one_by_one_m = distances_m
     assert together_m < 0.7 * one_by_one_m
 
@@ -79,26 +81,26 @@ def test_overlapping_groups_are_better_than_one_link_at_a_time(monkeypatch: pyte
 def test_the_waves_pass_through_the_keyframes_and_close() -> None:
     waves = fit_helix(make_alternating_robot())
     phases = 2.0 * np.pi * np.arange(16) / 16
-    passed = np.array([waves.find_angles_rad(phase) for phase in phases])
+    passed = np.array([waves.compute_joint_angles_rad(phase) for phase in phases])
     assert passed == pytest.approx(waves.keyframes_rad, abs=1e-9)
-    assert waves.find_angles_rad(2.0 * np.pi) == pytest.approx(waves.find_angles_rad(0.0))
-    between = np.array([waves.find_angles_rad(phase) for phase in np.linspace(0.0, 2.0 * np.pi, 200)])
+    assert waves.compute_joint_angles_rad(2.0 * np.pi) == pytest.approx(waves.compute_joint_angles_rad(0.0))
+    between = np.array([waves.compute_joint_angles_rad(phase) for phase in np.linspace(0.0, 2.0 * np.pi, 200)])
     assert np.abs(np.diff(between, axis=0)).max() < 0.1
 
 
 def test_the_waves_between_keyframes_are_near_the_curve() -> None:
     robot = make_alternating_robot()
     coarse, fine = fit_helix(robot, 16), fit_helix(robot, 32)
-    between = [coarse.find_angles_rad(2.0 * np.pi * (k + 0.5) / 16) for k in range(16)]
+    between = [coarse.compute_joint_angles_rad(2.0 * np.pi * (k + 0.5) / 16) for k in range(16)]
     assert np.array(between) == pytest.approx(fine.keyframes_rad[1::2], abs=0.05)
 
 
 def test_a_fit_of_some_steps_at_a_time_is_the_same_fit() -> None:
     robot = make_alternating_robot()
-    places, length_m = find_node_fractions(robot), measure_length_m(robot)
-    waves = KeyframeWaves(robot, lambda phase: find_helix(places, length_m, PARAMETERS, phase))
+    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
+    waves = KeyframeWaves(robot, lambda phase: compute_helix(places, length_m, PARAMETERS, phase))
     calls = 1
-    while not waves.fit(3):
+    while not waves.advance_fit(3):
         calls += 1
     assert 10 < calls < 25
     assert (waves.keyframes_rad == fit_helix(robot).keyframes_rad).all()
@@ -108,9 +110,9 @@ def test_a_fit_of_some_steps_at_a_time_is_the_same_fit() -> None:
 def test_rolling_turns_the_arc_in_the_frames_of_the_links(bend_rad: float) -> None:
     """All yaw joints follow one cosine, and all pitch joints one sine, as in the closed form of rolling."""
     robot = make_alternating_robot()
-    places, length_m = find_node_fractions(robot), measure_length_m(robot)
-    waves = KeyframeWaves(robot, lambda phase: find_arc(places, length_m, bend_rad, phase))
-    waves.fit()
+    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
+    waves = KeyframeWaves(robot, lambda phase: compute_arc(places, length_m, bend_rad, phase))
+    waves.advance_fit()
     series = np.fft.rfft(waves.keyframes_rad, axis=0)[1] / 8
     inner = series[2:-2]
     bend_of_pair = 2.0 * 2.0 / 19.0  # of two links, in one of the two planes

@@ -18,7 +18,7 @@ TURN_RAD_S = 4.0
 def advance(oscillators: Oscillators, seconds: float, feedback_rad_s: Any = 0.0) -> None:
     feedback = np.broadcast_to(feedback_rad_s, (2, 4))
     for _ in range(round(seconds / 0.01)):
-        oscillators.advance(0.01, TURN_RAD_S, LIMIT_RAD, feedback)
+        oscillators.integrate(0.01, TURN_RAD_S, LIMIT_RAD, feedback)
 
 
 def test_disturbed_oscillators_return_to_the_traveling_wave() -> None:
@@ -35,7 +35,7 @@ def test_amplitudes_approach_their_limit_without_overshoot() -> None:
     oscillators = Oscillators(PHASES, coupling=30.0, amplitude_rate=10.0)
     seen: list[float] = []
     for _ in range(300):
-        oscillators.advance(0.01, TURN_RAD_S, LIMIT_RAD, np.zeros((2, 4)))
+        oscillators.integrate(0.01, TURN_RAD_S, LIMIT_RAD, np.zeros((2, 4)))
         seen.append(float(oscillators.r_rad[0, 0]))
     time_s = 0.01 * np.arange(1, 301)
     exact = 0.2 * (1.0 - (1.0 + 5.0 * time_s) * np.exp(-5.0 * time_s))
@@ -54,7 +54,7 @@ def test_the_limit_cycle_is_the_serpenoid_curve() -> None:
     stage = make_stage(13)
     cpg = Cpg(stage.robot, CpgParameters(k_theta=0.0))
     serpenoid = Serpenoid(stage.robot, SerpenoidParameters(k_theta=0.0))
-    observation = stage.observe(0, 0.3)
+    observation = stage.make_observation(0, 0.3)
     oscillating, curve = np.zeros(13), np.zeros(13)
     for _ in range(640):
         oscillating = np.array(cpg.update(observation).telemetry.reference_rad)
@@ -69,14 +69,14 @@ def test_a_force_shifts_the_phases_beside_it(gain: float, sign: float) -> None:
     for force_n in (0.0, 5.0):
         stage = make_stage(13)
         controller = Cpg(stage.robot, CpgParameters(k_theta=0.0, force_gain=gain))
-        free = stage.observe(0, 0.3, contacts=[])
+        free = stage.make_observation(0, 0.3, contacts=[])
         for _ in range(200):
             controller.update(free)
         theta = controller._oscillators.theta_rad
         joint = int(np.cos(theta[0]).argmax())
         contact = make_contact("peg", (0.0, force_n, 0.0), link=joint)
         before = float(theta[0, joint])
-        controller.update(stage.observe(200, 0.3, contacts=[contact]))
+        controller.update(stage.make_observation(200, 0.3, contacts=[contact]))
         changes.append(float(controller._oscillators.theta_rad[0, joint]) - before)
     undisturbed, pushed = changes
     assert np.sign(round(pushed - undisturbed, 6)) == sign
@@ -87,8 +87,8 @@ def test_no_force_stops_an_oscillator() -> None:
     parameters = CpgParameters(k_theta=0.0, force_gain=-10.0)
     controller = Cpg(stage.robot, parameters)
     contacts = [make_contact("peg", (0.0, 500.0, 0.0), link=link) for link in range(14)]
-    observation = stage.observe(0, 0.3, contacts=contacts)
+    observation = stage.make_observation(0, 0.3, contacts=contacts)
     for _ in range(200):
-        feedback = controller._find_feedback_rad_s(observation.world)
+        feedback = controller._compute_feedback_rad_s(observation.world)
         controller.update(observation)
         assert np.abs(feedback).max() <= MAX_FEEDBACK_RATIO * math.tau / parameters.period_s + 1e-12

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.gaits.backbones import (
-    FITTING,
+    FITTING_REASON,
     BackboneRolling,
     BackboneSidewinding,
     BackboneSidewindingParameters,
 )
-from snakesim_gnc.control.gaits.concertina import Concertina, find_fold_fractions
+from snakesim_gnc.control.gaits.concertina import Concertina, compute_fold_fractions
 from snakesim_gnc.control.gaits.cpg import Cpg
 from snakesim_gnc.control.gaits.rectilinear import Rectilinear
 from snakesim_gnc.control.gaits.serpenoid import Serpenoid, SerpenoidParameters
@@ -35,7 +35,7 @@ def make_stage_for(gait: type[Controller[Any]]) -> Stage:
 
 def drive(controller: Controller[Any], stage: Stage, ticks: range, **changes: Any) -> list[ControllerCommand]:
     """The commands for a body that does not move. To lay it on the path again in every tick would take long."""
-    seen = stage.observe(ticks.start, 0.3, **changes)
+    seen = stage.make_observation(ticks.start, 0.3, **changes)
     observations = [dataclasses.replace(seen, tick=tick, time_s=tick * PERIOD_S) for tick in ticks]
     return [controller.update(observation) for observation in observations]
 
@@ -54,7 +54,7 @@ def test_a_gait_starts_at_the_pose_and_never_jumps(gait: type[Controller[Any]]) 
     controller = gait(stage.robot, gait.Parameters())
     commands = drive(controller, stage, range(300))
     targets = list_targets(commands)
-    measured_rad = np.array(stage.observe(0, 0.3).joints.angle_rad)
+    measured_rad = np.array(stage.make_observation(0, 0.3).joints.angle_rad)
     assert np.abs(targets[0] - measured_rad).max() < 0.02
     assert np.abs(np.diff(targets, axis=0)).max() < MAX_STEP_RAD
     assert np.ptp(targets, axis=0).max() > 0.1
@@ -132,7 +132,7 @@ def test_directional_control_bends_towards_the_path(gait: type[Controller[Any]])
         stage = make_stage(13)
         controller = gait(stage.robot, gait.Parameters())
         total = 0.0
-        observation = stage.observe(0, 2.0)
+        observation = stage.make_observation(0, 2.0)
         assert observation.trajectory is not None
         path_w = [(0.0, -offset_m), (6.0, -offset_m)]
         trajectory = msgspec.structs.replace(observation.trajectory, path_w=path_w)
@@ -152,7 +152,7 @@ def test_another_path_does_not_jerk_the_joints(gait: type[Controller[Any]]) -> N
     """Its direction differs by two radians, and the joints move no faster than in the wave itself."""
     stage = make_stage(13)
     controller = gait(stage.robot, gait.Parameters())
-    observation = stage.observe(0, 2.0)
+    observation = stage.make_observation(0, 2.0)
     assert observation.trajectory is not None
     aside = msgspec.structs.replace(observation.trajectory, path_id=1, path_w=[(2.0, 0.0), (1.0, 4.0)])
     replanned = dataclasses.replace(observation, trajectory=aside)
@@ -182,9 +182,9 @@ def test_sinus_lifting_lifts_where_the_body_bends_most() -> None:
 
 
 def test_concertina_folds_one_half_while_the_other_holds() -> None:
-    thirds = [find_fold_fractions(phase) for phase in (0.0, 2.0 * np.pi / 3.0 - 1e-9, 4.0 * np.pi / 3.0 - 1e-9)]
+    thirds = [compute_fold_fractions(phase) for phase in (0.0, 2.0 * np.pi / 3.0 - 1e-9, 4.0 * np.pi / 3.0 - 1e-9)]
     assert np.array(thirds) == pytest.approx(np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]), abs=1e-6)
-    fractions = np.array([find_fold_fractions(phase) for phase in np.linspace(0.0, 4.0 * np.pi, 400)])
+    fractions = np.array([compute_fold_fractions(phase) for phase in np.linspace(0.0, 4.0 * np.pi, 400)])
     assert np.abs(np.diff(fractions, axis=0)).max() < 0.05
 
 
@@ -193,6 +193,6 @@ def test_backbone_gaits_fit_before_they_move() -> None:
     controller = BackboneSidewinding(stage.robot, BackboneSidewindingParameters())
     commands = drive(controller, stage, range(60))
     reasons = [command.telemetry.reason for command in commands]
-    assert reasons[0] == FITTING
+    assert reasons[0] == FITTING_REASON
     assert reasons[-1] == ""
-    assert reasons.count(FITTING) < 25  # a quarter of a second
+    assert reasons.count(FITTING_REASON) < 25  # a quarter of a second

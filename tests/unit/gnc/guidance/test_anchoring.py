@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.anchoring import ESTIMATED, MEASURED, Anchors
-from snakesim_gnc.guidance.body_history import Base
+from snakesim_gnc.guidance.anchoring import ESTIMATED_CONTACT_TRUST, MEASURED_CONTACT_TRUST, ObstacleAnchors
+from snakesim_gnc.guidance.body_history import BasePose
 from snakesim_gnc.guidance.localization import Localizer, PoseNoise
-from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Contact, Obstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot
-from snakesim_testing.hal.small_robots import contact
+from snakesim_testing.hal.small_robots import make_link_contact
 
 ROBOT = make_robot()
 LENGTHS = [link.length_m for link in ROBOT.links]
@@ -19,14 +19,14 @@ PEG_M = 0.05
 TOUCHED = ((2, 1), (7, -1), (11, 1))  # link, and on which side of it a peg stands
 
 
-def base_at(planar_w) -> Base:
-    return Base(np.array(planar_w), BODY_RADIUS_M, np.eye(3))
+def base_at(planar_w) -> BasePose:
+    return BasePose(np.array(planar_w), BODY_RADIUS_M, np.eye(3))
 
 
 def pegs(apart_m: float = 0.0) -> list[Obstacle]:
     """At the middles of the links of a body that lies where it is in truth."""
     base = base_at(TRUE_W)
-    rear, frames = link_frames(base.position_w, base.rotation, SHAPE, ["yaw"] * len(SHAPE), LENGTHS)
+    rear, frames = compute_link_frames(base.position_w, base.rotation, SHAPE, ["yaw"] * len(SHAPE), LENGTHS)
     found: list[Obstacle] = []
     for link, side in TOUCHED:
         away_m = side * (BODY_RADIUS_M + PEG_M + apart_m)
@@ -38,7 +38,7 @@ def pegs(apart_m: float = 0.0) -> list[Obstacle]:
 def pushes(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     """side: -1 for pushes from where no peg is."""
     return [
-        contact(
+        make_link_contact(
             link,
             position_l=(0.07, s * side * BODY_RADIUS_M, 0.0),  # 15 mm off along the link, as estimates are
             normal_l=(0.0, -float(s * side), 0.0),
@@ -49,17 +49,17 @@ def pushes(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     ]
 
 
-def held(off_w, obstacles, contacts, trust=ESTIMATED, turns: int = 20) -> Localizer:
+def held(off_w, obstacles, contacts, trust=ESTIMATED_CONTACT_TRUST, turns: int = 20) -> Localizer:
     """A localizer that begins off the truth, and what is known after some turns."""
     localizer = Localizer(ROBOT, base_at(TRUE_W + off_w), PoseNoise())
     localizer.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
-    anchors = Anchors(ROBOT, obstacles)
+    anchors = ObstacleAnchors(ROBOT, obstacles)
     for _ in range(turns):
         anchors.correct_pose(localizer, SHAPE, contacts, trust)
     return localizer
 
 
-@pytest.mark.parametrize(("trust", "turns"), [(ESTIMATED, 20), (MEASURED, 1000)])
+@pytest.mark.parametrize(("trust", "turns"), [(ESTIMATED_CONTACT_TRUST, 20), (MEASURED_CONTACT_TRUST, 1000)])
 @pytest.mark.parametrize("off_w", [(0.0, 0.02, 0.0), (0.015, -0.01, 0.02)])
 def test_three_contacts_on_known_pegs_bring_the_pose_back(trust, turns, off_w):
     localizer = held(np.array(off_w), pegs(), pushes(), trust, turns)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.guidance import obstacle_map
 from snakesim_gnc.guidance.obstacle_map import FORGET_DISTANCE_M, ObstacleMap
-from snakesim_hal.model.outlines import outline_distance_m
+from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_testing.gnc.rendered import box, cylinder, scanned
+from snakesim_testing.gnc.rendered import make_box, make_cylinder, make_lidar_scan
 
 S = 1_000_000_000
 BODY_M = 0.04
@@ -20,7 +20,7 @@ BODY_M = 0.04
 def mapped(*obstacles, looks=4) -> ObstacleMap:
     map_ = ObstacleMap()
     for k in range(looks):
-        map_.add_scan(scanned(*obstacles, timestamp_ns=k * S // 20))
+        map_.add_scan(make_lidar_scan(*obstacles, timestamp_ns=k * S // 20))
     return map_
 
 
@@ -31,12 +31,12 @@ def touch(map_, center, radius_m, angle_rad) -> None:
 
 
 def only(map_, now_ns=0) -> Obstacle:
-    (reported,) = map_.obstacles(now_ns, 0.0)
+    (reported,) = map_.list_obstacles(now_ns, 0.0)
     return reported
 
 
 def test_map_obstacle_seen_repeatedly_gains_confidence():
-    once, often = mapped(cylinder("a", 0.8, 0.0), looks=1), mapped(cylinder("a", 0.8, 0.0), looks=6)
+    once, often = mapped(make_cylinder("a", 0.8, 0.0), looks=1), mapped(make_cylinder("a", 0.8, 0.0), looks=6)
     reported = only(often)
     assert only(once).confidence < 0.65
     assert reported.confidence > 0.9
@@ -60,7 +60,7 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
 
 
 def test_map_contact_elsewhere_adds_obstacle_and_on_known_keeps_it():
-    map_ = mapped(cylinder("a", 0.8, 0.0))
+    map_ = mapped(make_cylinder("a", 0.8, 0.0))
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)
     reported = only(map_)
@@ -69,33 +69,35 @@ def test_map_contact_elsewhere_adds_obstacle_and_on_known_keeps_it():
     assert map_.find_track(np.array([0.75, 0.0])) is map_.tracks[0]
     assert map_.find_track(np.array([0.5, 0.5])) is None
     touch(map_, (0.8, 0.4), 0.05, 3.0)
-    assert len(map_.obstacles(0, 0.0)) == 2
+    assert len(map_.list_obstacles(0, 0.0)) == 2
 
 
 def test_map_obstacle_seen_through_is_dropped():
-    map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
+    map_ = mapped(make_cylinder("ghost", 0.6, 0.0), make_cylinder("real", 0.8, 0.4))
     for k in range(8):
-        map_.add_scan(scanned(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k))
-    assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.obstacles(0, 0.0))
-    assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.obstacles(0, 0.0))
+        map_.add_scan(
+            make_lidar_scan(make_cylinder("real", 0.8, 0.4), make_box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k)
+        )
+    assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.list_obstacles(0, 0.0))
+    assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.list_obstacles(0, 0.0))
 
 
 def test_map_obstacle_hidden_or_out_of_view_is_kept():
-    map_ = mapped(cylinder("a", 1.2, 0.0))
+    map_ = mapped(make_cylinder("a", 1.2, 0.0))
     for k in range(20):
-        map_.add_scan(scanned(box("screen", 0.5, 0.0, (0.05, 0.8)), timestamp_ns=k))
-    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
+        map_.add_scan(make_lidar_scan(make_box("screen", 0.5, 0.0, (0.05, 0.8)), timestamp_ns=k))
+    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.list_obstacles(0, 0.0))
     for k in range(20):
-        map_.add_scan(scanned(at=(2.0, 0.0), timestamp_ns=k))
-    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
+        map_.add_scan(make_lidar_scan(at=(2.0, 0.0), timestamp_ns=k))
+    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.list_obstacles(0, 0.0))
 
 
 def test_map_obstacle_inside_the_body_is_dropped():
-    map_ = mapped(cylinder("smoke", 0.6, 0.0), cylinder("beside", 0.6, 0.3))
+    map_ = mapped(make_cylinder("smoke", 0.6, 0.0), make_cylinder("beside", 0.6, 0.3))
     for k in range(40):
         axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])
-        map_.carve_body(axis, BODY_M)
-    reported = map_.obstacles(0, 0.0)
+        map_.remove_surfaces_in_body(axis, BODY_M)
+    reported = map_.list_obstacles(0, 0.0)
     assert len(reported) == 1
     assert math.dist(reported[0].position_w[:2], (0.6, 0.3)) < 0.01
 
@@ -103,38 +105,38 @@ def test_map_obstacle_inside_the_body_is_dropped():
 def test_where_the_body_lies_nothing_reaches():
     map_ = ObstacleMap()
     for k in range(4):  # one face of a box: how deep it is, is a guess
-        map_.add_scan(scanned(box("thin", 0.8, 0.0, (0.03, 0.3)), timestamp_ns=k))
+        map_.add_scan(make_lidar_scan(make_box("thin", 0.8, 0.0, (0.03, 0.3)), timestamp_ns=k))
     axis = np.column_stack([np.full(40, 0.8 + 0.015 + BODY_M + 0.002), np.linspace(-0.3, 0.3, 40)])
     outer = only(map_)
     assert outer.shape == "box"
     assert _depth_beyond(outer, axis) > 0.02
     for _ in range(5):
-        map_.carve_body(axis, BODY_M)
+        map_.remove_surfaces_in_body(axis, BODY_M)
     assert _depth_beyond(only(map_), axis) < 0.012
 
 
 def _depth_beyond(reported: Obstacle, axis: np.ndarray) -> float:
     """How far an obstacle reaches into the body."""
-    return BODY_M - min(outline_distance_m(reported, p) for p in axis)
+    return BODY_M - min(compute_outline_distance_m(reported, p) for p in axis)
 
 
 def test_the_newest_look_counts_most_after_drift():
-    still, drifted = mapped(cylinder("a", 0.8, 0.0)), mapped(cylinder("a", 0.8, 0.0))
-    drifted.drift(0.02**2)
+    still, drifted = mapped(make_cylinder("a", 0.8, 0.0)), mapped(make_cylinder("a", 0.8, 0.0))
+    drifted.add_drift(0.02**2)
     for map_ in (still, drifted):
-        map_.add_scan(scanned(cylinder("a", 0.815, 0.0)))
+        map_.add_scan(make_lidar_scan(make_cylinder("a", 0.815, 0.0)))
     assert only(drifted).position_w[0] == pytest.approx(0.815, abs=0.003)
     assert only(still).position_w[0] < 0.812
 
 
 def test_far_things_are_forgotten_and_their_number_is_bounded(monkeypatch):
     monkeypatch.setattr(obstacle_map, "MAX_TRACKS", 64)
-    map_ = mapped(cylinder("a", 0.8, 0.0))
-    map_.drop_distant(np.array([[FORGET_DISTANCE_M + 0.5, 0.0]]))
+    map_ = mapped(make_cylinder("a", 0.8, 0.0))
+    map_.drop_distant_tracks(np.array([[FORGET_DISTANCE_M + 0.5, 0.0]]))
     assert len(map_.tracks) == 1
-    map_.drop_distant(np.array([[FORGET_DISTANCE_M + 1.0, 0.0]]))
+    map_.drop_distant_tracks(np.array([[FORGET_DISTANCE_M + 1.0, 0.0]]))
     assert not map_.tracks
     map_.add_touches([(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0)
     assert len(map_.tracks) == 100
-    map_.drop_distant(np.zeros((1, 2)))
+    map_.drop_distant_tracks(np.zeros((1, 2)))
     assert len(map_.tracks) == 64

@@ -27,8 +27,8 @@ class Brake:
         self.brakes = HoldingBrakes(1, release_s=0.05, engage_s=0.03, clock_ns=lambda: self.now_ns)
 
     def step(self, asked: BusCommand) -> BrakePlan:
-        plan = self.brakes.plan(asked, [0] if self.is_enabled else [], ANGLE_RAD)
-        self.is_enabled = 0 in plan.command.following
+        plan = self.brakes.update_brakes(asked, [0] if self.is_enabled else [], ANGLE_RAD)
+        self.is_enabled = 0 in plan.command.enabled_drives
         self.now_ns += PERIOD_NS
         return plan
 
@@ -46,7 +46,7 @@ def test_torque_is_held_until_the_brake_has_closed() -> None:
         brake.step(command(follow=True))
     plans = [brake.step(command(follow=False, mode=Mode.PASSIVE, target=0.0)) for _ in range(5)]
     assert not any(plan.released for plan in plans)
-    assert [bool(plan.command.following) for plan in plans] == [True] * 3 + [False] * 2
+    assert [bool(plan.command.enabled_drives) for plan in plans] == [True] * 3 + [False] * 2
     assert plans[0].command.modes == [Mode.POSITION]
     assert plans[0].command.targets[0] == 0.5
     assert plans[0].command.limits_nm[0] == 2.0
@@ -57,11 +57,11 @@ def test_emergency_stop_closes_the_brake_and_switches_torque_off_at_once() -> No
     for _ in range(8):
         brake.step(command(follow=True))
     plan = brake.step(command(follow=False, emergency=True))
-    assert not plan.released and not plan.command.following
+    assert not plan.released and not plan.command.enabled_drives
 
 
 def test_drive_that_was_never_enabled_holds_nothing_when_disarmed() -> None:
-    assert not Brake().step(command(follow=False)).command.following
+    assert not Brake().step(command(follow=False)).command.enabled_drives
 
 
 @pytest.mark.parametrize(
@@ -70,23 +70,23 @@ def test_drive_that_was_never_enabled_holds_nothing_when_disarmed() -> None:
 )
 def test_closed_switch_allows_motion_away_from_it_alone(mode: Mode, into: float, kept_at: float, away: float) -> None:
     switches = LimitSwitches(["joint_1"])
-    switches.note(0, lower=False, upper=True)
+    switches.record_switches(0, lower=False, upper=True)
     for target, expected in ((into, kept_at), (away, away)):
-        restricted = switches.restrict(command(follow=True, mode=mode, target=target), ANGLE_RAD)
+        restricted = switches.restrict_command(command(follow=True, mode=mode, target=target), ANGLE_RAD)
         assert restricted.targets[0] == expected
 
 
 def test_switch_is_a_fault_once_and_a_reset_allows_to_leave_it() -> None:
     switches = LimitSwitches(["joint_1"])
-    switches.note(0, lower=True, upper=False)
+    switches.record_switches(0, lower=True, upper=False)
     [finding] = switches.findings()
-    assert (finding.what, finding.joint, finding.alone) == ("limit_switch", 0, True)
+    assert (finding.what, finding.joint, finding.affects_only_joint) == ("limit_switch", 0, True)
     assert "lower limit switch" in finding.cause
     switches.reset(frozenset({0}))
-    switches.note(0, lower=True, upper=False)
+    switches.record_switches(0, lower=True, upper=False)
     assert switches.findings() == []
-    switches.note(0, lower=False, upper=False)
-    switches.note(0, lower=True, upper=False)
+    switches.record_switches(0, lower=False, upper=False)
+    switches.record_switches(0, lower=True, upper=False)
     assert len(switches.findings()) == 1, "it has closed again"
 
 
@@ -95,4 +95,4 @@ def test_safe_torque_off_has_a_fault_of_its_own_that_stops_the_robot() -> None:
     states.drives[0].safe_torque_off = True
     states.drives[0].errors = "something else, which is its consequence"
     [finding] = states.findings()
-    assert (finding.what, finding.joint, finding.alone) == ("safe_torque_off", 0, False)
+    assert (finding.what, finding.joint, finding.affects_only_joint) == ("safe_torque_off", 0, False)

@@ -19,13 +19,13 @@ class Bench:
 
     def __init__(self) -> None:
         self.now_ns = 0
-        self.guard = DriveGuard(lambda: self.now_ns, gap_ns=GAP_NS, grace_ns=GRACE_NS)
+        self.guard = DriveGuard(lambda: self.now_ns, watchdog_timeout_ns=GAP_NS, reset_grace_period_ns=GRACE_NS)
 
     def armed(self) -> frozenset[int]:
-        return self.guard.drives_to_command(BOTH, may_enable=True)
+        return self.guard.select_drives_to_enable(BOTH, may_enable=True)
 
     def in_fault(self) -> frozenset[int]:
-        return self.guard.drives_to_command(BOTH, may_enable=False)
+        return self.guard.select_drives_to_enable(BOTH, may_enable=False)
 
     def finds(self, joint: int | None) -> None:
         self.guard.note_findings([Finding("drive_fault", "it is too hot", joint)])
@@ -41,20 +41,20 @@ def test_guard_driver_pause_counts_until_states_are_read(bench: Bench) -> None:
     bench.guard.mark_active()
     bench.now_ns += GAP_NS
     bench.guard.mark_active()
-    assert not bench.guard.was_away
+    assert not bench.guard.was_paused
     bench.now_ns += GAP_NS + 1
     bench.guard.mark_active()
     bench.guard.mark_active()
-    assert bench.guard.was_away
+    assert bench.guard.was_paused
     bench.guard.mark_states_read()
-    assert not bench.guard.was_away
+    assert not bench.guard.was_paused
 
 
 def test_guard_enables_only_armed_drives_and_keeps_damped_ones(bench: Bench) -> None:
     assert bench.in_fault() == NONE
     assert bench.armed() == BOTH
     assert bench.in_fault() == BOTH
-    assert bench.guard.drives_to_command(frozenset({0}), may_enable=False) == {0}
+    assert bench.guard.select_drives_to_enable(frozenset({0}), may_enable=False) == {0}
     assert bench.in_fault() == {0}, "the other one was let go"
 
 
@@ -83,9 +83,9 @@ def test_guard_stale_drive_report_right_after_reset_is_ignored(bench: Bench) -> 
 
 
 def test_guard_drives_disabled_by_bus_stay_off_until_reset(bench: Bench) -> None:
-    assert not bench.guard.release_drives(), "none was driven"
+    assert not bench.guard.note_drives_released(), "none was driven"
     assert bench.armed() == BOTH
-    assert bench.guard.release_drives()
+    assert bench.guard.note_drives_released()
     assert bench.armed() == NONE
     assert bench.in_fault() == NONE
     bench.guard.reset(BOTH)
@@ -97,7 +97,7 @@ EVERYBODY = frozenset({0, 1, 2})
 
 
 def test_guard_joint_brakes_until_rest_or_watchdog_time() -> None:
-    braking, modes = Braking([100 * MS, 200 * MS, 100 * MS], holds=False), [Mode.VELOCITY] * 3
+    braking, modes = Braking([100 * MS, 200 * MS, 100 * MS], is_hold_mode=False), [Mode.VELOCITY] * 3
     for _ in range(2):  # a fault, and the next one
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 0) == {0, 1}
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 99 * MS) == {0, 1}
@@ -108,7 +108,7 @@ def test_guard_joint_brakes_until_rest_or_watchdog_time() -> None:
 
 
 def test_guard_hold_has_no_end_and_passive_disables_at_once() -> None:
-    braking = Braking([100 * MS] * 3, holds=True)
+    braking = Braking([100 * MS] * 3, is_hold_mode=True)
     assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
     assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY
     modes = [Mode.PASSIVE, Mode.POSITION, Mode.POSITION]

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 
 from snakesim_drivers.mounting import Mounting
 from snakesim_hal.wire.messages import Mode
-from snakesim_testing.hal.small_robots import robot_file
+from snakesim_testing.hal.small_robots import make_robot_file
 
 MIXED = {
     "joint_1": {"sign": -1, "zero_rad": 3.0, "gear": 9.0, "angle_min_rad": -0.4},
     "joint_3": {"sign": 1, "zero_rad": -0.2},
 }
-mounting = Mounting(robot_file(joints=MIXED).joint_table)
-plain = Mounting(robot_file().joint_table)
+mounting = Mounting(make_robot_file(joints=MIXED).joint_table)
+plain = Mounting(make_robot_file().joint_table)
 numbers = st.lists(st.floats(-10, 10), min_size=3, max_size=3).map(np.array)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_drivers.template.new_command import check_driver_name, write_driver_package
+from snakesim_drivers.template.new_command import validate_driver_name, write_driver_package
 from snakesim_drivers.template.package_files import DRIVER, SUBJECTS, make_package_files
 from snakesim_hal.base.errors import ConfigError
 from snakesim_testing.contract import plugin
@@ -27,7 +27,7 @@ def test_written_driver_has_the_new_name_everywhere() -> None:
 
 
 def test_written_test_imports_every_subject_of_the_suite() -> None:
-    assert sorted(SUBJECTS) == sorted(plugin.SUBJECTS)
+    assert sorted(SUBJECTS) == sorted(plugin.SECTION_ORDER)
 
 
 def test_example_is_the_template() -> None:
@@ -37,7 +37,7 @@ def test_example_is_the_template() -> None:
 @pytest.mark.parametrize("name", ["", "Acme", "acme-servo", "1st", "a__b", "../acme", "x" * 41, "lambda", "odrive"])
 def test_bad_names_are_refused(name: str) -> None:
     with raises_error(ConfigError, code=("config/invalid-value", "config/duplicate-name")):
-        check_driver_name(name)
+        validate_driver_name(name)
 
 
 def test_existing_folder_is_refused_and_kept(tmp_path: Path) -> None:

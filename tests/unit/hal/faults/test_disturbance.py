@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, corrupted
-from snakesim_hal.model.fault_kinds import Injection, check_injection
+from snakesim_hal.faults.disturbance import MAX_REPEATS_PER_CALL, MessageDisturbance, corrupt_payload
+from snakesim_hal.model.fault_kinds import Injection, validate_and_complete_injection
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointCommand
-from snakesim_testing.hal.small_robots import command, description
+from snakesim_testing.hal.small_robots import make_description, make_joint_command
 
 KEY = "sensor/joints"
 MESSAGES = [b"%05d" % i for i in range(400)]
@@ -20,24 +20,26 @@ STEP_S = 0.01
 
 
 def on(kind: str, amount: float | None = None) -> Injection:
-    return check_injection(Injection(kind, KEY, amount=amount))
+    return validate_and_complete_injection(Injection(kind, KEY, amount=amount))
 
 
-def disturbed(*faults: Injection, seed: str = "1") -> Disturbance:
-    made = Disturbance(seed)
+def disturbed(*faults: Injection, seed: str = "1") -> MessageDisturbance:
+    made = MessageDisturbance(seed)
     for fault in faults:
-        made.begin(fault, 0.0)
+        made.start_fault(fault, 0.0)
     return made
 
 
-def sent(way: Disturbance, messages: list[bytes] = MESSAGES, step_s: float = STEP_S) -> list[tuple[float, bytes]]:
+def sent(
+    way: MessageDisturbance, messages: list[bytes] = MESSAGES, step_s: float = STEP_S
+) -> list[tuple[float, bytes]]:
     """(when, what) of everything that goes out, to the last that is late."""
     out: list[tuple[float, bytes]] = []
     for i, message in enumerate(messages):
         now_s = i * step_s
-        out += [(now_s, payload) for payload in way.due(now_s) + way.disturb(message, now_s)]
-    while (now_s := way.next_s()) < inf:
-        out += [(now_s, payload) for payload in way.due(now_s)]
+        out += [(now_s, payload) for payload in way.pop_due_payloads(now_s) + way.disturb_payload(message, now_s)]
+    while (now_s := way.next_due_s()) < inf:
+        out += [(now_s, payload) for payload in way.pop_due_payloads(now_s)]
     return out
 
 
@@ -71,14 +73,14 @@ def test_nothing_is_invented_and_nothing_comes_before_its_time(chosen: list[Inje
 def test_when_all_is_over_everything_is_as_before(chosen: list[Injection], at: int) -> None:
     way = disturbed(*chosen)
     for message in MESSAGES[:at]:
-        way.disturb(message, 0.0)
+        way.disturb_payload(message, 0.0)
     for fault in chosen:
-        way.end(fault.kind, 0.0)
-    while way.next_s() < inf:
-        way.due(way.next_s())
-    assert way.over
-    assert way.disturb(b"new", 9.0) == [b"new"]
-    assert way.over
+        way.end_fault(fault.kind, 0.0)
+    while way.next_due_s() < inf:
+        way.pop_due_payloads(way.next_due_s())
+    assert way.is_over
+    assert way.disturb_payload(b"new", 9.0) == [b"new"]
+    assert way.is_over
 
 
 def test_disturbance_depends_only_on_its_seed() -> None:
@@ -102,9 +104,9 @@ def test_disturbance_reordered_message_follows_its_successor() -> None:
 
 def test_a_held_message_goes_out_when_the_reordering_ends() -> None:
     way = disturbed(on("reorder"))
-    assert way.disturb(b"1", 0.0) == []
-    assert way.end("reorder", 0.0) == [b"1"]
-    assert way.over
+    assert way.disturb_payload(b"1", 0.0) == []
+    assert way.end_fault("reorder", 0.0) == [b"1"]
+    assert way.is_over
 
 
 def test_disturbance_delay_has_configured_length_and_keeps_order() -> None:
@@ -114,27 +116,29 @@ def test_disturbance_delay_has_configured_length_and_keeps_order() -> None:
     assert len(late_s) == len(MESSAGES)
     assert min(late_s) > 0.0499
     assert max(late_s) < 0.0501 + STEP_S
-    way.disturb(b"late", 10.0)
-    assert way.end("delay", 10.01) == []
-    assert not way.over
-    assert way.disturb(b"prompt", 10.02) == []
-    assert way.due(10.049) == []
-    assert way.due(10.05) == [b"late", b"prompt"]
-    assert way.over
+    way.disturb_payload(b"late", 10.0)
+    assert way.end_fault("delay", 10.01) == []
+    assert not way.is_over
+    assert way.disturb_payload(b"prompt", 10.02) == []
+    assert way.pop_due_payloads(10.049) == []
+    assert way.pop_due_payloads(10.05) == [b"late", b"prompt"]
+    assert way.is_over
 
 
 def test_a_flood_repeats_the_newest_message_at_its_rate() -> None:
     way = disturbed(on("flood", 1000.0))
-    assert way.next_s() == inf, "there is nothing to repeat yet"
-    assert way.disturb(b"1", 1.0) == [b"1"]
-    repeated = [way.due(1.0 + i / 1000) for i in range(100)]
+    assert way.next_due_s() == inf, "there is nothing to repeat yet"
+    assert way.disturb_payload(b"1", 1.0) == [b"1"]
+    repeated = [way.pop_due_payloads(1.0 + i / 1000) for i in range(100)]
     assert 100 <= sum(map(len, repeated)) <= 101
-    way.disturb(b"2", 1.2)
-    assert set(way.due(1.3)) == {b"2"} and len(way.due(99.0)) == MAX_AT_ONCE, "a hiccup is not made up for"
-    assert way.due(99.0) == []
-    way.end("flood", 99.0)
-    assert way.over
-    assert way.due(100.0) == []
+    way.disturb_payload(b"2", 1.2)
+    assert set(way.pop_due_payloads(1.3)) == {b"2"} and len(way.pop_due_payloads(99.0)) == MAX_REPEATS_PER_CALL, (
+        "a hiccup is not made up for"
+    )
+    assert way.pop_due_payloads(99.0) == []
+    way.end_fault("flood", 99.0)
+    assert way.is_over
+    assert way.pop_due_payloads(100.0) == []
 
 
 # --- bytes ---------------------------------------------------------------------------------------------------
@@ -142,14 +146,14 @@ def test_a_flood_repeats_the_newest_message_at_its_rate() -> None:
 
 @given(st.binary(max_size=200), st.integers(0, 2**32))
 def test_corrupt_bytes_are_other_bytes(payload: bytes, seed: int) -> None:
-    assert corrupted(payload, random.Random(seed)) != payload
+    assert corrupt_payload(payload, random.Random(seed)) != payload
 
 
 def test_disturbance_corrupted_payloads_are_refused_by_decoders() -> None:
-    payload, decoder, rng = encode(command(description(), 0.1)), Decoder(JointCommand), random.Random(5)
+    payload, decoder, rng = encode(make_joint_command(make_description(), 0.1)), Decoder(JointCommand), random.Random(5)
     lengths, refused, taken = set(), 0, 0
     for _ in range(20_000):
-        wrong = corrupted(payload, rng)
+        wrong = corrupt_payload(payload, rng)
         lengths.add(len(wrong))
         try:
             decoder.decode(wrong, format_encoding(JointCommand))

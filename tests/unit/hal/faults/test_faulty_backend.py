@@ -13,7 +13,7 @@ from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import Injection, parse_injection
 from snakesim_hal.wire.messages import Description, JointState, Mode
 from snakesim_testing.hal.local_network import LagBackend
-from snakesim_testing.hal.small_robots import PERIOD_NS, run_config
+from snakesim_testing.hal.small_robots import PERIOD_NS, make_run_config
 from snakesim_testing.messages import raises_error
 
 
@@ -57,7 +57,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Bench:
-    made = Bench(Emulated(run_config(rate_hz=100)))
+    made = Bench(Emulated(make_run_config(rate_hz=100)))
     made.sample()
     return made
 
@@ -114,7 +114,7 @@ def test_slow_simulator_sample_takes_the_amount(bench: Bench, monkeypatch: pytes
 
 
 def test_injection_is_offered_to_backend_first_else_refused(bench: Bench) -> None:
-    leaky = Leaky(run_config())
+    leaky = Leaky(make_run_config())
     able = Bench(leaky)
     able.inject("leak:joint_1")
     able.inject("leak:joint_1", begins=False)
@@ -127,4 +127,4 @@ def test_injection_is_offered_to_backend_first_else_refused(bench: Bench) -> Non
     with raises_error(ConfigError, code="injection/unknown-target", field="joint_4"):
         bench.inject("mute:joint_4")
     with raises_error(ConfigError, code="injection/not-supported"):
-        Bench(LagBackend(run_config())).inject("slow:simulator")
+        Bench(LagBackend(make_run_config())).inject("slow:simulator")

@@ -9,26 +9,26 @@ import msgspec
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.host.cable_file import CABLES, FRESH_S, CableFile, open_cable_file
-from snakesim_hal.model.files import SHIPPED, decode, read_part
+from snakesim_hal.host.cable_file import CABLE_FILENAME, MAX_DECLARATION_AGE_S, CableFile, open_cable_file
+from snakesim_hal.model.files import SHIPPED_FILES_DIR, decode_table, read_table_with_base
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import Description
-from snakesim_testing.hal.small_robots import state
+from snakesim_testing.hal.small_robots import make_joint_state
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 DECLARED = "2026-11-25T02:40:12+00:00"
 NOW_S = datetime(2026, 11, 25, 2, 50, tzinfo=UTC).timestamp()
-LATER_S = NOW_S + 10 * FRESH_S
+LATER_S = NOW_S + 10 * MAX_DECLARATION_AGE_S
 TURN = 2 * math.pi
 
 
 def file_of(folder: Path, joint_2: str, extra: str = "") -> RobotFile:
-    shipped = (SHIPPED / "robots" / "planar13.toml").read_text().replace("modules = 13", "modules = 3")
+    shipped = (SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text().replace("modules = 13", "modules = 3")
     path = folder / "snake.toml"
     path.write_text(f"{shipped}\n[joints.joint_2]\nangle_rad = 3.0\n{joint_2}\n{extra}")
-    return decode(read_part(str(path), "robots"), RobotFile)
+    return decode_table(read_table_with_base(str(path), "robots"), RobotFile)
 
 
 class Bench:
@@ -52,8 +52,8 @@ class Bench:
         others = writers()
         kept = CableFile(self.folder, self.joints, msgspec.structs.replace(self.robot, joints=serials), now_s)
         for angle_rad in angles_rad:
-            kept.update(state(self.robot, [0.0, angle_rad, 0.0]))
-        against = kept.cables.list_arming_obstacles()
+            kept.update(make_joint_state(self.robot, [0.0, angle_rad, 0.0]))
+        against = kept.tracker.list_arming_obstacles()
         if ends:
             kept.close()  # on a computer that stutters a disk may take longer than a host waits for it
             wait_until(lambda: writers() <= others, "the file, written")
@@ -104,7 +104,7 @@ def test_cable_record_counts_only_for_same_drive_and_mounting(tmp_path: Path, ch
 def test_cable_record_survives_kill_and_unreadable_file_is_unknown(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     assert bench.host(*(0.05 * step for step in range(80)), ends=False) == []
-    path = tmp_path / CABLES
+    path = tmp_path / CABLE_FILENAME
     wait_until(lambda: path.is_file() and b":3." in path.read_bytes(), "what it keeps, on the disk")
     assert "Turn it by hand" in bench.host(3.95 - TURN, now_s=LATER_S)[0]
     path.write_text("{")
@@ -117,7 +117,7 @@ def test_cable_turns_are_counted_only_for_declared_real_joints(tmp_path: Path) -
     bench.file("angle_max_rad = 3.1415\nangle_min_rad = -3.1415")
     no_stops = open_cable_file(tmp_path, bench.joints, bench.robot)
     assert no_stops is not None
-    assert "leave no room for end stops" in no_stops.cables.list_arming_obstacles()[0]
+    assert "leave no room for end stops" in no_stops.tracker.list_arming_obstacles()[0]
     bench.file("")
     assert open_cable_file(tmp_path, bench.joints, bench.robot) is None
 

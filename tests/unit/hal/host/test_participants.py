@@ -14,18 +14,18 @@ SERVICES = {
 def test_service_that_connects_at_tick_zero_is_awaited_there() -> None:
     participants = Participants(SERVICES)
     participants.mark_present("control", 0)
-    assert participants.behind(0) == ["control"]
+    assert participants.find_services_behind(0) == ["control"]
     participants.mark_done("control", 0)
-    assert participants.behind(0) == []
-    assert participants.behind(1) == ["control"]
+    assert participants.find_services_behind(0) == []
+    assert participants.find_services_behind(1) == ["control"]
 
 
 def test_service_is_not_awaited_for_a_tick_that_was_published_before_it_connected() -> None:
     """The host would wait for an answer to a clock that the service never gets, and the service for the next clock."""
     participants = Participants(SERVICES)
     participants.mark_present("control", 8)  # it connects while the host waits at the end of tick 7
-    assert participants.behind(7) == []
-    assert participants.behind(8) == ["control"]
+    assert participants.find_services_behind(7) == []
+    assert participants.find_services_behind(8) == ["control"]
 
 
 @pytest.mark.parametrize(("next_tick", "awaited_from"), [(5, 9), (8, 9), (9, 13)])
@@ -33,14 +33,14 @@ def test_service_with_decimation_is_awaited_from_its_first_due_tick_on(next_tick
     """The end of tick 9 needs the answer to tick 8: navigation is due every 4 ticks, and has 2 ticks for it."""
     participants = Participants(SERVICES)
     participants.mark_present("navigation", next_tick)
-    assert [tick for tick in range(16) if participants.behind(tick)] == list(range(awaited_from, 16))
+    assert [tick for tick in range(16) if participants.find_services_behind(tick)] == list(range(awaited_from, 16))
 
 
 def test_second_token_of_a_connected_service_changes_nothing() -> None:
     participants = Participants(SERVICES)
     participants.mark_present("control", 3)
     participants.mark_present("control", 9)
-    assert participants.behind(3) == ["control"]
+    assert participants.find_services_behind(3) == ["control"]
 
 
 def test_service_that_reconnects_counts_anew() -> None:
@@ -48,7 +48,7 @@ def test_service_that_reconnects_counts_anew() -> None:
     participants.mark_present("control", 0)
     participants.mark_done("control", 4)
     assert participants.mark_absent("control")
-    assert participants.behind(5) == []
+    assert participants.find_services_behind(5) == []
     participants.mark_present("control", 6)
-    assert participants.behind(5) == []
-    assert participants.behind(6) == ["control"]
+    assert participants.find_services_behind(5) == []
+    assert participants.find_services_behind(6) == ["control"]

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.host.run_statistics import Durations
+from snakesim_hal.host.run_statistics import DurationHistogram
 
 
 @pytest.mark.parametrize("percent", [1, 50, 99])
 def test_percentiles_are_right_to_one_percent(percent: int) -> None:
     took_us = np.random.default_rng(1).lognormal(6.0, 1.0, 20_000)
-    durations = Durations()
+    durations = DurationHistogram()
     for one in took_us.tolist():
         durations.add(one)
     assert durations.count == 20_000
@@ -17,7 +17,7 @@ def test_percentiles_are_right_to_one_percent(percent: int) -> None:
 
 
 def test_what_is_out_of_range_counts_at_its_end() -> None:
-    durations = Durations()
+    durations = DurationHistogram()
     assert durations.percentile_us(50) is None
     for one in (-5.0, 0.0, 0.3):
         durations.add(one)
@@ -28,7 +28,7 @@ def test_what_is_out_of_range_counts_at_its_end() -> None:
 
 
 def test_histogram_counts_each_value_from_shortest_to_longest() -> None:
-    durations = Durations(0.05)
+    durations = DurationHistogram(0.05)
     assert durations.timing() is None
     for took_us in [100.0] * 90 + [200.0] * 9 + [10_000.0]:
         durations.add(took_us)

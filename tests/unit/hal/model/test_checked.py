@@ -5,15 +5,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord, mounting_digest, why_unchecked
+from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord, compute_mounting_digest, find_unchecked_reason
 from snakesim_hal.wire.messages import Description
-from snakesim_testing.hal.small_robots import description, robot_file
+from snakesim_testing.hal.small_robots import make_description, make_robot_file
 
-JOINTS = robot_file().joint_table
+JOINTS = make_robot_file().joint_table
 CHECKED = StartCheckRecord(
     by="anna",
     on="2026-11-24",
-    joints=mounting_digest(JOINTS),
+    joints=compute_mounting_digest(JOINTS),
     backend="can",
     hardware="can0",
     confirmed=list(PROPERTIES),
@@ -21,7 +21,7 @@ CHECKED = StartCheckRecord(
 
 
 def robot(serials: str = "", **fields: Any) -> Description:
-    plain = description()
+    plain = make_description()
     given = serials.split(",") if serials else [""] * len(plain.joints)
     joints = [msgspec.structs.replace(one, serial=serial) for one, serial in zip(plain.joints, given, strict=True)]
     return msgspec.structs.replace(plain, **{"backend": "can", "hardware": "can0", "joints": joints, **fields})
@@ -47,5 +47,5 @@ SERIALS = [f"S{i}" for i in range(len(JOINTS))]
 def test_check_counts_only_for_judged_joints_and_drives(
     checked: StartCheckRecord | None, here: Description, words: str
 ) -> None:
-    found = why_unchecked(checked, JOINTS, here)
+    found = find_unchecked_reason(checked, JOINTS, here)
     assert words in found if words else found == ""

@@ -8,12 +8,12 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from snakesim_hal.model.field_docs import FieldDoc, describe_fields, document_fields
+from snakesim_hal.model.field_docs import FieldDoc, collect_field_descriptions, document_fields
 from snakesim_hal.model.field_words import find_unit, format_value
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import JointExceptions, Limits
 from snakesim_hal.model.json_schema import list_structs, make_schema
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin
+from snakesim_hal.model.plugins import CONTROLLERS, load_plugin
 from snakesim_hal.wire.quantities import about, above
 
 
@@ -55,37 +55,37 @@ def docs_of(struct: type[msgspec.Struct]) -> dict[str, FieldDoc]:
 
 
 def test_field_description_is_its_literal_on_one_line() -> None:
-    assert describe_fields(Wheel)["radius_m"] == "Radius of the wheel, without its tire."
-    assert "spokes" not in describe_fields(Wheel)
+    assert collect_field_descriptions(Wheel)["radius_m"] == "Radius of the wheel, without its tire."
+    assert "spokes" not in collect_field_descriptions(Wheel)
 
 
 def test_field_without_literal_uses_description_of_its_type() -> None:
-    assert describe_fields(Wheel)["slip_m_s"] == "speed at the ground"
+    assert collect_field_descriptions(Wheel)["slip_m_s"] == "speed at the ground"
 
 
 def test_descriptions_are_inherited_and_overridden() -> None:
-    assert describe_fields(SpareWheel)["spokes"] == "Number of spokes."
-    assert describe_fields(SpareWheel)["radius_m"] == describe_fields(Wheel)["radius_m"]
+    assert collect_field_descriptions(SpareWheel)["spokes"] == "Number of spokes."
+    assert collect_field_descriptions(SpareWheel)["radius_m"] == collect_field_descriptions(Wheel)["radius_m"]
 
 
 def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
-    assert describe_fields(Limits)["torque_nm"] == "Maximum torque of the joint."
+    assert collect_field_descriptions(Limits)["torque_nm"] == "Maximum torque of the joint."
     exceptions: Any = JointExceptions
-    described = describe_fields(exceptions)
+    described = collect_field_descriptions(exceptions)
     assert described["torque_nm"] == "Maximum torque of the joint. None: as in the section for all."
     assert described["rated_nm"].count("None:") == 1
 
 
 def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.MonkeyPatch) -> None:
     made: Any = msgspec.defstruct("Made", [("x", int)], module="gone")
-    assert describe_fields(made) == {}
+    assert collect_field_descriptions(made) == {}
     monkeypatch.setattr(sys.modules[__name__], "__file__", str(Path("gone.pyc").absolute()))
 
     class Local(FileStruct, frozen=True):
         x: int
         """Never read."""
 
-    assert describe_fields(Local) == {}
+    assert collect_field_descriptions(Local) == {}
 
 
 def test_a_plugin_in_a_file_is_described(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ class Wave:
         """Phase from joint to joint."""
 '''
     (tmp_path / "wave.py").write_text(code)
-    settings = find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave").Settings
+    settings = load_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave").Settings
     (doc,) = document_fields(settings)
     assert doc.description == "Phase from joint to joint."
     assert doc.unit == "rad"

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import FileStruct, Table, decode, find_file, leaves, list_shipped, read_table
+from snakesim_hal.model.files import (
+    ConfigTable,
+    FileStruct,
+    decode_table,
+    iterate_leaves,
+    list_shipped_names,
+    read_table,
+    resolve_file_path,
+)
 from snakesim_testing.messages import raises_error
 
 
@@ -64,27 +72,27 @@ WRONG: dict[str, dict[str, Any]] = {
 
 
 def test_a_section_of_a_larger_file_names_its_place_there() -> None:
-    table = Table({"size_m": 5}, "my.toml", {"box.size_m": "--set box.size_m=5"})
+    table = ConfigTable({"size_m": 5}, "my.toml", {"box.size_m": "--set box.size_m=5"})
     with raises_error(ConfigError, code="config/out-of-range", field="--set", value=5):
-        decode(table, Part, "box")
+        decode_table(table, Part, "box")
 
 
 def test_missing_field_error_names_file_where_it_belongs() -> None:
-    table = Table({}, "outer.toml")
+    table = ConfigTable({}, "outer.toml")
     table.set_value("parts", [], "outer.toml")
     table.set_value("part", {"many": 2, "typo": {"x": 1}}, "inner.toml")
     with raises_error(ConfigError, code="config/unknown-key", field="inner.toml"):
-        decode(table, Whole)
+        decode_table(table, Whole)
     del table.values["part"]["typo"]
     with raises_error(ConfigError, code="config/missing-key", field="inner.toml"):
-        decode(table, Whole)
+        decode_table(table, Whole)
     table.set_value("part.size_m", 7, "--set part.size_m=7")
     with raises_error(ConfigError, code="config/out-of-range", field="--set", value=7):
-        decode(table, Whole)
+        decode_table(table, Whole)
     table.set_value("part.size_m", 1, "--set part.size_m=1")
     table.set_value("part.sise_m", 7, "--set part.sise_m=7")
     with raises_error(ConfigError, code="config/unknown-key", field="--set"):
-        decode(table, Whole)
+        decode_table(table, Whole)
 
 
 class Round(FileStruct, frozen=True, tag="round", tag_field="kind"):
@@ -136,7 +144,7 @@ def test_a_wrong_value_is_explained_by_what_is_allowed(wrong: str) -> None:
         code=("config/invalid-value", "config/missing-key", "config/out-of-range", "config/unknown-key"),
         field="my.toml",
     ) as caught:
-        decode(Table(values, "my.toml"), Whole if wrong in WRONG else Thing)
+        decode_table(ConfigTable(values, "my.toml"), Whole if wrong in WRONG else Thing)
     assert "\n" not in str(caught.value)
     assert caught.value.__cause__ is None
     assert caught.value.__suppress_context__
@@ -154,7 +162,7 @@ def test_a_wrong_value_is_explained_by_what_is_allowed(wrong: str) -> None:
 )
 def test_what_is_quoted_is_short(values: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as caught:
-        decode(Table(values, "my.toml"), Whole)
+        decode_table(ConfigTable(values, "my.toml"), Whole)
     assert len(str(caught.value)) < 600
 
 
@@ -171,7 +179,7 @@ JSON = st.recursive(
 @given(values=st.dictionaries(st.sampled_from(["part", "parts", "by_name", "free", "at_m", "open", "zz"]), JSON))
 def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> None:
     try:
-        assert isinstance(decode(Table(values, "my.toml"), Whole), Whole)
+        assert isinstance(decode_table(ConfigTable(values, "my.toml"), Whole), Whole)
     except ConfigError as error:
         assert str(error).startswith("my.toml: ")
 
@@ -204,13 +212,13 @@ def test_missing_file_error_names_it_and_existing_ones(tmp_path: Path) -> None:
 
 
 def test_find_takes_names_and_paths(tmp_path: Path) -> None:
-    assert find_file("triplet", "scenes").is_file()
-    assert find_file("x.toml", "robots", tmp_path) == tmp_path / "x.toml"
-    assert find_file("/abs/x.toml", "robots", tmp_path) == Path("/abs/x.toml")
-    assert find_file("sub/x", "robots", tmp_path) == tmp_path / "sub/x"
+    assert resolve_file_path("triplet", "scenes").is_file()
+    assert resolve_file_path("x.toml", "robots", tmp_path) == tmp_path / "x.toml"
+    assert resolve_file_path("/abs/x.toml", "robots", tmp_path) == Path("/abs/x.toml")
+    assert resolve_file_path("sub/x", "robots", tmp_path) == tmp_path / "sub/x"
     with raises_error(ConfigError, code="config/unknown-name", field="planar31", stored=False) as caught:
-        find_file("planar31", "robots")
-    assert all(name in str(caught.value) for name in list_shipped("robots"))
+        resolve_file_path("planar31", "robots")
+    assert all(name in str(caught.value) for name in list_shipped_names("robots"))
 
 
 # --- where values come from ------------------------------------------------------------------------------------
@@ -222,19 +230,19 @@ def test_origins_follow_the_last_writer(tmp_path: Path) -> None:
     file = str(tmp_path / "a.toml")
     table.set_value("part.many", 3, "--many 3")
     table.set_value("parts.0.size_m", 0.5, "--set parts.0.size_m=0.5")
-    assert decode(table, Whole).parts[0].size_m == 0.5
-    assert table.origin_of("part.size_m") == file
-    assert table.origin_of("part.many") == "--many 3"
-    assert table.origin_of("parts.0.size_m") == "--set parts.0.size_m=0.5"
-    assert table.origin_of("at_m") == "default"
-    assert table.origin_of("free.a.b") == "default"  # an empty section sets nothing
+    assert decode_table(table, Whole).parts[0].size_m == 0.5
+    assert table.find_origin("part.size_m") == file
+    assert table.find_origin("part.many") == "--many 3"
+    assert table.find_origin("parts.0.size_m") == "--set parts.0.size_m=0.5"
+    assert table.find_origin("at_m") == "default"
+    assert table.find_origin("free.a.b") == "default"  # an empty section sets nothing
     table.set_value("part", {"size_m": 2.0}, "other.toml")
-    assert table.origin_of("part.size_m") == "other.toml"
-    assert table.origin_of("part.many") == "default"
+    assert table.find_origin("part.size_m") == "other.toml"
+    assert table.find_origin("part.many") == "default"
 
 
 def test_putting_into_lists() -> None:
-    table = Table({"at_m": [0.0, 0.0], "parts": [{"size_m": 1.0}], "word": "x"}, "my.toml")
+    table = ConfigTable({"at_m": [0.0, 0.0], "parts": [{"size_m": 1.0}], "word": "x"}, "my.toml")
     table.set_value("at_m.1", 2.0, "--set at_m.1=2")
     assert table.values["at_m"] == [0.0, 2.0]
     for dotted in ("parts.1.size_m", "parts.-1.size_m", "parts.first.size_m", "at_m.2", "word.length"):
@@ -247,9 +255,9 @@ def test_putting_into_lists() -> None:
 
 @given(st.recursive(st.integers(), lambda x: st.dictionaries(st.sampled_from("abc"), x, min_size=1), max_leaves=9))
 def test_leaves_and_put_are_each_others_inverse(value: Any) -> None:
-    table = Table({}, "my.toml")
-    for dotted, leaf in leaves({"root": value}):
+    table = ConfigTable({}, "my.toml")
+    for dotted, leaf in iterate_leaves({"root": value}):
         table.set_value(dotted, leaf, "flag")
     assert table.values == {"root": value}
-    assert dict(leaves(table.values)) == dict(leaves({"root": value}))
-    assert all(table.origin_of(dotted) == "flag" for dotted, _ in leaves(table.values))
+    assert dict(iterate_leaves(table.values)) == dict(iterate_leaves({"root": value}))
+    assert all(table.find_origin(dotted) == "flag" for dotted, _ in iterate_leaves(table.values))

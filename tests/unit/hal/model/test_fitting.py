@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.fitting import spacing_m
-from snakesim_hal.model.scenario import RunConfig, load, parse_set, place_obstacles, write_config
+from snakesim_hal.model.fitting import compute_joint_spacing_m
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, place_obstacles, write_config
 from snakesim_hal.model.scene import SineRoute
 
 
 def clutter(*sets: str) -> RunConfig:
-    return load("surveyed_clutter", [parse_set(text) for text in sets]).config
+    return load_scenario("surveyed_clutter", [parse_set_option(text) for text in sets]).config
 
 
 def sine(config: RunConfig) -> SineRoute:
@@ -30,7 +30,7 @@ def test_fitting_scene_for_same_or_longer_robot_is_unchanged() -> None:
 def test_fitting_scene_for_other_joints_and_radius_scales_it() -> None:
     before, config = clutter(), clutter("robot=mamba")
     share = 0.2 / 0.11  # its yaw joints are every second one
-    assert spacing_m(config.robot) == pytest.approx(0.2)
+    assert compute_joint_spacing_m(config.robot) == pytest.approx(0.2)
     for name in ("amplitude_m", "wavelength_m", "length_m"):
         assert getattr(sine(config), name) == pytest.approx(share * getattr(sine(before), name))
     (row,), (field,) = config.scene.pegs_along_route, config.scene.random_field
@@ -43,9 +43,11 @@ def test_fitting_scene_for_other_joints_and_radius_scales_it() -> None:
 
 
 def test_fitting_keeps_values_set_by_flags_and_marks_others() -> None:
-    loaded = load("surveyed_clutter", [parse_set("robot=mamba"), parse_set("scene.route.wavelength_m=0.7")])
+    loaded = load_scenario(
+        "surveyed_clutter", [parse_set_option("robot=mamba"), parse_set_option("scene.route.wavelength_m=0.7")]
+    )
     assert sine(loaded.config).wavelength_m == 0.7
-    origin = {key: source for key, _, source in loaded.explain()}
+    origin = {key: source for key, _, source in loaded.list_effective_values()}
     assert origin["scene.route.wavelength_m"] == "--set scene.route.wavelength_m=0.7"
     assert origin["scene.route.amplitude_m"] == "fitted to robot 'mamba'"
     assert "clutter.toml" in origin["scene.ground.friction"]
@@ -54,4 +56,4 @@ def test_fitting_keeps_values_set_by_flags_and_marks_others() -> None:
 def test_fitting_an_already_fitted_scene_changes_nothing(tmp_path: Path) -> None:
     config = clutter("robot=mamba")
     write_config(config, tmp_path / "run.json")
-    assert load(str(tmp_path / "run.json")).config == config
+    assert load_scenario(str(tmp_path / "run.json")).config == config

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import (
-    joint_rotation,
-    link_frames,
+    compute_joint_rotation,
+    compute_link_frames,
     quaternion_from_yaw,
     rotation_from_quaternion,
     yaw_from_rotation,
@@ -66,7 +66,7 @@ def test_frames_agree_with_a_product_of_matrices(
     axes, angles, lengths = chain
     base = np.eye(4)
     base[:3, :3], base[:3, 3] = rotation_from_quaternion(wxyz), at
-    origins, rotations = link_frames(at, base[:3, :3], angles, axes, lengths)
+    origins, rotations = compute_link_frames(at, base[:3, :3], angles, axes, lengths)
     for i, frame in enumerate(homogeneous(axes, angles, lengths, base)):
         assert origins[i] == pytest.approx(frame[:3, 3], abs=1e-9)
         assert rotations[i] == pytest.approx(frame[:3, :3], abs=1e-9)
@@ -80,8 +80,8 @@ def test_the_planar_shortcut_is_the_full_calculation(
     _, angles, lengths = chain
     planar = ["yaw"] * len(angles)
     base = rotation_from_quaternion(wxyz)
-    short_o, short_r = link_frames((1.0, 2.0, 3.0), base, np.array(angles), planar, lengths)
-    full_o, full_r = link_frames((1.0, 2.0, 3.0), base, [*angles, 0.0], [*planar, "pitch"], [*lengths, 0.1])
+    short_o, short_r = compute_link_frames((1.0, 2.0, 3.0), base, np.array(angles), planar, lengths)
+    full_o, full_r = compute_link_frames((1.0, 2.0, 3.0), base, [*angles, 0.0], [*planar, "pitch"], [*lengths, 0.1])
     assert short_o == pytest.approx(full_o[:-1], abs=1e-9)
     assert short_r == pytest.approx(full_r[:-1], abs=1e-9)
 
@@ -90,20 +90,20 @@ QUARTER_TURN_RAD = math.pi / 2
 
 
 def test_positive_yaw_turns_next_link_left() -> None:
-    origins, rotations = link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["yaw"], [1.0, 1.0])
+    origins, rotations = compute_link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["yaw"], [1.0, 1.0])
     assert origins[1] == pytest.approx([1, 0, 0])
     assert rotations[1][:, 0] == pytest.approx([0, 1, 0])
 
 
 def test_positive_pitch_turns_next_link_down() -> None:
     """Pitch is right-handed about y, which points left."""
-    _, rotations = link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["pitch"], [1.0, 1.0])
+    _, rotations = compute_link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["pitch"], [1.0, 1.0])
     assert rotations[1][:, 0] == pytest.approx([0, 0, -1])
 
 
 def test_pitch_after_yaw_turns_about_yawed_axis() -> None:
     angles_rad = [QUARTER_TURN_RAD, QUARTER_TURN_RAD]
-    origins, rotations = link_frames((0, 0, 0), np.eye(3), angles_rad, ["yaw", "pitch"], [1.0, 2.0, 1.0])
+    origins, rotations = compute_link_frames((0, 0, 0), np.eye(3), angles_rad, ["yaw", "pitch"], [1.0, 2.0, 1.0])
     assert origins[2] == pytest.approx([1, 2, 0])
     assert rotations[2][:, 0] == pytest.approx([0, 0, -1])
 
@@ -123,4 +123,4 @@ def test_rotations_turn_as_their_quaternions_do(
 def test_yaw_there_and_back(yaw: float) -> None:
     rotation = rotation_from_quaternion(quaternion_from_yaw(yaw))
     assert yaw_from_rotation(rotation) == pytest.approx(yaw, abs=1e-9)
-    assert rotation == pytest.approx(joint_rotation("yaw", yaw), abs=1e-9)
+    assert rotation == pytest.approx(compute_joint_rotation("yaw", yaw), abs=1e-9)

@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import NodeFinder, find_nodes_w
-from snakesim_hal.model.scenario import describe_run_robot, load
+from snakesim_hal.model.kinematics import ForwardKinematics, compute_body_points_w
+from snakesim_hal.model.scenario import describe_run_robot, load_scenario
 
 POSES = 50
 
 
 @pytest.mark.parametrize("scenario", ["peg_row", "mamba_flat"])
 def test_many_poses_have_the_nodes_of_each_pose_alone(scenario: str) -> None:
-    robot = describe_run_robot(load(scenario).config)
+    robot = describe_run_robot(load_scenario(scenario).config)
     random = np.random.default_rng(1)
     positions_w = random.normal(size=(POSES, 3))
     wxyz = random.normal(size=(POSES, 4))
     angles_rad = random.normal(size=(POSES, len(robot.joints)))
-    nodes_w = NodeFinder(robot).find(positions_w, wxyz, angles_rad)
+    nodes_w = ForwardKinematics(robot).compute_body_points_w(positions_w, wxyz, angles_rad)
     for i in range(POSES):
-        alone_w = find_nodes_w(robot, positions_w[i], wxyz[i], angles_rad[i].tolist())
+        alone_w = compute_body_points_w(robot, positions_w[i], wxyz[i], angles_rad[i].tolist())
         assert nodes_w[i].tobytes() == alone_w.tobytes()

@@ -13,11 +13,11 @@ from snakesim_hal.model.plugins import (
     BACKENDS,
     CONTROLLERS,
     SERVICES,
-    find_installed,
-    find_plugin,
-    list_installed,
-    offer_plugin,
-    plugin_settings,
+    decode_plugin_settings,
+    list_installed_plugins,
+    load_plugin,
+    load_plugin_unless_file,
+    register_plugin_temporarily,
 )
 from snakesim_testing.messages import raises_error
 
@@ -32,9 +32,9 @@ class Wave:
 
 @pytest.mark.parametrize("group", [BACKENDS, CONTROLLERS, SERVICES])
 def test_everything_installed_loads_and_backends_declare_their_settings(group: str) -> None:
-    assert list_installed(group) == sorted(set(list_installed(group))) != []
-    for name in list_installed(group):
-        plugin: Any = find_plugin(group, name)
+    assert list_installed_plugins(group) == sorted(set(list_installed_plugins(group))) != []
+    for name in list_installed_plugins(group):
+        plugin: Any = load_plugin(group, name)
         assert callable(plugin)
         if group == BACKENDS:
             assert issubclass(vars(plugin)["Settings"], msgspec.Struct), name
@@ -44,15 +44,15 @@ def test_plugin_unknown_name_lists_installed_ones_and_how_to_add() -> None:
     with raises_error(
         ConfigError, code="plugin/not-found", field=("wiggle", "snakesim.controllers"), stored=False
     ) as caught:
-        find_plugin(CONTROLLERS, "wiggle")
-    assert all(name in str(caught.value) for name in list_installed(CONTROLLERS))
+        load_plugin(CONTROLLERS, "wiggle")
+    assert all(name in str(caught.value) for name in list_installed_plugins(CONTROLLERS))
 
 
 def test_a_class_of_a_file_is_a_plugin(tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text(WAVE)
-    wave = find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave")
+    wave = load_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave")
     assert wave.__name__ == "Wave"
-    assert plugin_settings(wave, {"gain": 2.0}, "a.toml", "c").gain == 2.0
+    assert decode_plugin_settings(wave, {"gain": 2.0}, "a.toml", "c").gain == 2.0
 
 
 TRAP = """\
@@ -70,20 +70,20 @@ NAMELESS = {"no class": "", "empty class": ":", "unknown class": ":Wove"}
 
 
 @pytest.mark.parametrize("nameless", NAMELESS)
-@pytest.mark.parametrize("find", [find_plugin, find_installed])
+@pytest.mark.parametrize("find", [load_plugin, load_plugin_unless_file])
 def test_a_file_without_its_class_lists_the_classes(find: Any, nameless: str, tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
     with raises_error(ConfigError, code="plugin/not-found", field=f"{tmp_path}/wave.py:Wave"):
         find(CONTROLLERS, f"{tmp_path}/wave.py{NAMELESS[nameless]}")
-    assert (tmp_path / "mark").exists() == (find is find_plugin and nameless == "unknown class")
+    assert (tmp_path / "mark").exists() == (find is load_plugin and nameless == "unknown class")
 
 
 def test_looking_at_a_file_runs_none_of_it(tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
     for name in ("Wave", "make", "Path"):
-        assert find_installed(CONTROLLERS, f"{tmp_path}/wave.py:{name}") is None
+        assert load_plugin_unless_file(CONTROLLERS, f"{tmp_path}/wave.py:{name}") is None
     assert not (tmp_path / "mark").exists()
-    assert find_installed(CONTROLLERS, "hold") is find_plugin(CONTROLLERS, "hold")
+    assert load_plugin_unless_file(CONTROLLERS, "hold") is load_plugin(CONTROLLERS, "hold")
 
 
 BROKEN = {
@@ -103,16 +103,19 @@ def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) 
     text, name = BROKEN[broken]
     (tmp_path / "wave.py").write_text(text)
     with raises_error(ConfigError, code=("plugin/not-found", "plugin/not-loadable")):
-        find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:{name}")
+        load_plugin(CONTROLLERS, f"{tmp_path}/wave.py:{name}")
 
 
 def test_a_program_may_offer_what_a_name_stands_for() -> None:
-    installed_one = find_plugin(CONTROLLERS, "hold")
-    with offer_plugin(CONTROLLERS, "hold", Plugin), offer_plugin(CONTROLLERS, "mine", Plugin):
-        assert find_plugin(CONTROLLERS, "hold") is find_plugin(CONTROLLERS, "mine") is Plugin
-    assert find_plugin(CONTROLLERS, "hold") is installed_one
+    installed_one = load_plugin(CONTROLLERS, "hold")
+    with (
+        register_plugin_temporarily(CONTROLLERS, "hold", Plugin),
+        register_plugin_temporarily(CONTROLLERS, "mine", Plugin),
+    ):
+        assert load_plugin(CONTROLLERS, "hold") is load_plugin(CONTROLLERS, "mine") is Plugin
+    assert load_plugin(CONTROLLERS, "hold") is installed_one
     with raises_error(ConfigError, code="plugin/not-found", field="mine"):
-        find_plugin(CONTROLLERS, "mine")
+        load_plugin(CONTROLLERS, "mine")
 
 
 class Plugin:
@@ -121,18 +124,18 @@ class Plugin:
 
 
 def test_plugin_settings_are_checked_by_its_struct_naming_the_source() -> None:
-    assert plugin_settings(Plugin, {}, "a.toml", "controllers.p").gain == 1.0
+    assert decode_plugin_settings(Plugin, {}, "a.toml", "controllers.p").gain == 1.0
     with raises_error(ConfigError, code="config/unknown-key", field="a.toml"):
-        plugin_settings(Plugin, {"gian": 1}, "a.toml", "controllers.p")
+        decode_plugin_settings(Plugin, {"gian": 1}, "a.toml", "controllers.p")
     origin = {"controllers.p.gain": "--set control.gain=x"}
     with raises_error(ConfigError, code="config/invalid-value", field="--set"):
-        plugin_settings(Plugin, {"gain": "x"}, "a.toml", "controllers.p", origin)
+        decode_plugin_settings(Plugin, {"gain": "x"}, "a.toml", "controllers.p", origin)
 
 
 def test_a_plugin_without_settings_is_told_to_state_them() -> None:
     for bad in (object(), type("Bare", (), {}), type("Odd", (), {"Settings": dict})):
         with raises_error(ConfigError, code="plugin/not-loadable", field="Settings"):
-            plugin_settings(bad, {}, "a.toml", "x")
+            decode_plugin_settings(bad, {}, "a.toml", "x")
 
 
 def test_plugin_name_in_two_packages_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,6 +146,6 @@ def test_plugin_name_in_two_packages_is_refused(tmp_path: Path, monkeypatch: pyt
         (metadata / "entry_points.txt").write_text(f"[snakesim.controllers]\nwave = {package}:Wave\n")
     monkeypatch.syspath_prepend(tmp_path)
     with raises_error(ConfigError, code="plugin/ambiguous", field="wave") as raised:
-        find_plugin(CONTROLLERS, "wave")
+        load_plugin(CONTROLLERS, "wave")
     assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(re.split(": | and |; ", str(raised.value)))
-    assert find_plugin(CONTROLLERS, "hold").__name__ == "Hold"
+    assert load_plugin(CONTROLLERS, "hold").__name__ == "Hold"

@@ -7,21 +7,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import decode, list_shipped, read_part
+from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
 from snakesim_hal.model.joints import Drive, Heat, JointExceptions, Limits, Motor, Supply
-from snakesim_hal.model.robot import RobotFile, describe_robot, layout_hash
+from snakesim_hal.model.robot import RobotFile, compute_layout_hash, describe_robot
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import Description, Mode
-from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, ROBOT, description, robot_file
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, ROBOT, make_description, make_robot_file
 from snakesim_testing.messages import raises_error
 
 SECTIONS = ("limits", "motor", "drive", "heat", "supply")
 
 
-@pytest.mark.parametrize("name", list_shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped_names("robots"))
 def test_every_shipped_robot_can_be_published(name: str) -> None:
-    robot = decode(read_part(name, "robots"), RobotFile)
+    robot = decode_table(read_table_with_base(name, "robots"), RobotFile)
     described = describe_robot(robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0")
     assert Decoder(Description).decode(encode(described), format_encoding(Description)) == described
     assert len(described.joints) == robot.chain.modules == len(described.links) - 1
@@ -36,7 +36,7 @@ def test_every_shipped_robot_can_be_published(name: str) -> None:
     length_m=st.floats(0.01, 2),
 )
 def test_links_add_up_to_the_modules(modules: int, axes: list[str], length_m: float) -> None:
-    robot = robot_file(chain={"modules": modules, "axes": axes}, module__length_m=length_m)
+    robot = make_robot_file(chain={"modules": modules, "axes": axes}, module__length_m=length_m)
     assert sum(robot.link_lengths_m) == pytest.approx(modules * length_m) == pytest.approx(robot.length_m)
     assert sum(robot.link_masses_kg) == pytest.approx(modules * robot.module.mass_kg)
     assert robot.link_lengths_m[0] == robot.link_lengths_m[-1] == 0.5 * length_m
@@ -44,7 +44,7 @@ def test_links_add_up_to_the_modules(modules: int, axes: list[str], length_m: fl
 
 
 def test_the_description_says_what_the_file_says() -> None:
-    described = description(chain__axes=["yaw", "pitch"])
+    described = make_description(chain__axes=["yaw", "pitch"])
     assert [joint.name for joint in described.joints] == ["joint_1", "joint_2", "joint_3"]
     assert [joint.axis for joint in described.joints] == ["yaw", "pitch", "yaw"]
     joint = described.joints[1]
@@ -68,7 +68,7 @@ def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
         "armature_kg_m2": 0.02, "torque_constant_nm_per_a": 0.08, "rated_nm": 1.0, "peak_nm": 3.5, "voltage_v": 25.2,
         "rise_at_rated_k": 90.0,
     }  # fmt: skip
-    robot = robot_file(joints={"joint_2": own}, drive__gear=9.0, limits__angle_max_rad=1.0)
+    robot = make_robot_file(joints={"joint_2": own}, drive__gear=9.0, limits__angle_max_rad=1.0)
     first, second, third = robot.joint_table
     for field, value in own.items():
         found = [part for part in (second, *(getattr(second, s) for s in SECTIONS)) if hasattr(part, field)]
@@ -78,24 +78,24 @@ def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
     assert first.drive.gear == 9.0
     assert first.supply.voltage_v == 24.0
     assert (first.limits.lower_rad, first.limits.upper_rad) == (-1.5, 1.0) == (third.limits.lower_rad, 1.0)
-    joints = description(joints={"joint_2": own}, limits__angle_max_rad=1.0).joints
+    joints = make_description(joints={"joint_2": own}, limits__angle_max_rad=1.0).joints
     assert [(joint.angle_min_rad, joint.angle_max_rad) for joint in joints] == [(-1.5, 1.0), (-0.4, 1.2), (-1.5, 1.0)]
     assert [joint.torque_limit_nm for joint in joints] == [4.0, 3.0, 4.0]
     assert [joint.speed_limit_rad_s for joint in joints] == [5.0, 2.0, 5.0]
     assert [joint.derate_from_c for joint in joints] == [80.0, 60.0, 80.0]
-    either = robot_file(joints={"joint_2": {"angle_rad": 0.2}}, limits__angle_max_rad=1.0).joint_table[1].limits
+    either = make_robot_file(joints={"joint_2": {"angle_rad": 0.2}}, limits__angle_max_rad=1.0).joint_table[1].limits
     assert (either.lower_rad, either.upper_rad) == (-0.2, 0.2), "to either side, whatever the others' sides are"
 
 
 def test_the_description_says_what_each_joint_can_do_and_measure() -> None:
     own = {"joint_2": {"modes": ["torque", "position"], "measures": ["torque"]}}
-    first, second, third = description(drive__modes=["position"], drive__measures=[], joints=own).joints
+    first, second, third = make_description(drive__modes=["position"], drive__measures=[], joints=own).joints
     assert first.modes == third.modes == [Mode.PASSIVE, Mode.POSITION]
     assert first.measures == []
     assert second.modes == [Mode.PASSIVE, Mode.POSITION, Mode.TORQUE]
     assert second.measures == ["torque"]
-    assert description().joints[0].modes == list(Mode), "all, where nothing is said"
-    assert description().joints[0].measures == ["torque", "temperature", "voltage"]
+    assert make_description().joints[0].modes == list(Mode), "all, where nothing is said"
+    assert make_description().joints[0].measures == ["torque", "temperature", "voltage"]
 
 
 def test_robot_every_section_field_has_a_joint_field() -> None:
@@ -104,8 +104,10 @@ def test_robot_every_section_field_has_a_joint_field() -> None:
 
 
 def test_robot_description_lists_only_its_sensors_within_loop_rate() -> None:
-    assert [sensor.key for sensor in description().sensors] == [keys.JOINTS]
-    rich = description(sensors={"contacts": {"rate_hz": 1000.0}, "imu": {"rate_hz": 20.0, "delay_s": 0.1}, "pose": {}})
+    assert [sensor.key for sensor in make_description().sensors] == [keys.JOINTS]
+    rich = make_description(
+        sensors={"contacts": {"rate_hz": 1000.0}, "imu": {"rate_hz": 20.0, "delay_s": 0.1}, "pose": {}}
+    )
     rates = {sensor.key: sensor.rate_hz for sensor in rich.sensors}
     assert rates == {keys.JOINTS: 100.0, keys.CONTACTS: 100.0, keys.IMU: 20.0, keys.POSE: 100.0}
     assert {sensor.key: sensor.delay_s for sensor in rich.sensors}[keys.IMU] == 0.1
@@ -116,7 +118,7 @@ def test_robot_cameras_and_lidars_are_named_and_one_period_late() -> None:
         {"name": "head", "delay_s": 0.0, "color": True},
         {"name": "back", "link": 2, "position_m": [0.0, 0.0, 0.1]},
     ]
-    rich = description(sensors={"depth": depth, "range": [{"name": "front", "rate_hz": 500.0, "delay_s": 0.04}]})
+    rich = make_description(sensors={"depth": depth, "range": [{"name": "front", "rate_hz": 500.0, "delay_s": 0.04}]})
     found = {sensor.key: (sensor.rate_hz, sensor.delay_s) for sensor in rich.sensors}
     del found[keys.JOINTS]
     assert found == {
@@ -132,33 +134,36 @@ def test_a_robot_may_extend_another_and_say_only_what_differs(tmp_path: Path) ->
     file.write_text(
         'extends = "planar13"\nname = "worm"\n[limits]\ntorque_nm = 3.0\n[[sensors.range]]\nname = "front"\n'
     )
-    table, plain = read_part(str(file), "robots"), decode(read_part("planar13", "robots"), RobotFile)
-    robot = decode(table, RobotFile)
+    table, plain = (
+        read_table_with_base(str(file), "robots"),
+        decode_table(read_table_with_base("planar13", "robots"), RobotFile),
+    )
+    robot = decode_table(table, RobotFile)
     assert robot.name == "worm"
     assert robot.limits.torque_nm == 3.0
     assert robot.sensors.range[0].name == "front"
     assert robot.chain == plain.chain
     assert robot.sensors.imu == plain.sensors.imu
-    assert table.origin_of("limits.torque_nm") == str(file)
-    assert table.origin_of("limits.angle_rad").endswith("planar13.toml")
+    assert table.find_origin("limits.torque_nm") == str(file)
+    assert table.find_origin("limits.angle_rad").endswith("planar13.toml")
     more = tmp_path / "more.toml"
     more.write_text('extends = "./worm.toml"\nname = "more"')
-    further = decode(read_part(str(more), "robots"), RobotFile)
+    further = decode_table(read_table_with_base(str(more), "robots"), RobotFile)
     assert further.name == "more"
     assert further.limits.torque_nm == 3.0
     assert further.chain == plain.chain
     file.write_text('extends = "./more.toml"')
     with raises_error(ConfigError, code="config/conflict", field="extends"):
-        read_part(str(more), "robots")
+        read_table_with_base(str(more), "robots")
     file.write_text("extends = 13")
     with raises_error(ConfigError, code="config/invalid-value", field="extends", value=13):
-        read_part(str(file), "robots")
+        read_table_with_base(str(file), "robots")
 
 
 def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
-    three, four = description(), description(chain__modules=4)
-    mixed = description(chain__axes=["yaw", "pitch"])
+    three, four = make_description(), make_description(chain__modules=4)
+    mixed = make_description(chain__axes=["yaw", "pitch"])
     swapped = list(reversed(three.joints))
-    found = {layout_hash(joints) for joints in (three.joints, four.joints, mixed.joints, swapped)}
+    found = {compute_layout_hash(joints) for joints in (three.joints, four.joints, mixed.joints, swapped)}
     assert len(found) == 4
-    assert description(limits__torque_nm=1.0).layout == three.layout  # the same vectors, other numbers
+    assert make_description(limits__torque_nm=1.0).layout == three.layout  # the same vectors, other numbers

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.route import Route, chain_angles, lay_chain, next_on_route, sine_points, yaw_segments_m
+from snakesim_hal.model.route import (
+    Route,
+    compute_yaw_segments_m,
+    expand_yaw_angles,
+    find_arc_length_at_distance,
+    place_chain_on_route,
+    sample_sine_curve,
+)
 from snakesim_testing.messages import raises_error
 
 
@@ -17,7 +24,7 @@ def gentle(draw: st.DrawFn) -> Route:
     """Sines that a snake could follow."""
     wavelength_m = draw(st.floats(0.5, 3.0))
     amplitude_m = draw(st.floats(0.0, 0.15)) * wavelength_m
-    return Route(sine_points(amplitude_m, wavelength_m, draw(st.floats(2.0, 6.0))))
+    return Route(sample_sine_curve(amplitude_m, wavelength_m, draw(st.floats(2.0, 6.0))))
 
 
 def circle(radius_m: float, turn_rad: float, count: int = 2000) -> Route:
@@ -31,30 +38,30 @@ def test_arc_length_of_known_curves() -> None:
     x = np.linspace(0, 4, 400_001)
     slope = 0.1 * (2 * np.pi / 0.8) * np.cos(2 * np.pi * x / 0.8)
     exact = float(np.trapezoid(np.hypot(1.0, slope), x))
-    assert Route(sine_points(0.1, 0.8, 4.0)).length_m == pytest.approx(exact, rel=1e-3)
+    assert Route(sample_sine_curve(0.1, 0.8, 4.0)).length_m == pytest.approx(exact, rel=1e-3)
 
 
 def test_route_passes_through_points_and_extends_straight_at_ends() -> None:
     route = Route([(0, 0), (3, 4), (3, 5)])
     wanted = {-5.0: (-3, -4), 0.0: (0, 0), 2.5: (1.5, 2), 5.0: (3, 4), 5.5: (3, 4.5), 6.0: (3, 5), 8.0: (3, 7)}
-    assert route.position_w(np.array(list(wanted))) == pytest.approx(np.array(list(wanted.values())))
+    assert route.compute_positions_w(np.array(list(wanted))) == pytest.approx(np.array(list(wanted.values())))
 
 
 @given(route=gentle(), s_m=st.floats(-1, 8))
 def test_the_fast_lookup_is_the_slow_one(route: Route, s_m: float) -> None:
-    assert route.point_at(s_m) == pytest.approx(tuple(route.position_w(s_m)), abs=1e-9)
+    assert route.compute_point(s_m) == pytest.approx(tuple(route.compute_positions_w(s_m)), abs=1e-9)
 
 
 @given(route=gentle(), s_m=st.floats(-0.5, 7), step_m=st.floats(1e-4, 0.05))
 def test_route_chord_is_at_most_and_nearly_its_arc(route: Route, s_m: float, step_m: float) -> None:
-    chord = math.dist(route.point_at(s_m), route.point_at(s_m + step_m))
+    chord = math.dist(route.compute_point(s_m), route.compute_point(s_m + step_m))
     assert 0.9 * step_m <= chord <= step_m * (1 + 1e-9)
 
 
 def test_heading_of_a_circle() -> None:
     route = circle(0.7, 3.0)
     for s in (0.1, 1.0, 2.0):
-        assert route.heading_rad(s) == pytest.approx(s / 0.7, abs=1e-3)
+        assert route.compute_heading_rad(s) == pytest.approx(s / 0.7, abs=1e-3)
         assert route.tangent_w(s) == pytest.approx([math.cos(s / 0.7), math.sin(s / 0.7)], abs=1e-3)
 
 
@@ -64,9 +71,9 @@ def test_heading_of_a_circle() -> None:
 @given(route=gentle(), x=st.floats(-0.3, 6), y=st.floats(-0.6, 0.6))
 @settings(max_examples=60)
 def test_projection_is_the_nearest_point(route: Route, x: float, y: float) -> None:
-    s = route.project(np.array([x, y]))
-    found = math.dist(route.point_at(s), (x, y))
-    tried = route.position_w(np.arange(-1.0, route.length_m + 1.0, 0.004))
+    s = route.project_point(np.array([x, y]))
+    found = math.dist(route.compute_point(s), (x, y))
+    tried = route.compute_positions_w(np.arange(-1.0, route.length_m + 1.0, 0.004))
     assert found <= float(np.hypot(*(tried - [x, y]).T).min()) + 1e-9
 
 
@@ -101,34 +108,34 @@ def test_projection_has_the_bits_of_measuring_every_segment(seed: int, count: in
     for _ in range(8):
         place_w = route.points_w[random.integers(len(route.points_w))]
         point_w = place_w + random.normal(0.0, spread_m, 2) * random.integers(2)
-        assert route.project(point_w) == project_by_measuring_all(route, point_w, 0, count)
+        assert route.project_point(point_w) == project_by_measuring_all(route, point_w, 0, count)
         near_s_m = float(random.uniform(-1.0, route.length_m + 1.0))
-        first, last = route._segments_near(near_s_m, 0.3)
-        assert route.project(point_w, near_s_m, 0.3) == project_by_measuring_all(route, point_w, first, last)
+        first, last = route._find_segments_near(near_s_m, 0.3)
+        assert route.project_point(point_w, near_s_m, 0.3) == project_by_measuring_all(route, point_w, first, last)
 
 
 def test_projection_near_a_place_stays_on_its_branch() -> None:
     """A hairpin: the nearest point of all is on the other leg, but the snake is on this one."""
     route = Route([(0, 0), (2, 0), (2, 0.2), (0, 0.2)])
     point = np.array([0.5, 0.19])
-    assert route.project(point) == pytest.approx(3.7)
-    assert route.project(point, near_s_m=0.5) == pytest.approx(0.5)
+    assert route.project_point(point) == pytest.approx(3.7)
+    assert route.project_point(point, near_s_m=0.5) == pytest.approx(0.5)
     for near in (-50.0, 50.0):  # far beyond both ends: the end that is there
-        assert math.isfinite(route.project(point, near_s_m=near))
+        assert math.isfinite(route.project_point(point, near_s_m=near))
 
 
 @given(route=gentle(), s_m=st.floats(0, 5), near_m=st.floats(-0.3, 0.3))
 def test_projection_near_the_right_place_finds_it(route: Route, s_m: float, near_m: float) -> None:
-    point = np.array(route.point_at(s_m))
-    assert math.dist(route.point_at(route.project(point, near_s_m=s_m + near_m)), point) < 1e-7
+    point = np.array(route.compute_point(s_m))
+    assert math.dist(route.compute_point(route.project_point(point, near_s_m=s_m + near_m)), point) < 1e-7
 
 
 # --- inflections -----------------------------------------------------------------------------------------------
 
 
 def test_a_sine_bends_the_other_way_at_every_half_wave() -> None:
-    route = Route(sine_points(0.1, 0.8, 4.0))
-    spots = route.position_w(np.array(route.inflections_s_m()))
+    route = Route(sample_sine_curve(0.1, 0.8, 4.0))
+    spots = route.compute_positions_w(np.array(route.find_inflections_s_m()))
     assert spots[:, 0] == pytest.approx(0.4 * np.arange(1, 10), abs=0.011)
     assert np.abs(spots[:, 1]).max() < 0.01
 
@@ -140,11 +147,11 @@ def test_route_inflections_are_detected_across_straight_pieces_only() -> None:
     straight = first[-1] + np.linspace(0.05, 1, 20)[:, None] * forward
     mirrored = straight[-1] + first[-1] - first[::-1]
     route = Route(np.vstack([first, straight, mirrored[1:]]))
-    (only,) = route.inflections_s_m()
+    (only,) = route.find_inflections_s_m()
     assert 1.0 < only < 2.0
-    assert circle(1.0, 2.0).inflections_s_m() == []
-    assert Route([(0, 0), (1, 0)]).inflections_s_m() == []
-    assert Route([(0, 0), (1, 0), (2, 0), (3, 0)]).inflections_s_m() == []
+    assert circle(1.0, 2.0).find_inflections_s_m() == []
+    assert Route([(0, 0), (1, 0)]).find_inflections_s_m() == []
+    assert Route([(0, 0), (1, 0), (2, 0), (3, 0)]).find_inflections_s_m() == []
 
 
 @pytest.mark.parametrize("points", [[(0, 0)], [(0, 0), (0, 0)], [(0, 0), (1, 0), (1, 0), (2, 0)]])
@@ -154,11 +161,11 @@ def test_degenerate_routes_are_refused(points: list[tuple[float, float]]) -> Non
 
 
 def test_sine_points_begin_at_the_origin_and_end_where_told() -> None:
-    points = sine_points(0.1, 0.8, 1.23)
+    points = sample_sine_curve(0.1, 0.8, 1.23)
     assert points[0].tolist() == [0.0, 0.0]
     assert points[-1][0] == pytest.approx(1.23)
     assert np.diff(points[:, 0]).max() <= 0.01 + 1e-12
-    assert len(sine_points(0.1, 0.8, 0.001)) == 2
+    assert len(sample_sine_curve(0.1, 0.8, 0.001)) == 2
 
 
 # --- chains ----------------------------------------------------------------------------------------------------
@@ -177,40 +184,42 @@ def nodes(tail_w: tuple[float, float], heading_rad: float, angles_rad: Floats, l
     lengths_m=st.lists(st.floats(0.04, 0.15), min_size=2, max_size=15),
 )
 def test_route_laid_chain_has_joints_at_their_distances(route: Route, tail_s_m: float, lengths_m: list[float]) -> None:
-    lay = lay_chain(route, tail_s_m, lengths_m)
+    lay = place_chain_on_route(route, tail_s_m, lengths_m)
     points = nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, lengths_m)
-    assert lay.tail_w == pytest.approx(route.point_at(tail_s_m))
+    assert lay.tail_w == pytest.approx(route.compute_point(tail_s_m))
     assert len(lay.angles_rad) == len(lengths_m) - 1
     assert np.abs(lay.angles_rad).max() <= math.pi
-    along = [route.project(point, near_s_m=tail_s_m + sum(lengths_m[:i])) for i, point in enumerate(points)]
-    assert max(math.dist(route.point_at(s), p) for s, p in zip(along, points, strict=True)) < 1e-5
+    along = [route.project_point(point, near_s_m=tail_s_m + sum(lengths_m[:i])) for i, point in enumerate(points)]
+    assert max(math.dist(route.compute_point(s), p) for s, p in zip(along, points, strict=True)) < 1e-5
     assert np.diff(along).min() > 0  # tail to head, in the direction of travel
 
 
 def test_a_laid_chain_bends_the_way_the_route_does() -> None:
-    lay = lay_chain(circle(1.0, 3.0), 0.2, [0.1] * 10)
+    lay = place_chain_on_route(circle(1.0, 3.0), 0.2, [0.1] * 10)
     assert lay.angles_rad == pytest.approx([2 * math.asin(0.05)] * 9, rel=1e-3)
-    straight = lay_chain(Route([(0, 0), (0, 5)]), 1.0, [0.1] * 5)
+    straight = place_chain_on_route(Route([(0, 0), (0, 5)]), 1.0, [0.1] * 5)
     assert straight.heading_rad == pytest.approx(math.pi / 2)
     assert np.abs(straight.angles_rad).max() < 1e-9
-    backwards = lay_chain(circle(1.0, 6.0), 2.8, [0.2] * 5)  # headings pass half a turn: no joint turns by 2 pi
+    backwards = place_chain_on_route(
+        circle(1.0, 6.0), 2.8, [0.2] * 5
+    )  # headings pass half a turn: no joint turns by 2 pi
     assert backwards.angles_rad == pytest.approx([2 * math.asin(0.1)] * 4, rel=1e-3)
 
 
 @given(route=gentle(), s_m=st.floats(0, 4), distance_m=st.floats(0.01, 0.2))
 def test_the_next_point_is_ahead_at_the_straight_distance(route: Route, s_m: float, distance_m: float) -> None:
-    s = next_on_route(route, route.point_at(s_m), s_m, distance_m)
+    s = find_arc_length_at_distance(route, route.compute_point(s_m), s_m, distance_m)
     assert s >= s_m + distance_m - 1e-6
-    assert math.dist(route.point_at(s), route.point_at(s_m)) == pytest.approx(distance_m, abs=1e-6)
+    assert math.dist(route.compute_point(s), route.compute_point(s_m)) == pytest.approx(distance_m, abs=1e-6)
 
 
 @given(axes=st.lists(st.sampled_from(["yaw", "pitch"]), min_size=1, max_size=12))
 def test_joints_that_do_not_yaw_leave_longer_straight_pieces(axes: list[str]) -> None:
     lengths = [0.05] + [0.1] * (len(axes) - 1) + [0.05]
-    segments = yaw_segments_m(axes, lengths)
+    segments = compute_yaw_segments_m(axes, lengths)
     assert len(segments) == axes.count("yaw") + 1
     assert sum(segments) == pytest.approx(sum(lengths))
     yaw_angles = np.arange(1.0, axes.count("yaw") + 1)
-    angles = chain_angles(axes, yaw_angles)
+    angles = expand_yaw_angles(axes, yaw_angles)
     assert [a for a, axis in zip(angles, axes, strict=True) if axis == "yaw"] == yaw_angles.tolist()
     assert all(a == 0 for a, axis in zip(angles, axes, strict=True) if axis == "pitch")

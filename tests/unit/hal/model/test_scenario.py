@@ -12,39 +12,45 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.participants import Participants
-from snakesim_hal.model.fault_plan import check_planned
-from snakesim_hal.model.files import list_shipped
-from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.fault_plan import parse_and_validate_planned_faults
+from snakesim_hal.model.files import list_shipped_names
+from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.scenario import (
-    Loaded,
+    LoadedScenario,
     Override,
     ServiceSchedule,
     WaypointGoal,
-    capsules_at_start,
-    config_hash,
-    find_start_pose,
-    load,
-    parse_set,
+    compute_config_hash,
+    compute_start_pose,
+    get_noisy_obstacle_map,
+    load_scenario,
+    make_start_capsules,
+    parse_set_option,
     place_obstacles,
     read_config,
-    survey_obstacles,
     write_config,
 )
 from snakesim_hal.model.scene import make_route
-from snakesim_testing.hal.small_robots import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
+from snakesim_testing.hal.small_robots import (
+    ROBOT_TOML,
+    SCENARIO_TOML,
+    SCENE_TOML,
+    make_run_config,
+    write_scenario_files,
+)
 from snakesim_testing.messages import raises_error
 
 
-def with_flags(path: str, *flags: str) -> Loaded:
-    return load(path, [parse_set(flag) for flag in flags])
+def with_flags(path: str, *flags: str) -> LoadedScenario:
+    return load_scenario(path, [parse_set_option(flag) for flag in flags])
 
 
 # --- what is good ----------------------------------------------------------------------------------------------
 
 
 def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
-    config = load(write_files(tmp_path)).config
+    config = load_scenario(write_scenario_files(tmp_path)).config
     assert config.name == "crawl"
     assert config.robot.name == "worm"
     assert config.scene.name == "bend"
@@ -69,45 +75,45 @@ def test_a_flag_makes_another_field_or_another_goal() -> None:
 def test_scenario_survey_error_is_the_same_for_all_services() -> None:
     exact, off = (with_flags("surveyed_clutter", f"mission.map_error_m={sd}").config for sd in (0.0, 0.005))
     truth = np.array([placed.obstacle.position_w for placed in place_obstacles(off)])
-    assert np.array_equal([one.position_w for one in survey_obstacles(exact)], truth)
-    errors_m = np.array([one.position_w for one in survey_obstacles(off)]) - truth
+    assert np.array_equal([one.position_w for one in get_noisy_obstacle_map(exact)], truth)
+    errors_m = np.array([one.position_w for one in get_noisy_obstacle_map(off)]) - truth
     assert 0.003 < errors_m[:, :2].std() < 0.007
     assert not errors_m[:, 2].any()
-    assert survey_obstacles(off) == survey_obstacles(off)
+    assert get_noisy_obstacle_map(off) == get_noisy_obstacle_map(off)
     with raises_error(ConfigError, code="config/invalid-value"):
         with_flags("clutter", "mission.map_error_m=0.005")
 
 
 def test_scenario_parts_beside_it_or_shipped_are_named_by_flags(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
-    path = write_files(tmp_path, scenario=SCENARIO_TOML.replace('"worm.toml"', '"planar13"'))
-    assert load(path).config.robot.name == "planar13"
+    path = write_scenario_files(tmp_path, scenario=SCENARIO_TOML.replace('"worm.toml"', '"planar13"'))
+    assert load_scenario(path).config.robot.name == "planar13"
     other = tmp_path / "elsewhere" / "other.toml"
     other.write_text(ROBOT_TOML.replace('"worm"', '"other"'))
     flag = Override("robot", str(other), f"--set robot={other}")
-    found = load(path, [flag])
+    found = load_scenario(path, [flag])
     assert found.config.robot.name == "other"
-    assert found.table.origin_of("robot.name") == str(other)
+    assert found.table.find_origin("robot.name") == str(other)
 
 
-@pytest.mark.parametrize("name", list_shipped("scenarios"))
+@pytest.mark.parametrize("name", list_shipped_names("scenarios"))
 def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(name: str, tmp_path: Path) -> None:
-    config = load(name).config
+    config = load_scenario(name).config
     write_config(config, tmp_path / "config.json")
     assert read_config(tmp_path / "config.json") == config
-    again = load(str(tmp_path / "config.json")).config
+    again = load_scenario(str(tmp_path / "config.json")).config
     assert again == config
-    assert config_hash(again) == config_hash(config)
+    assert compute_config_hash(again) == compute_config_hash(config)
 
 
 def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Path) -> None:
-    first = with_flags(write_files(tmp_path), "robot.limits.torque_nm=2.5", "control.gain=3", "seed=9").config
+    first = with_flags(write_scenario_files(tmp_path), "robot.limits.torque_nm=2.5", "control.gain=3", "seed=9").config
     write_config(first, tmp_path / "config.json")
     assert read_config(tmp_path / "config.json") == first
     again = with_flags(str(tmp_path / "config.json"), "seed=10")
     assert again.config == msgspec.structs.replace(first, seed=10)
-    assert again.table.origin_of("seed") == "--set seed=10"
-    assert again.table.origin_of("robot.limits.torque_nm") == str(tmp_path / "config.json")
+    assert again.table.find_origin("seed") == "--set seed=10"
+    assert again.table.find_origin("robot.limits.torque_nm") == str(tmp_path / "config.json")
 
 
 @pytest.mark.parametrize(
@@ -115,30 +121,32 @@ def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Pat
     [({}, True), ({"seed": 2}, False), ({"robot__limits__torque_nm": 3.0}, False), ({"rate_hz": 50.0}, False)],
 )
 def test_the_hash_follows_everything_that_matters(change: dict[str, Any], same: bool) -> None:
-    assert (config_hash(run_config(**change)) == config_hash(run_config())) == same
-    assert 1 <= len(config_hash(run_config())) <= 64
+    assert (compute_config_hash(make_run_config(**change)) == compute_config_hash(make_run_config())) == same
+    assert 1 <= len(compute_config_hash(make_run_config())) <= 64
 
 
 def test_an_external_service_is_waited_for_and_not_started() -> None:
     own, external = (with_flags("triplet", *flags).config for flags in ([], ["services.control.external=true"]))
-    assert own.has_own_control
-    assert own.commander == "obstacle_triplet"
-    assert "control" in own.own_services
-    assert not external.has_own_control
-    assert external.commander == "external"
+    assert own.has_internal_control
+    assert own.commander_name == "obstacle_triplet"
+    assert "control" in own.internal_services
+    assert not external.has_internal_control
+    assert external.commander_name == "external"
     policies = [with_flags("triplet", f"controller=policy:{model}").config for model in ("clutter", "./mine.onnx")]
-    assert [policy.commander for policy in policies] == ["policy:clutter", "policy:./mine.onnx"]
-    assert set(external.services) - set(external.own_services) == {"control"}
+    assert [policy.commander_name for policy in policies] == ["policy:clutter", "policy:./mine.onnx"]
+    assert set(external.services) - set(external.internal_services) == {"control"}
     assert list(Participants(external.services)) == list(own.services)
     for text in ("kill:control@1", "hang:control@1", "drop:actuator/joints@1"):
-        check_planned(with_flags("triplet", f'faults=["{text}"]').config)
+        parse_and_validate_planned_faults(with_flags("triplet", f'faults=["{text}"]').config)
         with raises_error(ConfigError, code="injection/unknown-target", field="faults[0]"):
-            check_planned(with_flags("triplet", f'faults=["{text}"]', "services.control.external=true").config)
+            parse_and_validate_planned_faults(
+                with_flags("triplet", f'faults=["{text}"]', "services.control.external=true").config
+            )
 
 
 @given(rate_hz=st.floats(20, 5000))
 def test_scenario_lease_is_five_periods_between_50_and_100_ms(rate_hz: float) -> None:
-    config = run_config(rate_hz=rate_hz)
+    config = make_run_config(rate_hz=rate_hz)
     assert 50_000_000 <= config.lease_ns <= 100_000_000
     if 50_000_000 < config.lease_ns < 100_000_000:
         assert config.lease_ns == 5 * config.period_ns
@@ -174,18 +182,20 @@ def test_scenario_samples_at_a_tick_are_due_and_aged(tick: int, every: int, lag:
     ],
 )
 def test_set_reads_values_as_toml_and_else_as_text(text: str, key: str, value: Any) -> None:
-    assert parse_set(text) == Override(key, value, f"--set {text}")
+    assert parse_set_option(text) == Override(key, value, f"--set {text}")
 
 
 @pytest.mark.parametrize("text", ["", "seed", "=3", " = 3"])
 def test_set_without_key_or_value_is_refused(text: str) -> None:
     with raises_error(ConfigError, code="command/invalid-option", field="section.key"):
-        parse_set(text)
+        parse_set_option(text)
 
 
 def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
-    loaded = with_flags(write_files(tmp_path), "robot.limits.torque_nm=2.0", "start.tail_s_m=0.2", "control.gain=1")
-    reported = {key: (value, origin) for key, value, origin in loaded.explain()}
+    loaded = with_flags(
+        write_scenario_files(tmp_path), "robot.limits.torque_nm=2.0", "start.tail_s_m=0.2", "control.gain=1"
+    )
+    reported = {key: (value, origin) for key, value, origin in loaded.list_effective_values()}
     assert reported["robot.limits.torque_nm"] == (2.0, "--set robot.limits.torque_nm=2.0")
     assert reported["start.tail_s_m"] == (0.2, "--set start.tail_s_m=0.2")
     assert reported["controllers.hold.gain"] == (1, "--set control.gain=1")
@@ -214,7 +224,7 @@ def flat(value: Any, at: str = "") -> list[tuple[str, Any]]:
 
 
 def test_scenario_control_alias_means_chosen_controller_in_any_flag_order(tmp_path: Path) -> None:
-    path = write_files(tmp_path)
+    path = write_scenario_files(tmp_path)
     assert with_flags(path, "control.gain=3").config.controllers == {"hold": {"gain": 3}}
     for flags in (["control.gain=3", "controller=./w.py:Wave"], ["controller=./w.py:Wave", "control.gain=3"]):
         config = with_flags(path, *flags).config
@@ -241,14 +251,14 @@ FILES = {
 @pytest.mark.parametrize("wrong", FILES)
 def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
     name, old, new = FILES[wrong]
-    path = write_files(tmp_path)
+    path = write_scenario_files(tmp_path)
     text = (tmp_path / name).read_text()
     assert old in text
     (tmp_path / name).write_text(text.replace(old, new, 1))
     with raises_error(
         ConfigError, code=("config/invalid-value", "config/missing-key", "config/out-of-range", "file/invalid-syntax")
     ) as caught:
-        load(path)
+        load_scenario(path)
     said = str(caught.value)
     if wrong != "robot empty":  # an empty file has no neighbor that could tell whose the field is
         assert said.startswith(f"{tmp_path / name}: "), said
@@ -256,14 +266,14 @@ def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
 
 
 def test_absent_files_are_named(tmp_path: Path) -> None:
-    path = write_files(tmp_path)
+    path = write_scenario_files(tmp_path)
     with raises_error(ConfigError, code="config/unknown-name", field="nowhere"):
-        load("nowhere")
+        load_scenario("nowhere")
     with raises_error(ConfigError, code="file/not-found", field="none.toml"):
-        load(str(tmp_path / "none.toml"))
+        load_scenario(str(tmp_path / "none.toml"))
     (tmp_path / "worm.toml").unlink()
     with raises_error(ConfigError, code="file/not-found", field="worm.toml"):
-        load(path)
+        load_scenario(path)
     with raises_error(ConfigError, code="config/unknown-name", field="wurm"):
         with_flags(path, "robot=wurm")
 
@@ -280,39 +290,39 @@ def test_scenes_that_do_not_fit_the_robot_are_refused(wrong: str, tmp_path: Path
     old, new = SCENES[wrong]
     assert old in SCENE_TOML
     with raises_error(ConfigError, code=("config/out-of-range", "scene/no-route", "scene/overlap")):
-        load(write_files(tmp_path, scene=SCENE_TOML.replace(old, new)))
+        load_scenario(write_scenario_files(tmp_path, scene=SCENE_TOML.replace(old, new)))
 
 
 # --- the start -------------------------------------------------------------------------------------------------
 
 
 def test_the_snake_lies_on_its_route_with_every_joint(tmp_path: Path) -> None:
-    config = load(write_files(tmp_path)).config
+    config = load_scenario(write_scenario_files(tmp_path)).config
     route = make_route(config.scene)
     assert route is not None
-    pose = find_start_pose(config)
-    assert pose.position_w == pytest.approx(route.point_at(0.1))
+    pose = compute_start_pose(config)
+    assert pose.position_w == pytest.approx(route.compute_point(0.1))
     rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
     lengths = config.robot.link_lengths_m
-    origins, _ = link_frames((*pose.position_w, 0.0), rotation, pose.angles_rad, config.robot.axes, lengths)
+    origins, _ = compute_link_frames((*pose.position_w, 0.0), rotation, pose.angles_rad, config.robot.axes, lengths)
     for origin in origins:
-        assert np.hypot(*(route.position_w(route.project(origin[:2])) - origin[:2])) < 1e-5
+        assert np.hypot(*(route.compute_positions_w(route.project_point(origin[:2])) - origin[:2])) < 1e-5
 
 
 def test_a_snake_with_pitch_joints_lies_flat_on_its_route(tmp_path: Path) -> None:
     mixed = ROBOT_TOML.replace('axes = ["yaw"]', 'axes = ["pitch", "yaw"]').replace("modules = 3", "modules = 6")
-    pose = find_start_pose(load(write_files(tmp_path, robot=mixed)).config)
+    pose = compute_start_pose(load_scenario(write_scenario_files(tmp_path, robot=mixed)).config)
     assert pose.angles_rad[0::2].tolist() == [0.0, 0.0, 0.0]
     assert np.abs(pose.angles_rad[1::2]).min() > 0
 
 
 def test_off_the_route_the_snake_lies_straight_where_told() -> None:
-    config = run_config(start={"on_route": False, "position_m": [1.0, 2.0], "yaw_rad": 0.5})
-    pose = find_start_pose(config)
+    config = make_run_config(start={"on_route": False, "position_m": [1.0, 2.0], "yaw_rad": 0.5})
+    pose = compute_start_pose(config)
     assert pose.position_w == (1.0, 2.0)
     assert pose.yaw_rad == 0.5
     assert not pose.angles_rad.any()
-    capsules = capsules_at_start(config)
+    capsules = make_start_capsules(config)
     assert len(capsules) == 4
     assert capsules[0].rear_m == (1.0, 2.0)
     assert capsules[-1].front_m == pytest.approx((1.0 + 0.3 * np.cos(0.5), 2.0 + 0.3 * np.sin(0.5)))
@@ -322,11 +332,14 @@ def test_off_the_route_the_snake_lies_straight_where_told() -> None:
 def test_random_fields_stay_clear_of_the_start() -> None:
     field = {"seed": 1, "min_corner_m": [-0.3, -0.3], "max_corner_m": [0.7, 0.3], "density_per_m2": 30.0}
     field |= {"radius_m": [0.02, 0.03], "clearance_m": 0.01}
-    config = run_config(scene__random_field=[field])
+    config = make_run_config(scene__random_field=[field])
     placed = place_obstacles(config)
     assert len(placed) == 18
-    snake = capsules_at_start(config)
+    snake = make_start_capsules(config)
     rears, fronts = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
     links = Outlines.from_segments(rears, fronts, snake[0].radius_m)
     for item in placed:
-        assert links.distance_m(np.array(item.obstacle.position_w[:2])).min() - item.obstacle.radius_m >= 0.01 - 1e-9
+        assert (
+            links.compute_distances_m(np.array(item.obstacle.position_w[:2])).min() - item.obstacle.radius_m
+            >= 0.01 - 1e-9
+        )

@@ -11,9 +11,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import Table, decode
-from snakesim_hal.model.outlines import Capsule, Outlines, outline_distance_m
-from snakesim_hal.model.placement import Placed, check_clear, place_scene
+from snakesim_hal.model.files import ConfigTable, decode_table
+from snakesim_hal.model.outlines import Capsule, Outlines, compute_outline_distance_m
+from snakesim_hal.model.placement import PlacedObstacle, place_scene_obstacles, validate_start_clearance
 from snakesim_hal.model.scene import SceneFile, make_route
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_testing.hal.small_robots import SCENE
@@ -37,18 +37,18 @@ LINKS = Outlines.from_segments(
 
 
 def scene(**sections: Any) -> SceneFile:
-    return decode(Table({**SCENE, **sections}, "bend.toml"), SceneFile)
+    return decode_table(ConfigTable({**SCENE, **sections}, "bend.toml"), SceneFile)
 
 
 def refused_only_if(overlaps: bool, made: SceneFile, name: str) -> None:
     """A scene with an obstacle that overlaps the snake is refused by its name, and any other one is accepted."""
     with raises_error(ConfigError, code="scene/overlap", field=name) if overlaps else nullcontext():
-        check_clear(made, place_scene(made), SNAKE)
+        validate_start_clearance(made, place_scene_obstacles(made), SNAKE)
 
 
-def place_one(**sections: Any) -> Placed:
+def place_one(**sections: Any) -> PlacedObstacle:
     """Return the only obstacle of a scene with these sections."""
-    (placed,) = place_scene(scene(**sections))
+    (placed,) = place_scene_obstacles(scene(**sections))
     return placed
 
 
@@ -57,7 +57,7 @@ def test_scene_cylinder_stands_on_ground_with_its_name_and_friction() -> None:
         cylinder=[{"position_m": [1, 2], "radius_m": 0.1, "height_m": 0.4, "friction": 0.3, "name": "post"}]
     )
     center_height_m = 0.4 / 2
-    assert placed == Placed(
+    assert placed == PlacedObstacle(
         obstacle=Obstacle(
             name="post", shape="cylinder", position_w=(1, 2, center_height_m), radius_m=0.1, height_m=0.4
         ),
@@ -98,14 +98,16 @@ def test_scene_step_alone_is_walkable() -> None:
 def test_scene_row_material_applies_to_all_and_keeps_places() -> None:
     made = {"friction": 0.1, "mass_kg": 2.0, "base_friction": 0.5}
     row = {"corridor_m": 0.06, "radius_m": 0.05, "count": 3}
-    plain = place_scene(scene(route=SINE, pegs_along_route=[row], random_field=[FIELD]))
+    plain = place_scene_obstacles(scene(route=SINE, pegs_along_route=[row], random_field=[FIELD]))
     leaning = {**FIELD, **made, "lean_up_to_rad": 0.2}
-    loose = place_scene(scene(route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning]))
+    loose = place_scene_obstacles(
+        scene(route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning])
+    )
     assert [item.obstacle for item in loose] == [item.obstacle for item in plain]
-    assert {(item.friction, item.slides_at_n) for item in plain} == {(0.2, None)}
-    assert {(item.friction, item.slides_at_n) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
-    assert not any(item.yields for item in plain)
-    assert all(item.yields for item in loose)
+    assert {(item.friction, item.sliding_force_n) for item in plain} == {(0.2, None)}
+    assert {(item.friction, item.sliding_force_n) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
+    assert not any(item.can_move for item in plain)
+    assert all(item.can_move for item in loose)
     assert [item.lean_rad for item in loose[:3]] == [0.3] * 3
     leans = np.array([(item.lean_rad, item.lean_towards_rad) for item in loose[3:]])
     assert len(set(leans[:, 0])) == len(leans)
@@ -139,27 +141,29 @@ def test_scene_pegs_stand_at_distance_on_the_forward_pushing_side(
     made = scene(route={**SINE, "amplitude_m": amplitude_m}, pegs_along_route=[row])
     route = make_route(made)
     assert route is not None
-    pegs = [item.obstacle for item in place_scene(made)]
+    pegs = [item.obstacle for item in place_scene_obstacles(made)]
     assert [peg.name for peg in pegs] == [f"peg_0_{first + k}" for k in range(count)]
-    spots = route.inflections_s_m()[first:]
+    spots = route.find_inflections_s_m()[first:]
     for k, peg in enumerate(pegs):
-        center, foot = np.array(peg.position_w[:2]), route.position_w(spots[k])
+        center, foot = np.array(peg.position_w[:2]), route.compute_positions_w(spots[k])
         push = (foot - center) / np.linalg.norm(foot - center)  # from the peg onto the body
         assert np.linalg.norm(foot - center) - radius_m == pytest.approx(corridor_m)
         assert push @ route.tangent_w(spots[k]) == pytest.approx(0.0, abs=1e-6)
         assert push[0] > 0  # the route runs along x
-    sides = [math.copysign(1, peg.position_w[1] - route.point_at(s)[1]) for peg, s in zip(pegs, spots, strict=False)]
+    sides = [
+        math.copysign(1, peg.position_w[1] - route.compute_point(s)[1]) for peg, s in zip(pegs, spots, strict=False)
+    ]
     assert all(a == -b for a, b in itertools.pairwise(sides))
 
 
 def test_too_many_pegs_and_pegs_without_a_route_are_refused() -> None:
     row = {"corridor_m": 0.05, "radius_m": 0.05}
     with raises_error(ConfigError, code="scene/invalid", field=("pegs_along_route.0", "count"), value=12):
-        place_scene(scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}]))
+        place_scene_obstacles(scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}]))
     with raises_error(ConfigError, code="scene/no-route", field="pegs_along_route.0"):
-        place_scene(scene(pegs_along_route=[{**row, "count": 1}]))
+        place_scene_obstacles(scene(pegs_along_route=[{**row, "count": 1}]))
     with raises_error(ConfigError, code="scene/invalid"):
-        place_scene(scene(route=SINE, pegs_along_route=[{**row, "count": 1, "first": 50}]))
+        place_scene_obstacles(scene(route=SINE, pegs_along_route=[{**row, "count": 1, "first": 50}]))
 
 
 # --- random fields ---------------------------------------------------------------------------------------------
@@ -173,7 +177,7 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
     made = scene(route=SINE, cylinder=[post], random_field=[field])
     route = make_route(made)
     assert route is not None
-    pegs = [item.obstacle for item in place_scene(made, SNAKE)]
+    pegs = [item.obstacle for item in place_scene_obstacles(made, SNAKE)]
     placed = pegs[1:]
     assert len(placed) == round(5.0 * 4.0)
     for i, peg in enumerate(placed):
@@ -182,9 +186,9 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
         assert -1e-9 <= center[0] <= 2
         assert -1 <= center[1] <= 1
         for other in [pegs[0], *placed[:i]]:
-            assert outline_distance_m(other, center) - peg.radius_m >= clearance_m - 1e-9
-        assert LINKS.distance_m(center).min() - peg.radius_m >= clearance_m - 1e-9
-        dense = route.position_w(np.linspace(0, route.length_m, 2000))
+            assert compute_outline_distance_m(other, center) - peg.radius_m >= clearance_m - 1e-9
+        assert LINKS.compute_distances_m(center).min() - peg.radius_m >= clearance_m - 1e-9
+        dense = route.compute_positions_w(np.linspace(0, route.length_m, 2000))
         assert np.hypot(*(dense - center).T).min() - peg.radius_m >= route_clearance_m - 1e-5
 
 
@@ -193,7 +197,7 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
 @settings(max_examples=4)
 def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
     field = {**FIELD, "seed": seed, "density_per_m2": 8.0, "box_fraction": 0.6, "clearance_m": 0.1}
-    placed = [item.obstacle for item in place_scene(scene(random_field=[field]), SNAKE)]
+    placed = [item.obstacle for item in place_scene_obstacles(scene(random_field=[field]), SNAKE)]
     assert {o.shape for o in placed} == {"cylinder", "box"}
     around = np.linspace(-1.0, 1.0, 41)
     square = np.concatenate([[(x, y), (y, x)] for x in around for y in (-1.0, 1.0)])
@@ -205,15 +209,17 @@ def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
             rim = square * one.half_size_m[:2] @ np.array([[c, s], [-s, c]])
             assert all(0.06 <= 2 * half <= 0.18 for half in one.half_size_m[:2])
         for point in np.array(one.position_w[:2]) + rim:
-            assert min((outline_distance_m(o, point) for o in placed if o is not one), default=1.0) >= 0.1 - 1e-9
-            assert LINKS.distance_m(point).min() >= 0.1 - 1e-9
+            assert (
+                min((compute_outline_distance_m(o, point) for o in placed if o is not one), default=1.0) >= 0.1 - 1e-9
+            )
+            assert LINKS.compute_distances_m(point).min() >= 0.1 - 1e-9
 
 
 def test_scene_random_pegs_depend_only_on_their_seed() -> None:
-    first, again = (place_scene(scene(random_field=[FIELD])) for _ in range(2))
+    first, again = (place_scene_obstacles(scene(random_field=[FIELD])) for _ in range(2))
     assert first == again
-    assert place_scene(scene(random_field=[{**FIELD, "seed": 8}])) != first
-    two = place_scene(scene(random_field=[FIELD, {**FIELD, "min_corner_m": [3, -1], "max_corner_m": [5, 1]}]))
+    assert place_scene_obstacles(scene(random_field=[{**FIELD, "seed": 8}])) != first
+    two = place_scene_obstacles(scene(random_field=[FIELD, {**FIELD, "min_corner_m": [3, -1], "max_corner_m": [5, 1]}]))
     assert two[: len(first)] == first  # a second field does not stir the first
     assert {peg.obstacle.name for peg in two[len(first) :]} == {f"random_1_{k}" for k in range(20)}
     assert [p.obstacle.radius_m for p in two[len(first) :]] != [p.obstacle.radius_m for p in first]
@@ -225,14 +231,16 @@ def test_scene_random_pegs_depend_only_on_their_seed() -> None:
 def test_two_obstacles_with_one_name_are_refused() -> None:
     post = {"position_m": [1, 2], "radius_m": 0.1, "name": "post"}
     with raises_error(ConfigError, code="config/duplicate-name", field="plain"):
-        place_scene(scene(cylinder=[post, {**post, "position_m": [2, 2]}]))
+        place_scene_obstacles(scene(cylinder=[post, {**post, "position_m": [2, 2]}]))
     with raises_error(ConfigError, code="config/duplicate-name", field="box_0"):
-        place_scene(scene(cylinder=[{**post, "name": "box_0"}], box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}]))
+        place_scene_obstacles(
+            scene(cylinder=[{**post, "name": "box_0"}], box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}])
+        )
 
 
 def test_scene_zero_length_wall_and_equal_route_points_are_refused() -> None:
     with raises_error(ConfigError, code="scene/invalid", field="wall.0"):
-        place_scene(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
+        place_scene_obstacles(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
     with raises_error(ConfigError, code="scene/invalid", field="route.points_m"):
         make_route(scene(route={"kind": "waypoints", "points_m": [[0, 0], [0, 0]]}))
 
@@ -251,22 +259,22 @@ def test_a_peg_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float,
 @given(x=st.floats(-0.5, 1.1), y=st.floats(-0.5, 0.5), yaw_rad=st.floats(-3, 3))
 def test_a_block_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float, yaw_rad: float) -> None:
     made = scene(box=[{"position_m": [x, y], "size_m": [0.3, 0.1, 0.2], "yaw_rad": yaw_rad}])
-    (block,) = place_scene(made)
+    (block,) = place_scene_obstacles(made)
     line = np.column_stack([np.linspace(0, 0.6, 1200), np.zeros(1200)])
-    gap = min(outline_distance_m(block.obstacle, point) for point in line) - 0.04
+    gap = min(compute_outline_distance_m(block.obstacle, point) for point in line) - 0.04
     assume(abs(gap) > 2e-3)
     refused_only_if(gap < 0, made, "box_0")
 
 
 def test_a_snake_may_start_on_a_step() -> None:
     made = scene(step=[{"position_m": [0.3, 0], "size_m": [2, 1], "height_m": 0.02}])
-    check_clear(made, place_scene(made), SNAKE)
+    validate_start_clearance(made, place_scene_obstacles(made), SNAKE)
 
 
 def test_distances_to_outlines() -> None:
     peg = Obstacle(name="p", shape="cylinder", position_w=(1, 0, 0), radius_m=0.2)
-    assert outline_distance_m(peg, np.array([2.0, 0.0])) == pytest.approx(0.8)
+    assert compute_outline_distance_m(peg, np.array([2.0, 0.0])) == pytest.approx(0.8)
     block = Obstacle(name="b", shape="box", position_w=(0, 0, 0), yaw_rad=math.pi / 2, half_size_m=(2, 1, 1))
-    assert outline_distance_m(block, np.array([0.0, 3.0])) == pytest.approx(1.0)
-    assert outline_distance_m(block, np.array([4.0, 6.0])) == pytest.approx(5.0)
-    assert outline_distance_m(block, np.array([0.5, 0.0])) == pytest.approx(-0.5)
+    assert compute_outline_distance_m(block, np.array([0.0, 3.0])) == pytest.approx(1.0)
+    assert compute_outline_distance_m(block, np.array([4.0, 6.0])) == pytest.approx(5.0)
+    assert compute_outline_distance_m(block, np.array([0.5, 0.0])) == pytest.approx(-0.5)

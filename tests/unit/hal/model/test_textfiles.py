@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import Table, find_file, read_table
-from snakesim_hal.model.scenario import load, parse_set
-from snakesim_hal.model.textfiles import MAX_DEPTH, MAX_TOML, parse_toml, read_text, write_text
+from snakesim_hal.model.files import ConfigTable, read_table, resolve_file_path
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_hal.model.textfiles import MAX_DEPTH, MAX_TOML_CHARACTERS, parse_toml, read_text, write_text
 from snakesim_hal.network.router import open_router
 from snakesim_testing.messages import raises_error
 
@@ -59,7 +59,7 @@ def test_an_odd_file_is_one_clear_line_at_once(odd: str, tmp_path: Path, monkeyp
     ODD[odd](path)
     started = time.monotonic()
     with raises_error(ConfigError, code=("file/invalid-syntax", "file/not-readable", "file/too-large")) as caught:
-        load(str(path))
+        load_scenario(str(path))
     assert time.monotonic() - started < LIMIT_S
     assert str(caught.value).startswith(f"{path}: "), caught.value
     assert len(caught.value.lines) == 1
@@ -78,11 +78,13 @@ def test_a_deep_json_file_is_refused(depth: int, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_text_file_of_maximum_size_is_read_in_bounded_time(tmp_path: Path) -> None:
     key = ".".join("k" * (MAX_DEPTH - 1))
-    text = "".join(f"a{i}.{key} = 1\n" for i in range(80_000))[: MAX_TOML - 10]
+    text = "".join(f"a{i}.{key} = 1\n" for i in range(80_000))[: MAX_TOML_CHARACTERS - 10]
     (tmp_path / "large.toml").write_text(text[: text.rindex("\n")])
     started = time.monotonic()
     with raises_error(ConfigError, code="config/unknown-key", stored=False):
-        load(str(tmp_path / "large.toml"), [parse_set("robot=planar13"), parse_set("scene=triplet")])
+        load_scenario(
+            str(tmp_path / "large.toml"), [parse_set_option("robot=planar13"), parse_set_option("scene=triplet")]
+        )
     assert time.monotonic() - started < 3 * LIMIT_S
 
 
@@ -95,7 +97,7 @@ def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [f"{DEEP}=1", f"robot={{{DEEP}=1}}", "rate_hz=" + "[" * 50_000, "x" * 200_000])
 def test_a_flag_of_any_length_is_one_short_line(text: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        load("triplet", [parse_set(text)])
+        load_scenario("triplet", [parse_set_option(text)])
     assert len(str(caught.value)) < 1000
     assert "\n" not in str(caught.value)
 
@@ -103,11 +105,11 @@ def test_a_flag_of_any_length_is_one_short_line(text: str) -> None:
 def test_names_that_no_file_has() -> None:
     for name in ("a\0b.toml", "x" * 5000 + ".toml", "~nobody-of-this-name/x.toml"):
         with pytest.raises(ConfigError):
-            read_text(find_file(name, "scenarios"))
+            read_text(resolve_file_path(name, "scenarios"))
     with raises_error(ConfigError, code="config/unknown-name"):
-        find_file("x" * 5000, "scenarios")
+        resolve_file_path("x" * 5000, "scenarios")
     with raises_error(ConfigError, code="config/unknown-key"):
-        Table({"a": [1]}, "x").set_value("a.²", 1, "--set")
+        ConfigTable({"a": [1]}, "x").set_value("a.²", 1, "--set")
 
 
 def test_a_router_file_that_would_overflow_zenoh(tmp_path: Path) -> None:

@@ -6,71 +6,71 @@ import numpy as np
 import pytest
 
 from snakesim_hal.physics.thermal import HeatLimits, Thermal
-from snakesim_testing.hal.small_robots import robot_file
+from snakesim_testing.hal.small_robots import make_robot_file
 
 LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 
 
 def windings(count: int = 1, **exceptions: Any) -> Thermal:
-    robot = robot_file(chain__modules=count, limits__torque_nm=4.0, joints={"joint_1": exceptions})
+    robot = make_robot_file(chain__modules=count, limits__torque_nm=4.0, joints={"joint_1": exceptions})
     return Thermal(robot.joint_table)
 
 
 def test_thermal_half_rated_torque_settles_at_80_degrees() -> None:
     heat = windings()
-    heat.pass_time(3600.0, np.array([2.0**2]))
-    assert heat.winding_c[0] == pytest.approx(80.0)
-    assert heat.remaining_fraction() is None
+    heat.advance_temperatures(3600.0, np.array([2.0**2]))
+    assert heat.winding_temperature_c[0] == pytest.approx(80.0)
+    assert heat.compute_remaining_fractions() is None
 
 
 def test_it_is_exact_whatever_the_step() -> None:
     fine, coarse = windings(), windings()
     for _ in range(1000):
-        fine.pass_time(0.01, np.array([9.0]))
-    coarse.pass_time(10.0, np.array([9.0]))
-    assert fine.winding_c == pytest.approx(coarse.winding_c)
-    assert coarse.winding_c[0] == pytest.approx(20 + 240 * 9 / 16 * (1 - np.exp(-10 / 60)))
+        fine.advance_temperatures(0.01, np.array([9.0]))
+    coarse.advance_temperatures(10.0, np.array([9.0]))
+    assert fine.winding_temperature_c == pytest.approx(coarse.winding_temperature_c)
+    assert coarse.winding_temperature_c[0] == pytest.approx(20 + 240 * 9 / 16 * (1 - np.exp(-10 / 60)))
 
 
 def test_thermal_share_is_reported_while_hot_and_once_after_cooling() -> None:
     heat = windings(2)
     for celsius, reported in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
-        heat.winding_c[1] = celsius
-        share = heat.remaining_fraction()
+        heat.winding_temperature_c[1] = celsius
+        share = heat.compute_remaining_fractions()
         assert (share is not None) is reported
-        assert share is None or share.tolist() == pytest.approx([1.0, LIMITS.remaining_fraction(celsius)])
+        assert share is None or share.tolist() == pytest.approx([1.0, LIMITS.compute_remaining_fraction(celsius)])
 
 
 def test_a_motor_at_stall_fades_and_never_overheats() -> None:
     heat = windings()
     shares: list[float] = []
     for _ in range(60_000):
-        shares.append(LIMITS.remaining_fraction(float(heat.winding_c[0])))
-        heat.pass_time(0.01, np.array([(4.0 * shares[-1]) ** 2]))
+        shares.append(LIMITS.compute_remaining_fraction(float(heat.winding_temperature_c[0])))
+        heat.advance_temperatures(0.01, np.array([(4.0 * shares[-1]) ** 2]))
     assert np.abs(np.diff(shares)).max() < 0.01
-    assert heat.winding_c[0] < LIMITS.stop_at_c - 5
+    assert heat.winding_temperature_c[0] < LIMITS.stop_at_c - 5
     assert shares[-1] < 0.8
 
 
 def test_injected_heat_stays_only_while_it_is_held() -> None:
     heat = windings(2)
-    heat.inject(0, heat=True, hold=False)
-    heat.inject(1, heat=True, hold=True)
-    assert heat.winding_c.tolist() == [110.0, 110.0], "5 K above where the robot stops"
-    heat.pass_time(30.0, np.zeros(2))
-    assert heat.winding_c[0] < 80
-    assert heat.winding_c[1] == 110.0
-    heat.inject(1, heat=False, hold=False)
-    assert heat.winding_c[1] == 110.0, "it cools from there"
-    heat.pass_time(30.0, np.zeros(2))
-    assert heat.winding_c[1] < 80
+    heat.inject_heat(0, heat=True, hold=False)
+    heat.inject_heat(1, heat=True, hold=True)
+    assert heat.winding_temperature_c.tolist() == [110.0, 110.0], "5 K above where the robot stops"
+    heat.advance_temperatures(30.0, np.zeros(2))
+    assert heat.winding_temperature_c[0] < 80
+    assert heat.winding_temperature_c[1] == 110.0
+    heat.inject_heat(1, heat=False, hold=False)
+    assert heat.winding_temperature_c[1] == 110.0, "it cools from there"
+    heat.advance_temperatures(30.0, np.zeros(2))
+    assert heat.winding_temperature_c[1] < 80
 
 
 def test_a_warm_module_at_work_takes_more_from_its_supply() -> None:
     heat = windings(4)
-    heat.winding_c[1] = 80.0
-    assert heat.board_c() == pytest.approx([20.0, 38.0, 20.0, 20.0])
-    watts = heat.power_w(np.array([0.0, 4.0, 2.0, -2.0]), np.array([5.0, 0.0, 3.0, 3.0]))
+    heat.winding_temperature_c[1] = 80.0
+    assert heat.compute_board_temperatures_c() == pytest.approx([20.0, 38.0, 20.0, 20.0])
+    watts = heat.compute_power_w(np.array([0.0, 4.0, 2.0, -2.0]), np.array([5.0, 0.0, 3.0, 3.0]))
     assert watts == pytest.approx([0.0, 48.0, 18.0, 6.0])
 
 
@@ -78,9 +78,9 @@ def test_one_motor_may_warm_up_otherwise_than_the_others() -> None:
     heat = windings(
         2, rated_nm=2.0, rise_at_rated_k=100.0, time_constant_s=30.0, derate_from_c=50.0, board_fraction=0.5
     )
-    heat.pass_time(30.0, np.array([4.0, 4.0]))
-    assert heat.winding_c == pytest.approx([20 + 100 * (1 - np.exp(-1)), 20 + 60 * (1 - np.exp(-0.5))])
-    share = heat.remaining_fraction()
+    heat.advance_temperatures(30.0, np.array([4.0, 4.0]))
+    assert heat.winding_temperature_c == pytest.approx([20 + 100 * (1 - np.exp(-1)), 20 + 60 * (1 - np.exp(-0.5))])
+    share = heat.compute_remaining_fractions()
     assert share is not None and share[0] < 1.0 and share[1] == 1.0, "each by its own limits"
-    assert (heat.board_c() - 20) / (heat.winding_c - 20) == pytest.approx([0.5, 0.3])
-    assert heat.power_w(np.array([2.0, 2.0]), np.zeros(2)) == pytest.approx([48.0, 12.0])
+    assert (heat.compute_board_temperatures_c() - 20) / (heat.winding_temperature_c - 20) == pytest.approx([0.5, 0.3])
+    assert heat.compute_power_w(np.array([2.0, 2.0]), np.zeros(2)) == pytest.approx([48.0, 12.0])

@@ -11,23 +11,23 @@ import pytest
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_box
-from snakesim_hal.safety.authority import TickDecision
+from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Mode
-from snakesim_testing.hal.small_robots import contact, description, pose, state
+from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_link_contact, make_pose
 from snakesim_testing.messages import raises_error
 
-ROBOT = description()
+ROBOT = make_description()
 
 
-def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> TickDecision:
-    return TickDecision(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
+def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> TickOutput:
+    return TickOutput(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
 
 
-def digest(*rows: tuple[int, TickDecision], angle: float = 0.0) -> str:
+def digest(*rows: tuple[int, TickOutput], angle: float = 0.0) -> str:
     box = BlackBox(ROBOT)
     for tick, reported in rows:
-        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, angle)), reported)
+        box.record_tick(tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, angle)), reported)
     return box.command_digest
 
 
@@ -38,7 +38,7 @@ def all_rows(box: BlackBox) -> dict[str, Any]:
     while taken:
         rows += taken
         row, taken = box.read_rows(row + len(taken) // box.layout.row_bytes)
-    return box.layout.arrays(bytes(rows))
+    return box.layout.decode_rows(bytes(rows))
 
 
 LONG_RUN_TICKS = 9000  # several times what `read_rows` returns at once
@@ -54,20 +54,24 @@ def long_run() -> BlackBox:
     for tick in range(LONG_RUN_TICKS):
         others: dict[str, Any] = {}
         if tick == FIRST_POSE_TICK:
-            others[keys.POSE] = pose(tick, position_w=(1.0, 2.0, 3.0))
+            others[keys.POSE] = make_pose(tick, position_w=(1.0, 2.0, 3.0))
         if tick == TOUCH_TICK:
-            touches = [contact(obstacle="a", force_l=(3.0, 4.0, 0.0)), contact(obstacle="a"), contact(obstacle="b")]
+            touches = [
+                make_link_contact(obstacle="a", force_l=(3.0, 4.0, 0.0)),
+                make_link_contact(obstacle="a"),
+                make_link_contact(obstacle="b"),
+            ]
             others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=touches)
         if tick == RELEASE_TICK:
             others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=[])
-        joints = state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
-        box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
+        joints = make_joint_state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
+        box.record_tick(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
     return box
 
 
 def test_black_box_of_long_run_has_every_tick(long_run: BlackBox) -> None:
     columns = all_rows(long_run)
-    assert long_run.ticks == LONG_RUN_TICKS
+    assert long_run.row_count == LONG_RUN_TICKS
     assert all(len(column) == LONG_RUN_TICKS for column in columns.values())
     assert columns["time_s"] == pytest.approx(0.01 * np.arange(LONG_RUN_TICKS))
 
@@ -122,7 +126,7 @@ def test_black_box_digest_depends_only_on_commands() -> None:
 
 
 def on_disk(box: BlackBox, path: Path, torn: int = 0) -> Path:
-    content = box.layout.header() + box.read_rows(0)[1]
+    content = box.layout.encode_header() + box.read_rows(0)[1]
     path.write_bytes(content[: len(content) - torn])
     return path
 
@@ -131,7 +135,7 @@ def on_disk(box: BlackBox, path: Path, torn: int = 0) -> Path:
 def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int) -> None:
     box = BlackBox(ROBOT)
     for tick in range(5):
-        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, 0.3 * tick)), decision())
+        box.record_tick(tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.3 * tick)), decision())
     layout, columns = read_black_box(on_disk(box, tmp_path / "box", torn))
     assert layout.robot == "worm"
     assert layout.joints == ["joint_1", "joint_2", "joint_3"]
@@ -155,10 +159,10 @@ def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:
         b"",
         b"\0" * 100,
         b"{}\n",
-        BlackBox(ROBOT).layout.header()[:-50],
-        BlackBox(ROBOT).layout.header().replace(b'"row_bytes":', b'"row_bytes":1'),
-        BlackBox(ROBOT).layout.header().replace(b"<f8", b"<O8"),
-        BlackBox(ROBOT).layout.header().replace(b"blackbox/1", b"blackbox/2"),
+        BlackBox(ROBOT).layout.encode_header()[:-50],
+        BlackBox(ROBOT).layout.encode_header().replace(b'"row_bytes":', b'"row_bytes":1'),
+        BlackBox(ROBOT).layout.encode_header().replace(b"<f8", b"<O8"),
+        BlackBox(ROBOT).layout.encode_header().replace(b"blackbox/1", b"blackbox/2"),
         b"[" * 3_000_000,
     ],
 )
@@ -177,12 +181,12 @@ def test_what_is_no_box_is_named(tmp_path: Path, content: bytes) -> None:
 def test_when_nobody_takes_them_the_newest_rows_are_kept() -> None:
     box = BlackBox(ROBOT, memory_bytes=10 * BlackBox(ROBOT).layout.row_bytes)
     for tick in range(25):
-        box.record(tick, tick, Samples(state(ROBOT, 0.001 * tick)), decision())
+        box.record_tick(tick, tick, Samples(make_joint_state(ROBOT, 0.001 * tick)), decision())
     first, rows = box.read_rows(3)
     assert first == 16
     assert all_rows(box)["tick"].tolist() == list(range(16, 25))
-    assert box.ticks == 25
-    assert box.layout.arrays(rows)["angle_rad"][:, 1] == pytest.approx([0.001 * tick for tick in range(16, 20)])
+    assert box.row_count == 25
+    assert box.layout.decode_rows(rows)["angle_rad"][:, 1] == pytest.approx([0.001 * tick for tick in range(16, 20)])
     assert box.command_digest == digest(*((tick, decision()) for tick in range(25)))  # of all, kept or not
 
 
@@ -195,7 +199,7 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
         row = 0
         while not over.is_set():
             first, rows = box.read_rows(row)
-            columns = box.layout.arrays(rows)
+            columns = box.layout.decode_rows(rows)
             same = columns["angle_rad"][:, 0] == columns["tick"]
             torn.extend(columns["tick"][~same].tolist())
             if len(rows) and columns["tick"][0] != first:
@@ -205,24 +209,27 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
     thread = threading.Thread(target=take)
     thread.start()
     for tick in range(count):
-        box.record(tick, tick, Samples(state(ROBOT, float(tick))), decision())
+        box.record_tick(tick, tick, Samples(make_joint_state(ROBOT, float(tick))), decision())
     over.set()
     thread.join(10)
     assert torn == []
 
 
 def test_black_box_tick_has_constant_cost_and_memory() -> None:
-    robot = description(chain__modules=100)
-    box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
-    reported = TickDecision(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    robot = make_description(chain__modules=100)
+    box, row = (
+        BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes),
+        Samples(make_joint_state(robot, 0.1)),
+    )
+    reported = TickOutput(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
     for tick in range(300):
-        box.record(tick, tick, row, reported)
+        box.record_tick(tick, tick, row, reported)
     peaks = [0] * 700
     tracemalloc.start()
     before = tracemalloc.get_traced_memory()[0]
     for i in range(len(peaks)):
         tracemalloc.reset_peak()
-        box.record(300 + i, i, row, reported)
+        box.record_tick(300 + i, i, row, reported)
         peaks[i] = tracemalloc.get_traced_memory()[1] - before - 36 * i  # the list's own numbers
     kept = tracemalloc.get_traced_memory()[0] - before - 36 * len(peaks)
     tracemalloc.stop()
@@ -232,6 +239,8 @@ def test_black_box_tick_has_constant_cost_and_memory() -> None:
 
 def test_black_box_keeps_mean_force_where_sensor_measures_it() -> None:
     box = BlackBox(ROBOT)
-    touches = Contacts(tick=0, timestamp_ns=0, contacts=[contact(force_l=(3.0, 4.0, 0.0))], measured_force_n=1.5)
-    box.record(0, 0, Samples(state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())
+    touches = Contacts(
+        tick=0, timestamp_ns=0, contacts=[make_link_contact(force_l=(3.0, 4.0, 0.0))], measured_force_n=1.5
+    )
+    box.record_tick(0, 0, Samples(make_joint_state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())
     assert all_rows(box)["contact_peak_n"].tolist() == [1.5]

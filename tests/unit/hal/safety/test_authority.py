@@ -5,8 +5,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority, TickDecision
-from snakesim_hal.safety.cables import Cables
+from snakesim_hal.safety.authority import RECENT_COMMAND_COUNT, Authority, TickOutput
+from snakesim_hal.safety.cables import CableTracker
 from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, LeaseRequest, Mode, SensorDescription
@@ -16,13 +16,13 @@ from snakesim_testing.hal.authority_rig import (
     DISARM,
     ESTOP,
     JOINTS,
-    Rig,
-    armed,
-    commanded,
-    modes,
+    AuthorityRig,
+    list_modes,
+    make_armed_rig,
+    make_commanded_rig,
     report_power,
 )
-from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, state
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, make_joint_state
 
 MAX_REASON_LENGTH = 500  # characters that the reason of an answer may have on the wire
 ARM_UNCHECKED = msgspec.structs.replace(ARM, unchecked=True)
@@ -32,7 +32,7 @@ HOT = Fault(tick=1, what="hot", cause="joint_2 is hot")
 
 
 def test_arming_unmet_conditions_are_named_until_met() -> None:
-    rig = Rig()
+    rig = AuthorityRig()
     assert rig.arm().reason == "no joint state yet; nothing commands the robot: the lease is free"
     rig.observe(0.1)
     assert rig.arm().reason == "nothing commands the robot: the lease is free"
@@ -52,10 +52,10 @@ def test_arming_unmet_conditions_are_named_until_met() -> None:
 
 
 def test_arming_stopped_robot_asks_for_reset() -> None:
-    rig = armed()
-    rig.authority.fault(HOT)
+    rig = make_armed_rig()
+    rig.authority.latch_fault(HOT)
     assert "state is fault, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
-    rig.authority.on_estop(ESTOP, rig.tick)
+    rig.authority.handle_estop_request(ESTOP, rig.tick)
     assert "state is estop, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
 
 
@@ -73,14 +73,14 @@ def test_arming_stopped_robot_asks_for_reset() -> None:
 def test_arming_request_for_another_robot_is_explained(
     request_fields: dict[str, Any], refusal: str, explanation: str
 ) -> None:
-    rig = commanded()
-    answer = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, **request_fields), rig.now_ns)
+    rig = make_commanded_rig()
+    answer = rig.authority.handle_lifecycle_request(msgspec.structs.replace(ARM, **request_fields), rig.now_ns)
     assert answer.refusal == refusal
     assert explanation in answer.reason
 
 
 def test_arming_hundred_unknown_joints_is_refused_within_message_length() -> None:
-    rig = Rig(chain__modules=100)
+    rig = AuthorityRig(chain__modules=100)
     rig.observe(0.1, valid=[False] * 100)
     assert len(rig.authority.list_unmet_conditions(0)[0]) == 400
     rig.observe(0.1)
@@ -92,31 +92,31 @@ def test_arming_hundred_unknown_joints_is_refused_within_message_length() -> Non
 @pytest.mark.parametrize("stop", ["estop", "fault", "disarm"])
 def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
     """Reset and armed again within one period, the backend would never report_power the stop."""
-    rig = armed()
+    rig = make_armed_rig()
     rig.tick_with(0.1)
     match stop:
         case "estop":
-            rig.authority.on_estop(ESTOP, rig.tick)
+            rig.authority.handle_estop_request(ESTOP, rig.tick)
         case "fault":
-            rig.authority.fault(HOT)
+            rig.authority.latch_fault(HOT)
         case _:
-            rig.authority.on_lifecycle(DISARM, rig.now_ns)
+            rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     if stop != "disarm":
         rig.pass_tick()  # the motors report_power the stop, but not yet its reset
-        rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+        rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     rig.acquire()
     rig.send(0.1)
     answer = rig.arm()
     assert answer.refusal == "not_ready"
     assert "have not received the stop" in answer.reason
-    rig.authority.decide()
+    rig.authority.compute_setpoints()
     assert rig.arm().ok
 
 
 def test_arming_for_the_first_time_waits_for_no_stop() -> None:
-    rig = Rig()
-    rig.authority.fault(HOT)
-    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig = AuthorityRig()
+    rig.authority.latch_fault(HOT)
+    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     rig.observe(0.1)
     rig.acquire()
     rig.send(0.1)
@@ -124,35 +124,35 @@ def test_arming_for_the_first_time_waits_for_no_stop() -> None:
 
 
 def test_arming_after_a_disarm_needs_a_new_command() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     rig.tick_with(0.1)
-    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.arm().reason == "no commands from control yet"
 
 
 def test_arming_after_commands_ended_is_refused_despite_renewals() -> None:
-    rig = commanded()
+    rig = make_commanded_rig()
     renewal = LeaseRequest(action="renew", holder="control", priority=100, epoch=1)
     rig.now_ns = LEASE_NS
-    assert rig.authority.on_lease(renewal, rig.now_ns).ok
+    assert rig.authority.handle_lease_request(renewal, rig.now_ns).ok
     assert rig.authority.list_unmet_conditions(rig.now_ns) == []
     rig.now_ns += 1
     assert rig.arm().reason == "no commands from control any more"
 
 
 def test_arming_unchecked_robot_needs_explicit_request() -> None:
-    rig = commanded(unchecked="nobody has checked it")
+    rig = make_commanded_rig(unchecked="nobody has checked it")
     answer = rig.arm()
     assert answer.refusal == "not_checked"
     assert "nobody has checked it; to arm it" in answer.reason
-    assert rig.authority.on_lifecycle(ARM_UNCHECKED, rig.now_ns).ok
+    assert rig.authority.handle_lifecycle_request(ARM_UNCHECKED, rig.now_ns).ok
     assert ", unchecked" in rig.authority.reason
 
 
 def test_arming_with_unknown_cable_is_refused_even_unchecked() -> None:
-    rig = commanded(unchecked="nobody has checked it", cables=Cables((), {}, {"joint_2": "unknown"}))
-    answer = rig.authority.on_lifecycle(ARM_UNCHECKED, rig.now_ns)
+    rig = make_commanded_rig(unchecked="nobody has checked it", cables=CableTracker((), {}, {"joint_2": "unknown"}))
+    answer = rig.authority.handle_lifecycle_request(ARM_UNCHECKED, rig.now_ns)
     assert answer.refusal == "cable"
     assert answer.reason == "joint_2: unknown"
 
@@ -160,7 +160,7 @@ def test_arming_with_unknown_cable_is_refused_even_unchecked() -> None:
 def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
     """Time may stand still until the robot is armed, so that no report can arrive."""
     power_sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
-    rig = Rig()
+    rig = AuthorityRig()
     rig.authority = Authority(msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power_sensor]))
     rig.observe(0.1)
     rig.acquire()
@@ -173,7 +173,7 @@ def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
 
 
 def test_command_of_another_arm_session_neither_moves_nor_renews() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     rig.tick_with(0.1, arm_session=1)
     for other_session in (0, 2, 0, 2):
         assert rig.send(0.2, arm_session=other_session) == "before_arming"
@@ -185,7 +185,7 @@ def test_command_of_another_arm_session_neither_moves_nor_renews() -> None:
 
 
 def test_command_under_way_at_arming_is_not_counted_as_rejected() -> None:
-    rig = Rig()
+    rig = AuthorityRig()
     rig.tick = 5
     rig.observe(0.1, tick=5)
     rig.acquire()
@@ -199,15 +199,15 @@ def test_command_under_way_at_arming_is_not_counted_as_rejected() -> None:
 
 
 def test_lease_without_commands_expires_with_a_fault() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     for _ in range(20):
         rig.tick_with(0.1)
     for _ in range(LEASE_NS // PERIOD_NS - 1):  # the last command remains in force for one term
-        assert rig.pass_tick().sequence == rig.sequence
+        assert rig.pass_tick().command_sequence == rig.sequence
     decision = rig.pass_tick()
     assert rig.authority.state == "fault"
-    assert decision.sequence is None
-    assert modes(decision) == {Mode.VELOCITY}
+    assert decision.command_sequence is None
+    assert list_modes(decision) == {Mode.VELOCITY}
     assert decision.setpoints.target == [0.0] * JOINTS
     (fault,) = rig.authority.faults
     assert fault.what == "lease_expired"
@@ -217,14 +217,14 @@ def test_lease_without_commands_expires_with_a_fault() -> None:
 
 
 def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     rig.tick_with(0.1)
     assert not rig.acquire("teleop").ok
     assert rig.authority.state == "armed"
     answer = rig.acquire("teleop", priority=200)
     assert answer.epoch == 2
     assert answer.lifecycle == "disarmed"
-    assert modes(rig.pass_tick()) == {Mode.PASSIVE}
+    assert list_modes(rig.pass_tick()) == {Mode.PASSIVE}
     assert rig.send(0.1, lease_epoch=1) == "wrong_epoch"
     assert rig.arm().reason == "no commands from teleop yet"
     rig.send(0.1, sequence=1)  # the sequence numbers of a new holder start anew
@@ -232,7 +232,7 @@ def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None
 
 
 def test_lease_taken_while_disarmed_forgets_the_old_commands() -> None:
-    rig = commanded()
+    rig = make_commanded_rig()
     rig.acquire("teleop", priority=200)
     assert rig.arm().reason == "no commands from teleop yet"
     assert rig.send(0.1, sequence=0) is None
@@ -240,52 +240,52 @@ def test_lease_taken_while_disarmed_forgets_the_old_commands() -> None:
 
 
 def test_holder_gone_while_armed_keeps_the_lease() -> None:
-    rig = armed()
-    rig.authority.on_holder_gone("control is gone")
+    rig = make_armed_rig()
+    rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.state == "armed"
     assert rig.authority.lease.holder == "control"
 
 
 def test_holder_gone_after_estop_frees_lease_and_keeps_reason() -> None:
-    rig = armed()
-    rig.authority.on_estop(ESTOP, rig.tick)
-    rig.authority.on_holder_gone("control is gone")
+    rig = make_armed_rig()
+    rig.authority.handle_estop_request(ESTOP, rig.tick)
+    rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.lease.holder is None
     assert "emergency stop by a person" in rig.authority.reason
-    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
-    rig.authority.on_holder_gone("control is gone")
+    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+    rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.reason == "control is gone"
 
 
 def test_decision_before_any_input_is_passive() -> None:
-    rig = Rig()
+    rig = AuthorityRig()
     assert rig.send(0.1) == "no_lease"
-    assert modes(rig.authority.decide()) == {Mode.PASSIVE}
+    assert list_modes(rig.authority.compute_setpoints()) == {Mode.PASSIVE}
 
 
 def test_decision_in_lockstep_uses_the_command_of_its_tick() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     rig.send(0.11, tick=0)
     rig.tick = 1
     rig.send(0.12, tick=1)
-    assert rig.authority.decide(0).setpoints.target == pytest.approx([0.11] * JOINTS)
-    assert rig.authority.decide(1).setpoints.target == pytest.approx([0.12] * JOINTS)
+    assert rig.authority.compute_setpoints(0).setpoints.target == pytest.approx([0.11] * JOINTS)
+    assert rig.authority.compute_setpoints(1).setpoints.target == pytest.approx([0.12] * JOINTS)
 
 
 def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
     """The pose at arming would be a jump that no limiter has limited."""
-    rig = armed()
-    decisions: list[TickDecision] = []
+    rig = make_armed_rig()
+    decisions: list[TickOutput] = []
     for tick in range(5):
         rig.tick = tick
         rig.send(0.3)
-        decisions.append(rig.authority.decide(tick))
+        decisions.append(rig.authority.compute_setpoints(tick))
     before = decisions[-1]
     rig.tick = 5
-    for _ in range(COMMANDS_KEPT + 1):
+    for _ in range(RECENT_COMMAND_COUNT + 1):
         rig.send(0.1)
-    after = rig.authority.decide(4)
-    assert after.sequence == before.sequence
+    after = rig.authority.compute_setpoints(4)
+    assert after.command_sequence == before.command_sequence
     assert after.setpoints.target == pytest.approx([0.3] * JOINTS)
 
 
@@ -293,15 +293,15 @@ def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
 
 
 def test_estop_stays_until_reset_and_arming() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     rig.tick_with(0.2)
-    assert rig.authority.on_estop(ESTOP, rig.tick).ok
+    assert rig.authority.handle_estop_request(ESTOP, rig.tick).ok
     for _ in range(3):
-        assert modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
+        assert list_modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
     assert not rig.arm().ok
-    assert not rig.authority.on_lifecycle(DISARM, rig.now_ns).ok
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
-    assert modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
+    assert not rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
+    assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
+    assert list_modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
     assert rig.arm().ok
     assert rig.pass_tick().setpoints.target == [0.1] * JOINTS  # resumes from the measured pose
 
@@ -311,21 +311,21 @@ def test_estop_stays_until_reset_and_arming() -> None:
     [("passive", Mode.PASSIVE, 0.0), ("damp", Mode.VELOCITY, 0.0), ("hold", Mode.POSITION, 0.4)],
 )
 def test_fault_starts_the_stop_mode_of_the_robot(stop_mode: str, mode: Mode, target: float) -> None:
-    rig = armed(safety__action=stop_mode)
+    rig = make_armed_rig(safety__action=stop_mode)
     rig.observe(0.4)
-    rig.authority.fault(HOT)
+    rig.authority.latch_fault(HOT)
     for angle_rad in (0.4, 0.6, 0.9):  # later motion of the joint does not change the pose that is held
         rig.observe(angle_rad)
         decision = rig.pass_tick()
-        assert modes(decision) == {mode}
+        assert list_modes(decision) == {mode}
         assert decision.setpoints.target == [target] * JOINTS
 
 
 def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
     """From 1 rad/s at 50 rad/s² the joint is at rest after two periods of 10 ms."""
-    rig = armed(joints={"joint_2": {"modes": ["position"]}}, limits__acceleration_rad_s2=50.0)
+    rig = make_armed_rig(joints={"joint_2": {"modes": ["position"]}}, limits__acceleration_rad_s2=50.0)
     rig.observe(0.1, 1.0)
-    rig.authority.fault(HOT)
+    rig.authority.latch_fault(HOT)
     braking = rig.pass_tick().setpoints
     assert braking.mode == [Mode.VELOCITY, Mode.POSITION, Mode.VELOCITY]
     assert 0.1 < braking.target[1] < 0.2
@@ -335,9 +335,9 @@ def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
 
 
 def test_fault_after_the_first_does_not_replace_the_reason() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     for what in ("bus_off", *["watchdog"] * 40):
-        rig.authority.fault(Fault(tick=1, what=what, cause=f"because of {what}"))
+        rig.authority.latch_fault(Fault(tick=1, what=what, cause=f"because of {what}"))
     assert rig.authority.reason == "because of bus_off"
     assert rig.authority.faults[0].cause == "because of bus_off"
     assert rig.authority.faults[1].cause == "because of watchdog"
@@ -345,46 +345,46 @@ def test_fault_after_the_first_does_not_replace_the_reason() -> None:
 
 @pytest.mark.parametrize("stop", ["fault", "estop"])
 def test_faults_of_a_full_log_include_the_first_stop(stop: str) -> None:
-    rig = armed()
+    rig = make_armed_rig()
     for tick in range(16):
-        rig.authority.record_fault(Fault(tick=tick, what="late", cause="late"))
+        rig.authority.log_fault(Fault(tick=tick, what="late", cause="late"))
     match stop:
         case "fault":
-            rig.authority.fault(Fault(tick=16, what="hot", cause="hot"))
+            rig.authority.latch_fault(Fault(tick=16, what="hot", cause="hot"))
         case _:
-            rig.authority.on_estop(ESTOP, 16)
-            rig.authority.on_estop(ESTOP, 17)
-    rig.authority.fault(Fault(tick=18, what="hot", cause="hot"))
+            rig.authority.handle_estop_request(ESTOP, 16)
+            rig.authority.handle_estop_request(ESTOP, 17)
+    rig.authority.latch_fault(Fault(tick=18, what="hot", cause="hot"))
     for tick in range(19, 60):
-        rig.authority.fault(Fault(tick=tick, what="late", cause="late", reach="none"))
+        rig.authority.latch_fault(Fault(tick=tick, what="late", cause="late", reach="none"))
     for tick in range(60, 100):
-        rig.authority.record_fault(Fault(tick=tick, what="late", cause="late"))
+        rig.authority.log_fault(Fault(tick=tick, what="late", cause="late"))
     assert [fault.tick for fault in rig.authority.faults][:17] == [*range(17)]
 
 
 def test_faults_since_start_survive_a_reset() -> None:
-    rig = armed()
-    rig.authority.fault(HOT)
-    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig = make_armed_rig()
+    rig.authority.latch_fault(HOT)
+    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     assert rig.authority.faults == []
-    assert [fault.what for fault in rig.authority.faults_since_start.stored] == ["hot"]
+    assert [fault.what for fault in rig.authority.faults_since_start.faults] == ["hot"]
 
 
 # --- heat, supply and measured states --------------------------------------------------------------------------
 
 
 def test_heat_derates_then_stops_then_blocks_arming() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     report_power(rig, [20.0, 92.5, 20.0])
     derated = rig.tick_with(0.1)
     assert derated.setpoints.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
-    assert derated.limited == {1: "thermal"}
+    assert derated.limit_by_joint == {1: "thermal"}
     assert rig.authority.derated_joints == {"joint_2": pytest.approx(0.6)}
     report_power(rig, [20.0, 110.0, 20.0])
     stopped = rig.pass_tick()
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
     assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also while stopping
-    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     rig.acquire()
     rig.tick_with(0.1)
     assert "joint_2 is at 110" in rig.arm().reason
@@ -395,11 +395,11 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
 
 
 def test_weak_supply_blocks_arming_with_one_explanation() -> None:
-    rig = Rig()
+    rig = AuthorityRig()
     for _ in range(7):
         report_power(rig, [20.0] * JOINTS, volts=12.0)
         rig.pass_tick()
-    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     answer = rig.arm()
     assert answer.refusal == "not_ready"
     assert answer.reason.count("12.0 V") == 1
@@ -407,15 +407,17 @@ def test_weak_supply_blocks_arming_with_one_explanation() -> None:
 
 
 def test_joint_angle_after_a_host_pause_may_be_far() -> None:
-    rig = armed()
-    rig.authority.observe(state(rig.robot, 0.9, timestamp_ns=rig.timestamp_ns), rig.timestamp_ns + 10**9)
+    rig = make_armed_rig()
+    rig.authority.observe_joints(
+        make_joint_state(rig.robot, 0.9, timestamp_ns=rig.timestamp_ns), rig.timestamp_ns + 10**9
+    )
     rig.pass_tick()
     assert rig.authority.state == "armed"
 
 
 def test_joint_state_with_nan_is_published_as_last_good() -> None:
-    rig = armed()
-    published = rig.authority.replace_unreadable(state(rig.robot, [0.2, float("nan"), 0.2]))
+    rig = make_armed_rig()
+    published = rig.authority.replace_non_finite_values(make_joint_state(rig.robot, [0.2, float("nan"), 0.2]))
     assert published.angle_rad == [0.2, 0.1, 0.2]
     assert published.valid == [True, False, True]
 
@@ -424,21 +426,21 @@ def test_joint_state_with_nan_is_published_as_last_good() -> None:
 
 
 def test_reset_without_a_fault_is_refused_with_its_reason() -> None:
-    rig = armed()
-    answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig = make_armed_rig()
+    answer = rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     assert not answer.ok
     assert answer.reason == "nothing to reset in state armed"
 
 
 def test_fault_that_reaches_nothing_is_recorded_and_stops_nothing() -> None:
-    rig = armed()
-    rig.authority.fault(Fault(tick=1, what="noted", cause="a test", reach="none"))
+    rig = make_armed_rig()
+    rig.authority.latch_fault(Fault(tick=1, what="noted", cause="a test", reach="none"))
     assert rig.authority.state == "armed"
     assert [fault.what for fault in rig.authority.faults] == ["noted"]
 
 
 def test_command_with_a_sequence_number_again_is_a_replay() -> None:
-    rig = armed()
+    rig = make_armed_rig()
     assert rig.send(0.1, sequence=50) is None
     assert rig.send(0.1, sequence=50) == "replayed"
 
@@ -446,9 +448,11 @@ def test_command_with_a_sequence_number_again_is_a_replay() -> None:
 @pytest.mark.parametrize("is_armed", [False, True], ids=["disarmed", "armed"])
 def test_angles_that_never_change_are_implausible_only_while_commanded_to_move(is_armed: bool) -> None:
     """A robot that nothing commands may rest for as long as it likes."""
-    rig = armed() if is_armed else commanded()
+    rig = make_armed_rig() if is_armed else make_commanded_rig()
     for tick in range(1, 400):
         rig.tick_with(0.1 + 0.001 * tick)
-        rig.authority.observe(state(rig.robot, 0.1, tick=tick, timestamp_ns=rig.timestamp_ns + tick * PERIOD_NS))
-        rig.authority.check_deadlines(rig.now_ns, rig.tick)
+        rig.authority.observe_joints(
+            make_joint_state(rig.robot, 0.1, tick=tick, timestamp_ns=rig.timestamp_ns + tick * PERIOD_NS)
+        )
+        rig.authority.latch_faults_and_expire_lease(rig.now_ns, rig.tick)
     assert (rig.authority.state == "fault") == is_armed

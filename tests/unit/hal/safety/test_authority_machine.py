@@ -32,10 +32,17 @@ from snakesim_testing.hal.authority_model import (
     PERIOD_S,
     STOP_AT,
     WORDS,
-    Model,
-    within,
+    AuthorityModel,
+    clamp,
 )
-from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, command, description, power, state
+from snakesim_testing.hal.small_robots import (
+    LEASE_NS,
+    PERIOD_NS,
+    make_description,
+    make_joint_command,
+    make_joint_state,
+    make_power,
+)
 
 SEQUENCES = int(os.environ.get("SNAKESIM_SEQUENCES", "200"))
 PER_TEST = 200
@@ -80,7 +87,7 @@ def spoil(values: list[float], joint: int, failure: str | None) -> None:
             pass
 
 
-class Everything(Model):
+class Everything(AuthorityModel):
     """Every input of the authority as a rule. What the rules know of it by themselves is the model."""
 
     @initialize(
@@ -91,13 +98,13 @@ class Everything(Model):
         at_once=often(True, False),
     )
     def begin(self, action: str, first_epoch: int, lag: int | None, max_isolated: int, at_once: bool) -> None:
-        self.robot = description(safety__action=action, safety__max_isolated_joints=max_isolated)
+        self.robot = make_description(safety__action=action, safety__max_isolated_joints=max_isolated)
         self.max_isolated = max_isolated
         self.action = action
         self.lag = lag  # in lockstep; None: the newest command counts
-        kept, under_test.COMMANDS_KEPT = under_test.COMMANDS_KEPT, KEPT
+        kept, under_test.RECENT_COMMAND_COUNT = under_test.RECENT_COMMAND_COUNT, KEPT
         self.authority = Authority(self.robot, first_epoch=first_epoch)
-        under_test.COMMANDS_KEPT = kept
+        under_test.RECENT_COMMAND_COUNT = kept
         self.epoch = first_epoch
         if at_once:
             self.set_up_and_arm(0.1)
@@ -139,11 +146,11 @@ class Everything(Model):
             case _:
                 spoil(columns[column], joint, failure)
         when = {"tick": self.tick, "timestamp_ns": self.timestamp_ns}
-        seen = state(self.robot, *columns, valid=valid, age_ns=age_ns, **when)
-        self.authority.observe(seen)
+        seen = make_joint_state(self.robot, *columns, valid=valid, age_ns=age_ns, **when)
+        self.authority.observe_joints(seen)
         self.seen_tick = self.tick
         if failure in ("short", "long", "no_valid", "no_age"):
-            self.doubt = None
+            self.doubtful_joints = None
             return
         measured = (list(self.measured[0]), list(self.measured[1]), list(self.measured[2]))
         unknown, strayed, stuck = set[int](), set[int](), set[int]()
@@ -151,11 +158,11 @@ class Everything(Model):
             taken_s = (self.timestamp_ns - age_ns[i]) * 1e-9
             frozen = self.is_frozen(i, (columns[0][i], columns[1][i], columns[2][i]), taken_s)
             sound = failure is None or i != joint
-            believed = sound and self.believe(i, angle[i], taken_s)
+            believed = sound and self.check_angle_plausible(i, angle[i], taken_s)
             if believed or not sound:
-                self.strays[i] = []
+                self.implausible_angles[i] = []
             if believed:
-                self.good[i] = angle[i], taken_s
+                self.last_plausible_angles[i] = angle[i], taken_s
                 measured[0][i], measured[1][i], measured[2][i] = angle[i], velocity[i], torque[i]
             if i in self.isolated:
                 continue
@@ -163,7 +170,7 @@ class Everything(Model):
             strayed |= {i} if sound and not believed else set()
             stuck |= {i} if frozen else set()
         self.measured = measured
-        self.doubt = unknown or strayed or stuck
+        self.doubtful_joints = unknown or strayed or stuck
 
     @rule(
         celsius=per_joint(often(20.0, 80.0, 81.0, 104.9, 105.0, 300.0)),
@@ -177,7 +184,7 @@ class Everything(Model):
     ) -> None:
         leaks, valid = [i == leak for i in range(JOINTS)], [i != silent for i in range(JOINTS)]
         reported = [NAN, *celsius[1:]] if failure == "nan" else celsius[1:] if failure == "short" else celsius
-        self.authority.observe_power(power(reported, volts, leaks, valid), self.now_ns)
+        self.authority.observe_power(make_power(reported, volts, leaks, valid), self.now_ns)
         for i, health in enumerate(self.healths if failure != "short" else ()):
             if i == silent or not math.isfinite(reported[i]):
                 continue
@@ -190,10 +197,10 @@ class Everything(Model):
 
     def draw_conclusions(self) -> None:
         """At the end of a tick: what the modules said, and what they have not said for long."""
-        before, self.wrong = self.wrong, set()
+        before, self.health_faults = self.health_faults, set()
         for i, health in enumerate(self.healths):
-            self.wrong |= {(word, i) for word in health.wrong(self.now_ns)}
-        for word, i in sorted(self.wrong - before, key=lambda found: (found[1], WORDS.index(found[0]))):
+            self.health_faults |= {(word, i) for word in health.wrong(self.now_ns)}
+        for word, i in sorted(self.health_faults - before, key=lambda found: (found[1], WORDS.index(found[0]))):
             self.lose_or_fail({i} if word == "overheated" else None)
         quiet_before, self.silent = self.silent, set()
         for i, health in enumerate(self.healths):
@@ -202,7 +209,7 @@ class Everything(Model):
         fresh = self.silent - quiet_before
         if fresh and not (len(fresh) == 1 and fresh <= self.isolated):
             self.note_fault()
-        self.shares = [health.share(self.now_ns) for health in self.healths]
+        self.torque_fractions = [health.share(self.now_ns) for health in self.healths]
 
     @rule(
         who=HOLDERS,
@@ -212,16 +219,16 @@ class Everything(Model):
     )
     def ask_for_the_lease(self, who: str, action: Any, priority: int, epoch: int) -> None:
         epoch = max(self.epoch + epoch, 0)
-        mine = self.live and who == self.holder and epoch == self.epoch
-        ok = mine if action != "acquire" else not self.live or priority > self.priority
+        mine = self.is_lease_held and who == self.holder and epoch == self.epoch
+        ok = mine if action != "acquire" else not self.is_lease_held or priority > self.priority
         request = LeaseRequest(action=action, holder=who, priority=priority, epoch=epoch)
-        answer = self.authority.on_lease(request, self.now_ns)
+        answer = self.authority.handle_lease_request(request, self.now_ns)
         if ok and action == "renew" and self.state != "armed":
             self.expires_ns = self.now_ns + LEASE_NS
         elif ok and action != "renew":
             self.drop_lease()
             if self.state == "armed":
-                self.leave_for("disarmed")
+                self.change_state("disarmed")
             if action == "acquire":
                 self.holder, self.priority, self.expires_ns = who, priority, self.now_ns + LEASE_NS
                 self.epoch += 1
@@ -263,7 +270,7 @@ class Everything(Model):
         meant = 0 if arm_session is None else max(self.arm_session + arm_session, 0)
         for _ in range(times):
             self.sequence += 1
-            asked = command(
+            asked = make_joint_command(
                 self.robot,
                 wanted,
                 mode,
@@ -280,10 +287,10 @@ class Everything(Model):
         if "replayed" in defects and self.last_sequence < 0:  # nothing yet that could be replayed
             defects = defects - {"replayed"}
         expected = next((REASONS[defect] for defect in DEFECTS if defect in defects), None)
-        if not self.live:
+        if not self.is_lease_held:
             expected = "no_lease"
         counted = self.authority.rejected_counts[expected] if expected else 0
-        refusal = self.authority.offer_command(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
+        refusal = self.authority.process_command(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
         self.offered += 1
         if expected is not None:
             assert refusal == expected
@@ -299,7 +306,7 @@ class Everything(Model):
         self.expires_ns = self.now_ns + LEASE_NS
         self.newest_command = self.now_ns, asked
         if self.state == "armed":
-            self.since_arming.append(asked)
+            self.commands_since_arming.append(asked)
 
     @rule(reason=st.sampled_from(["malformed", "unknown_version"]))
     def send_what_is_no_command(self, reason: str) -> None:
@@ -315,12 +322,14 @@ class Everything(Model):
         config_hash=often("0" * 16, "1" * 16, None),
     )
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
-        ready = self.state == "disarmed" and self.known and self.live and self.newest_command is not None
+        ready = self.state == "disarmed" and self.known and self.is_lease_held and self.newest_command is not None
         wrong = {
-            (word, i) for word, i in self.wrong if word == "leak" or (word == "overheated" and i not in self.isolated)
+            (word, i)
+            for word, i in self.health_faults
+            if word == "leak" or (word == "overheated" and i not in self.isolated)
         }
         weak = any(health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths)
-        ready = ready and not wrong and not weak and (self.reported or self.arm_session == 0)
+        ready = ready and not wrong and not weak and (self.is_stop_sent or self.arm_session == 0)
         if ready and self.newest_command is not None:
             received_ns, asked = self.newest_command
             ready = self.now_ns - received_ns <= LEASE_NS and all(
@@ -338,13 +347,13 @@ class Everything(Model):
         reported |= {"wrong_state": self.state == "disarmed", "not_ready": ready}
         ready = all(reported.values())
         request = LifecycleRequest(action="arm", robot=robot, backend=backend, config_hash=config_hash)
-        answer = self.authority.on_lifecycle(request, self.now_ns)
+        answer = self.authority.handle_lifecycle_request(request, self.now_ns)
         if ready:
-            self.leave_for("armed")
+            self.change_state("armed")
             self.arm_session += 1
             self.armed_tick = self.seen_tick
             self.newest_command = None
-            self.since_arming, self.counting = [], None
+            self.commands_since_arming, self.active_command = [], None
             self.expires_ns = self.now_ns + LEASE_NS
         self.check(answer, ready)
         assert answer.refusal == next((word for word, right in reported.items() if not right), None)
@@ -354,21 +363,21 @@ class Everything(Model):
         ok = action == "finish" or self.state in (("armed", "disarmed") if action == "disarm" else ("fault", "estop"))
         if action == "reset" and self.state == "disarmed":
             ok = True
-        answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self.now_ns)
+        answer = self.authority.handle_lifecycle_request(LifecycleRequest(action=action), self.now_ns)
         if ok and (action != "finish" or self.state == "armed"):
-            self.leave_for("disarmed")
+            self.change_state("disarmed")
         if ok and action == "reset":
             self.faults = 0
             if self.isolated:
-                self.isolated, self.doubt = set(), None
+                self.isolated, self.doubtful_joints = set(), None
         self.check(answer, ok)
         if not ok:
             assert answer.refusal == "wrong_state"
 
     @rule(who=st.text(min_size=1, max_size=64))
     def estop(self, who: str) -> None:
-        answer = self.authority.on_estop(EstopRequest(requester=who), self.tick)
-        self.leave_for("estop")
+        answer = self.authority.handle_estop_request(EstopRequest(requester=who), self.tick)
+        self.change_state("estop")
         self.note_fault()
         self.check(answer, True)
         assert self.authority.faults[-1] == Fault(tick=self.tick, what="estop", cause=f"emergency stop by {who}")
@@ -380,7 +389,7 @@ class Everything(Model):
     )
     def backend_fault(self, cause: str, reach: Any, joint: int | None) -> None:
         name = None if joint is None else f"joint_{joint + 1}"
-        self.authority.fault(Fault(tick=self.tick, what="hot", cause=cause, joint=name, reach=reach))
+        self.authority.latch_fault(Fault(tick=self.tick, what="hot", cause=cause, joint=name, reach=reach))
         if reach == "none":
             self.note_fault()
             return
@@ -391,15 +400,15 @@ class Everything(Model):
         """A fault that is only recorded, so that it is not taken for the reason of a stop."""
         fault = Fault(tick=self.tick, what="service_lost", cause="guidance is gone", reach="robot")
         if precedes_stop:
-            self.authority.record_fault(fault, precedes_stop=True)
+            self.authority.log_fault(fault, precedes_stop=True)
         else:
-            self.authority.record_fault(fault)
+            self.authority.log_fault(fault)
         self.note_fault()
         assert self.authority.faults[-1].reach == ("robot" if precedes_stop else "none")
 
     @rule()
     def holder_gone(self) -> None:
-        self.authority.on_holder_gone("the holder is gone")
+        self.authority.handle_lease_holder_exit("the holder is gone")
         if self.state != "armed":
             self.drop_lease()
 
@@ -407,7 +416,7 @@ class Everything(Model):
 
     def stay(self) -> None:
         """A good command to stay where the joints are."""
-        near = [within(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in self.measured[0]]
+        near = [clamp(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in self.measured[0]]
         still = [Mode.POSITION] * JOINTS
         self.send_commands(near, still, None, False, set(), False, 0, 0, 1)
 
@@ -417,7 +426,7 @@ class Everything(Model):
         self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0, 0, LONG_NS)
         if self.state in ("fault", "estop"):
             self.ask_for_less("reset")
-        if not self.live:
+        if not self.is_lease_held:
             self.ask_for_the_lease("control", "acquire", 100, 0)
         self.end_a_tick(0)
         self.stay()
@@ -469,7 +478,7 @@ class Everything(Model):
         self.end_a_tick(0)
         self.arm("worm", "lag", "0" * 16)
 
-    @precondition(lambda self: self.state == "armed" and self.live)
+    @precondition(lambda self: self.state == "armed" and self.is_lease_held)
     @rule(later=st.integers(0, 1))
     def send_for_the_arm_session_before(self, later: int) -> None:
         """Only a command that answers a state after the arming counts as rejected."""
@@ -489,34 +498,34 @@ class Everything(Model):
         self.now_ns += late_ns
         self.tick += 1
         if self.state == "armed" and not self.known:
-            self.lose_or_fail(self.doubt)
+            self.lose_or_fail(self.doubtful_joints)
         self.draw_conclusions()
-        if self.holder is not None and not self.live:
+        if self.holder is not None and not self.is_lease_held:
             if self.state == "armed":
                 self.fail()
             else:
                 self.drop_lease()
-        self.authority.check_deadlines(self.now_ns, self.tick)
+        self.authority.latch_faults_and_expire_lease(self.now_ns, self.tick)
         up_to = None if self.lag is None else self.tick - self.lag
         limited = self.authority.limited_counts.total()
-        decision = self.authority.decide(up_to)
+        decision = self.authority.compute_setpoints(up_to)
         self.check_isolated(decision)
-        assert self.authority.limited_counts.total() == limited + len(decision.limited)
+        assert self.authority.limited_counts.total() == limited + len(decision.limit_by_joint)
         if self.state != "armed":
-            self.reported = True
+            self.is_stop_sent = True
             self.check_safe(decision)
         else:
-            assert self.live
-            assert self.doubt is not None
-            assert self.doubt <= self.isolated
-            for sent in self.since_arming[-KEPT:]:
-                self.counting = sent if up_to is None or sent.tick <= up_to else self.counting
-            assert decision.sequence == (None if self.counting is None else self.counting.sequence)
-            if self.counting is None:  # nothing was commanded since the robot was armed
-                self.check_held(decision, self.hold_at)
+            assert self.is_lease_held
+            assert self.doubtful_joints is not None
+            assert self.doubtful_joints <= self.isolated
+            for sent in self.commands_since_arming[-KEPT:]:
+                self.active_command = sent if up_to is None or sent.tick <= up_to else self.active_command
+            assert decision.command_sequence == (None if self.active_command is None else self.active_command.sequence)
+            if self.active_command is None:  # nothing was commanded since the robot was armed
+                self.check_held(decision, self.hold_angles_rad)
             else:
-                self.check_commanded(decision, self.counting)
-        self.last = decision
+                self.check_commanded(decision, self.active_command)
+        self.last_output = decision
 
     @invariant()
     def it_matches_the_model(self) -> None:
@@ -528,14 +537,14 @@ class Everything(Model):
         expected = Lease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else Lease()
         assert found.lease.epoch == self.epoch  # the model's only ever grows
         assert found.lease.holder == self.holder
-        assert found.lease.is_live(self.now_ns) == self.live
+        assert found.lease.is_held(self.now_ns) == self.is_lease_held
         assert not self.holder or found.lease == expected
         assert found.reason
         assert len(found.reason) <= 500
         assert len(found.faults) == self.faults
         assert all(len(fault.cause) <= 500 for fault in found.faults)
         assert found.rejected_counts.total() == self.rejected
-        assert found.accepted_count == len(self.since_arming) or found.arm_session > 1
+        assert found.accepted_count == len(self.commands_since_arming) or found.arm_session > 1
         assert found.accepted_count + found.standby_count + found.rejected_counts.total() == self.offered
 
 

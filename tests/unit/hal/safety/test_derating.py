@@ -5,11 +5,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD, REPORT_TIMEOUT_NS, Derating
+from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD, REPORT_TIMEOUT_NS, HealthMonitor
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
 from snakesim_testing.hal.limiter_rig import JOINTS
-from snakesim_testing.hal.small_robots import description, power
+from snakesim_testing.hal.small_robots import make_description, make_power
 
 MS = 1_000_000
 S = 1000 * MS
@@ -20,16 +20,16 @@ class Bench:
 
     def __init__(self, *, expected: bool = False, awaits_reports: bool = False, **robot: Any) -> None:
         sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
-        plain = description(**robot)
+        plain = make_description(**robot)
         sensors = [*plain.sensors, sensor] if expected else plain.sensors
-        self.derating = Derating(msgspec.structs.replace(plain, sensors=sensors), awaits_reports=awaits_reports)
+        self.derating = HealthMonitor(msgspec.structs.replace(plain, sensors=sensors), awaits_reports=awaits_reports)
         self.now_ns = 5 * S
         self.notes: list[Fault] = []
 
     def receive(self, *values: Any, after_ns: int = 500 * MS, **other: Any) -> list[Fault]:
         """A sample, and what is newly wrong."""
         self.now_ns += after_ns
-        self.derating.update(power(*values, **other), self.now_ns)
+        self.derating.update(make_power(*values, **other), self.now_ns)
         return self.look(0)
 
     def look(self, after_ns: int) -> list[Fault]:
@@ -50,7 +50,7 @@ class Bench:
 def test_nothing_is_derated_before_anything_is_known() -> None:
     bench = Bench()
     assert bench.shares == [1.0] * JOINTS
-    assert bench.derating.present_faults == []
+    assert bench.derating.current_faults == []
     assert bench.look(0) == []
     assert bench.shares == [1.0] * JOINTS
     assert bench.derating.derated_joints() == {}
@@ -103,14 +103,14 @@ def test_derating_overheated_fault_stays_until_winding_has_cooled(temperature_c:
     bench = Bench()
     bench.receive([20.0, STOP_AT_C, 20.0])
     assert bench.receive([20.0, temperature_c, 20.0]) == [], "the fault is reported once"
-    assert len(bench.derating.present_faults) == 1
+    assert len(bench.derating.current_faults) == 1
 
 
 def test_derating_cooled_winding_that_overheats_again_is_a_new_fault() -> None:
     bench = Bench()
     bench.receive([20.0, STOP_AT_C, 20.0])
     assert bench.receive([20.0, COOL_BELOW_C - 0.1, 20.0]) == []
-    assert bench.derating.present_faults == []
+    assert bench.derating.current_faults == []
     assert len(bench.receive([20.0, STOP_AT_C + 5.0, 20.0])) == 1
 
 
@@ -118,7 +118,7 @@ def test_heat_that_was_too_much_is_not_forgotten_in_silence() -> None:
     bench = Bench()
     bench.receive([20.0, 110.0, 20.0])
     assert bench.look(10 * S) == []
-    assert [fault.what for fault in bench.derating.present_faults] == ["overheated"]
+    assert [fault.what for fault in bench.derating.current_faults] == ["overheated"]
     assert bench.shares == [1.0] * JOINTS
 
 
@@ -129,7 +129,7 @@ def test_water_stops_the_robot() -> None:
     assert fault.joint == "joint_3"
     assert fault.cause == "joint_3 reports water inside"
     assert bench.receive() == []
-    assert bench.derating.present_faults == []
+    assert bench.derating.current_faults == []
 
 
 def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
@@ -141,9 +141,9 @@ def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
     assert fault.joint == "joint_2"
     assert fault.cause == f"the supply of joint_2 is at 17.9 V, it needs 18 V: {MIN_VOLTAGE_FIELD}"
     assert bench.look(1) == []
-    assert len(bench.derating.present_faults) == 1
+    assert len(bench.derating.current_faults) == 1
     assert bench.receive() == []
-    assert bench.derating.present_faults == []
+    assert bench.derating.current_faults == []
 
 
 WAY_OUT = "check the supply, or set `min_voltage_v` under [limits] in the robot file of 'worm'"
@@ -230,9 +230,9 @@ def test_derating_leak_and_voltage_of_silent_module_are_ignored(reported: dict[s
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
-    assert len(bench.derating.present_faults) == JOINTS
+    assert len(bench.derating.current_faults) == JOINTS
     bench.look(3 * S)
-    assert bench.derating.present_faults == []
+    assert bench.derating.current_faults == []
 
 
 def test_derating_missing_reports_are_recorded_where_sensor_is_described() -> None:
@@ -268,4 +268,4 @@ def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(reported: dict[st
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
-    assert [fault.reach for fault in bench.derating.present_faults] == [reach] * JOINTS
+    assert [fault.reach for fault in bench.derating.current_faults] == [reach] * JOINTS

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.joint_limits import Applied, JointLimits, Measured
-from snakesim_hal.safety.limit_names import name_active_limits
+from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, MeasuredState
+from snakesim_hal.safety.limit_names import find_active_limits
 from snakesim_hal.safety.limiter import (
-    find_bumpless_target,
+    compute_bumpless_target,
+    compute_stoppable_speed,
+    compute_torque_bounds,
+    compute_velocity_bounds,
     limit_command,
-    stoppable_speed,
-    torque_bounds_at_ends,
-    velocity_bounds_at_ends,
 )
 from snakesim_hal.wire.messages import JointCommand, Mode
 from snakesim_testing.hal.limiter_rig import (
@@ -35,14 +35,14 @@ from snakesim_testing.hal.limiter_rig import (
     limited,
     words,
 )
-from snakesim_testing.hal.small_robots import command, description
+from snakesim_testing.hal.small_robots import make_description, make_joint_command
 
 
-def ends(mode: Mode, measured: Measured, i: int) -> tuple[float, float]:
+def ends(mode: Mode, measured: MeasuredState, i: int) -> tuple[float, float]:
     angle, velocity = float(measured.angle_rad[i]), float(measured.velocity_rad_s[i])
     if mode is Mode.VELOCITY:
-        return velocity_bounds_at_ends(ROBOT.joints[i], angle, LIMITS.period_s)
-    return torque_bounds_at_ends(ROBOT.joints[i], angle, velocity, LIMITS.period_s)
+        return compute_velocity_bounds(ROBOT.joints[i], angle, LIMITS.period_s)
+    return compute_torque_bounds(ROBOT.joints[i], angle, velocity, LIMITS.period_s)
 
 
 def at_a_bound(target: float, most: float, low: float, high: float) -> bool:
@@ -59,18 +59,18 @@ def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
 
 
 @st.composite
-def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
+def situations(draw: st.DrawFn) -> tuple[JointCommand, MeasuredState, AppliedSetpoints]:
     """Any command that passes the refusals, any state, and any setpoints that were applied before."""
     any_target = st.floats(-2, 2) | HUGE
     torque_limit = draw(st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10)))
     modes = draw(per_joint(st.sampled_from(list(Mode))))
-    asked = command(ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit)
-    measured = Measured(
+    asked = make_joint_command(ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit)
+    measured = MeasuredState(
         np.array(draw(per_joint(ANY_ANGLE))),
         np.array(draw(per_joint(st.floats(-10, 10) | HUGE))),
         np.array(draw(per_joint(st.floats(-5, 5) | HUGE))),
     )
-    last = Applied(
+    last = AppliedSetpoints(
         np.array(draw(per_joint(st.sampled_from([0, 1, 2, 3])))),
         np.array(draw(per_joint(any_target))),
         LIMITS.torque_nm,
@@ -80,7 +80,9 @@ def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
 
 @given(situations())
 @settings(max_examples=300)
-def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[JointCommand, Measured, Applied]) -> None:
+def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
+    case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
+) -> None:
     asked, measured, last = case
     applied = limited(asked, measured, last)
     assert np.isfinite(applied.target).all()
@@ -122,7 +124,7 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[Joi
 
 @given(situations())
 def test_gate_names_exactly_the_targets_it_changes(
-    case: tuple[JointCommand, Measured, Applied],
+    case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:
     asked, measured, last = case
     applied = limited(asked, measured, last)
@@ -137,7 +139,7 @@ def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]])
     """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
     zero, last = np.zeros(JOINTS), before(Mode.POSITION)
     for target in stream:
-        applied = limited(command(ROBOT, target), Measured(last.target, zero, zero), last)
+        applied = limited(make_joint_command(ROBOT, target), MeasuredState(last.target, zero, zero), last)
         assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
         last = applied
 
@@ -151,7 +153,7 @@ def test_a_target_that_waits_is_reached() -> None:
         last = before(mode)
         steps = int(np.ceil(wanted / step - 1e-9))
         for k in range(1, steps + 1):
-            last = limited(command(ROBOT, wanted, mode), every(), last)
+            last = limited(make_joint_command(ROBOT, wanted, mode), every(), last)
             assert last.target[0] == pytest.approx(min(k * step, wanted))
 
 
@@ -159,7 +161,7 @@ def test_a_target_that_waits_is_reached() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 def test_gate_joint_beyond_its_end_is_only_commanded_back(angle: float, side: int) -> None:
     for wanted in (-1e4, -1.5, 0.0, 1.5, 1e4):
-        target = applied_for(command(ROBOT, wanted), angle=side * angle).target
+        target = applied_for(make_joint_command(ROBOT, wanted), angle=side * angle).target
         assert (np.abs(target) <= 1.5).all()
         assert (side * target >= min(angle - 0.3, 1.5) - TINY).all()  # and not past what is near
 
@@ -167,29 +169,34 @@ def test_gate_joint_beyond_its_end_is_only_commanded_back(angle: float, side: in
 def test_with_no_torque_allowed_there_is_none() -> None:
     none = [0.0] * JOINTS
     for mode in Mode:
-        applied = applied_for(command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0)
+        applied = applied_for(make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0)
         assert (applied.torque_limit_nm == 0).all()
-    assert (applied_for(command(ROBOT, 1.0, Mode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0).all()
+    assert (
+        applied_for(make_joint_command(ROBOT, 1.0, Mode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0
+    ).all()
 
 
 def test_a_negative_torque_limit_is_none_at_all() -> None:
-    assert applied_for(command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)).torque_limit_nm.tolist() == [0.0] * JOINTS
+    assert (
+        applied_for(make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)).torque_limit_nm.tolist()
+        == [0.0] * JOINTS
+    )
 
 
-@pytest.mark.parametrize("held", [LIMITS, Measured(*np.zeros((3, 1))), Applied(*np.zeros((3, 1)))])  # pyright: ignore[reportArgumentType]
+@pytest.mark.parametrize("held", [LIMITS, MeasuredState(*np.zeros((3, 1))), AppliedSetpoints(*np.zeros((3, 1)))])  # pyright: ignore[reportArgumentType]
 def test_what_was_decided_stays(held: Any) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         held.torque_nm = 1.0
 
 
 def test_a_torque_limit_never_raises_the_robots_own() -> None:
-    applied = applied_for(command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
+    applied = applied_for(make_joint_command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
     assert applied.torque_limit_nm.tolist() == [4.0, 4.0, 1.0]
-    assert applied_for(command(ROBOT, 0.0)).torque_limit_nm.tolist() == [4.0] * JOINTS
+    assert applied_for(make_joint_command(ROBOT, 0.0)).torque_limit_nm.tolist() == [4.0] * JOINTS
 
 
 def test_modes_may_differ_from_joint_to_joint() -> None:
-    mixed = command(ROBOT, 9.0, [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
+    mixed = make_joint_command(ROBOT, 9.0, [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
     assert applied_for(mixed).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
 
 
@@ -211,7 +218,7 @@ def motor_torque(target: float, angle: float, velocity: float) -> float:
 def test_gate_switch_to_position_mode_keeps_present_torque(
     angle: float, velocity: float, torque: float, wanted: float, mode: Mode
 ) -> None:
-    applied = applied_for(command(ROBOT, wanted), angle, velocity, torque, mode)
+    applied = applied_for(make_joint_command(ROBOT, wanted), angle, velocity, torque, mode)
     implied = motor_torque(applied.target[0], angle, velocity)
     assert abs(implied - torque) <= 40.0 * ANGLE_STEP + 1e-6
 
@@ -222,13 +229,13 @@ def test_gate_switch_to_position_mode_keeps_present_torque(
     mode=st.sampled_from([Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]),
 )
 def test_gate_switch_to_torque_mode_keeps_present_torque(torque: float, wanted: float, mode: Mode) -> None:
-    applied = applied_for(command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, mode)
+    applied = applied_for(make_joint_command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, mode)
     assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
 
 
 @given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
 def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, wanted: float) -> None:
-    applied = applied_for(command(ROBOT, wanted, Mode.VELOCITY), 0.3, velocity, 1.0, Mode.POSITION)
+    applied = applied_for(make_joint_command(ROBOT, wanted, Mode.VELOCITY), 0.3, velocity, 1.0, Mode.POSITION)
     joint = ROBOT.joints[0]
     bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
     top = joint.speed_limit_rad_s
@@ -237,13 +244,13 @@ def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, want
 
 
 def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
-    none = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied = limited(command(ROBOT, 0.3, Mode.POSITION), every(), none)
+    none = AppliedSetpoints(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
+    applied = limited(make_joint_command(ROBOT, 0.3, Mode.POSITION), every(), none)
     assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
 
 
 def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
-    measured = Measured(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0]))
+    measured = MeasuredState(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0]))
     hold = bumpless([Mode.POSITION] * JOINTS, measured)
     implied = [motor_torque(*row) for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)]
     assert implied == pytest.approx(measured.torque_nm.tolist())
@@ -252,17 +259,19 @@ def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
 
 def test_a_switch_to_velocity_mode_reckons_with_the_gain() -> None:
     joint = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=2.0)
-    assert find_bumpless_target(joint, Mode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
-    assert find_bumpless_target(joint, Mode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
+    assert compute_bumpless_target(joint, Mode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
+    assert compute_bumpless_target(joint, Mode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
 
 
 def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     limp = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
-    assert find_bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
+    assert compute_bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
     measured, last = every(torque=4.0), before(Mode.PASSIVE)
-    applied = limit_command(command(ROBOT, 0.0), measured=measured, last=last, limits=soft, torque_fraction=COOL)
+    applied = limit_command(
+        make_joint_command(ROBOT, 0.0), measured=measured, last=last, limits=soft, torque_fraction=COOL
+    )
     assert np.abs(applied.target).max() <= 0.3
 
 
@@ -272,10 +281,10 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
 def test_a_joint_can_stop_before_its_end() -> None:
     """Four periods on at that speed, then braked by the acceleration limit, it comes to rest at the very end."""
     for distance in (1e-6, 0.01, 0.3, 3.0):
-        speed = stoppable_speed(distance, 100.0, 0.01)
+        speed = compute_stoppable_speed(distance, 100.0, 0.01)
         assert speed * 0.04 + speed**2 / 200.0 == pytest.approx(distance)
         assert speed < np.sqrt(2 * 100.0 * distance)
-    assert stoppable_speed(0.0, 100.0, 0.01) == stoppable_speed(-1.0, 100.0, 0.01) == 0.0
+    assert compute_stoppable_speed(0.0, 100.0, 0.01) == compute_stoppable_speed(-1.0, 100.0, 0.01) == 0.0
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -286,7 +295,7 @@ def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) 
     last = before(Mode.VELOCITY)
     speeds: list[float] = []
     for _ in range(400):
-        last = limited(command(ROBOT, side * 5.0, Mode.VELOCITY), every(angle, reported[0]), last)
+        last = limited(make_joint_command(ROBOT, side * 5.0, Mode.VELOCITY), every(angle, reported[0]), last)
         reported = [*reported[1:], float(last.target[0])]
         angle += reported[0] * 0.01
         speeds.append(abs(reported[0]))
@@ -303,47 +312,47 @@ def test_at_the_end_nothing_drives_outwards(side: int, mode: Mode, beyond: float
     for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
         for last in (before(mode, side * 3.0), before(Mode.POSITION, side * 3.0)):
             for wanted in (-9.0, 9.0):
-                applied = limited(command(ROBOT, wanted, mode), every(side * (1.5 + beyond), velocity), last)
+                applied = limited(make_joint_command(ROBOT, wanted, mode), every(side * (1.5 + beyond), velocity), last)
                 assert (side * applied.target <= 0.0).all()
 
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_gate_torque_mode_brakes_a_fast_joint(side: int) -> None:
-    measured, asked = every(side * 1.4, side * 5.0), command(ROBOT, side * 4.0, Mode.TORQUE)
+    measured, asked = every(side * 1.4, side * 5.0), make_joint_command(ROBOT, side * 4.0, Mode.TORQUE)
     applied = limited(asked, measured, before(Mode.TORQUE, side * 4.0))
-    allowed = stoppable_speed(0.1, 100.0, 0.01)
+    allowed = compute_stoppable_speed(0.1, 100.0, 0.01)
     assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))  # gain 1 N·m·s/rad
     assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
 
 
 def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
     weak = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
-    low, high = torque_bounds_at_ends(weak, 0.0, 0.0, 0.01)
-    assert high == -low == pytest.approx(4.0 / 5.0 * stoppable_speed(1.5, 100.0, 0.01))
+    low, high = compute_torque_bounds(weak, 0.0, 0.0, 0.01)
+    assert high == -low == pytest.approx(4.0 / 5.0 * compute_stoppable_speed(1.5, 100.0, 0.01))
     assert high > 4.0
     slow = msgspec.structs.replace(weak, speed_limit_rad_s=0.5)
-    low, high = torque_bounds_at_ends(slow, 0.0, 0.0, 0.01)
-    assert high == -low == pytest.approx(4.0 / 0.5 * stoppable_speed(1.5, 100.0, 0.01))
+    low, high = compute_torque_bounds(slow, 0.0, 0.0, 0.01)
+    assert high == -low == pytest.approx(4.0 / 0.5 * compute_stoppable_speed(1.5, 100.0, 0.01))
     still = msgspec.structs.replace(weak, speed_limit_rad_s=0.0)
-    low, high = torque_bounds_at_ends(still, 0.0, 0.0, 0.01)
+    low, high = compute_torque_bounds(still, 0.0, 0.0, 0.01)
     assert high == -low > 4.0
 
 
 def test_gate_joint_near_its_end_is_named_angle_limited() -> None:
-    asked = command(ROBOT, 5.0, Mode.VELOCITY)
+    asked = make_joint_command(ROBOT, 5.0, Mode.VELOCITY)
     applied = limited(asked, every(1.45), before(Mode.VELOCITY, 5.0))
     assert words(asked, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
     assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
 
 
 def test_gate_torque_far_from_ends_is_not_named_angle_limited() -> None:
-    asked = command(ROBOT, 5.0, Mode.TORQUE)
+    asked = make_joint_command(ROBOT, 5.0, Mode.TORQUE)
     measured = every(0.0, 1.45)
     applied = limited(asked, measured, before(Mode.TORQUE, 4.0))
     assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
 
 
-BRAKED = stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: below the speed limit of 5 rad/s
+BRAKED = compute_stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: below the speed limit of 5 rad/s
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -360,9 +369,9 @@ BRAKED = stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: be
 def test_the_tightest_limit_is_the_one_that_is_named(
     side: int, angle: float, wanted: float, speed_limit: float, word: str
 ) -> None:
-    robot = description(limits__speed_rad_s=speed_limit)
-    asked, limits = command(robot, side * wanted, Mode.VELOCITY), JointLimits.from_description(robot)
-    named = name_active_limits(
+    robot = make_description(limits__speed_rad_s=speed_limit)
+    asked, limits = make_joint_command(robot, side * wanted, Mode.VELOCITY), JointLimits.from_description(robot)
+    named = find_active_limits(
         asked, before(Mode.VELOCITY), measured=every(side * angle), limits=limits, torque_fraction=COOL
     )
     assert named == dict.fromkeys(range(JOINTS), word)
@@ -372,8 +381,8 @@ def test_the_tightest_limit_is_the_one_that_is_named(
 def test_gate_joint_at_its_end_needs_no_torque(velocity: float) -> None:
     """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
     joint = ROBOT.joints[0]
-    _, most = torque_bounds_at_ends(joint, joint.angle_max_rad, velocity, 0.01)
-    least, _ = torque_bounds_at_ends(joint, joint.angle_min_rad, velocity, 0.01)
+    _, most = compute_torque_bounds(joint, joint.angle_max_rad, velocity, 0.01)
+    least, _ = compute_torque_bounds(joint, joint.angle_min_rad, velocity, 0.01)
     assert most == (0.0 if velocity <= 0.0 else -velocity)  # gain 1 N·m·s/rad
     assert least == (0.0 if velocity >= 0.0 else -velocity)
 
@@ -381,6 +390,6 @@ def test_gate_joint_at_its_end_needs_no_torque(velocity: float) -> None:
 def test_a_range_without_width_leaves_no_torque() -> None:
     stuck = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
     for velocity in (-3.0, 0.0, 3.0):
-        low, high = torque_bounds_at_ends(stuck, 0.0, velocity, 0.01)
+        low, high = compute_torque_bounds(stuck, 0.0, velocity, 0.01)
         assert low <= 0.0 >= high
         assert low <= high

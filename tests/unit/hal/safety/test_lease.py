@@ -60,10 +60,10 @@ def test_refused_and_nothing_changed(case: str) -> None:
     lease, asked, now, words = REFUSED[case]
     ruling = decide_lease_request(lease, asked, now, TERM)
     assert ruling.lease == lease
-    assert not ruling.changed_hands
+    assert not ruling.has_holder_changed
     assert ruling.refusal is not None
     assert words in ruling.refusal
-    assert ruling.refusal_word == ("lease_held" if asked.action == "acquire" else "not_holder")
+    assert ruling.refusal_code == ("lease_held" if asked.action == "acquire" else "not_holder")
 
 
 def test_the_refusal_says_how_long_it_may_take() -> None:
@@ -74,9 +74,9 @@ def test_the_refusal_says_how_long_it_may_take() -> None:
 
 
 def test_live_until_the_last_nanosecond() -> None:
-    assert HELD.is_live(1000)
-    assert not HELD.is_live(1001)
-    assert not FREE.is_live(0)
+    assert HELD.is_held(1000)
+    assert not HELD.is_held(1001)
+    assert not FREE.is_held(0)
     assert free_lease(HELD) == Lease(epoch=4)
     assert renew_lease(HELD, 2000, TERM).expires_ns == 2050
 
@@ -106,9 +106,9 @@ def test_lease_every_holder_in_any_history_has_unique_epoch(history: list[tuple[
         ruling = decide_lease_request(lease, request(action, holder, epoch, priority), now, TERM)
         lease = ruling.lease
         assert lease.epoch in (before.epoch, before.epoch + 1)
-        assert (lease.epoch > before.epoch) == (ruling.changed_hands and lease.holder is not None)
+        assert (lease.epoch > before.epoch) == (ruling.has_holder_changed and lease.holder is not None)
         assert lease.expires_ns <= now + TERM or lease == before
         if lease.holder is not None:
             assert holders.setdefault(lease.epoch, lease.holder) == lease.holder
-        if before.is_live(now) and ruling.changed_hands and lease.holder is not None:
+        if before.is_held(now) and ruling.has_holder_changed and lease.holder is not None:
             assert priority > before.priority

@@ -4,10 +4,10 @@ from typing import get_args
 
 import pytest
 
-from snakesim_hal.safety.lifecycle import Event, next_state
+from snakesim_hal.safety.lifecycle import LifecycleEvent, next_state
 from snakesim_hal.wire.messages import LifecycleState
 
-STATES, EVENTS = get_args(LifecycleState), get_args(Event)
+STATES, EVENTS = get_args(LifecycleState), get_args(LifecycleEvent)
 TABLE: dict[str, dict[str, str | None]] = {
     "disarmed": {"arm": "armed", "disarm": "disarmed", "fault": "fault", "estop": "estop", "reset": "disarmed"},
     "armed": {"arm": None, "disarm": "disarmed", "fault": "fault", "estop": "estop", "reset": None},
@@ -18,5 +18,5 @@ TABLE: dict[str, dict[str, str | None]] = {
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("event", EVENTS)
-def test_transition(state: LifecycleState, event: Event) -> None:
+def test_transition(state: LifecycleState, event: LifecycleEvent) -> None:
     assert next_state(state, event) == TABLE[state][event]

@@ -8,26 +8,26 @@ import pytest
 
 from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.lease import Lease
-from snakesim_hal.safety.limiter import Refusal, find_refusal, make_safe_setpoints
+from snakesim_hal.safety.limiter import RejectionReason, find_rejection_reason, make_safe_setpoints
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
 from snakesim_testing.hal.limiter_rig import JOINTS, LEASE, LIMITS, ROBOT, applied_for, before, every, limited, words
-from snakesim_testing.hal.small_robots import LEASE_NS, command, description
+from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command
 
 
-def judge(given: JointCommand, **changes: Any) -> Refusal | None:
+def judge(given: JointCommand, **changes: Any) -> RejectionReason | None:
     values: dict[str, Any] = {"lease": LEASE, "now_ns": 900, "tick": 5, "last_sequence": 0, "age_ns": 0} | changes
     limits = values.pop("limits", LIMITS)
-    return find_refusal(given, limits=limits, **values)
+    return find_rejection_reason(given, limits=limits, **values)
 
 
 # --- refusals --------------------------------------------------------------------------------------------------
 
 SERVOS = JointLimits.from_description(
-    description(drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}})
+    make_description(drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}})
 )
 NAN, INF = float("nan"), float("inf")
-REFUSED: dict[Refusal, list[tuple[dict[str, Any], dict[str, Any]]]] = {
+REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
     "no_lease": [({}, {"lease": Lease(epoch=1)}), ({}, {"now_ns": 1001})],
     "wrong_epoch": [({"lease_epoch": 0}, {}), ({"lease_epoch": 2}, {})],
     "replayed": [({"sequence": 1}, {"last_sequence": 1}), ({"sequence": 1}, {"last_sequence": 2})],
@@ -63,26 +63,26 @@ REFUSED: dict[Refusal, list[tuple[dict[str, Any], dict[str, Any]]]] = {
 
 
 def test_a_good_command_passes() -> None:
-    assert judge(command(ROBOT)) is None
-    assert judge(command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
-    assert judge(command(ROBOT, tick=5), now_ns=1000) is None
-    assert judge(command(ROBOT, valid_for_ns=10), age_ns=10) is None
-    assert judge(command(ROBOT, valid_for_ns=0), age_ns=0) is None
-    assert judge(command(ROBOT, mode=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]), limits=SERVOS) is None
+    assert judge(make_joint_command(ROBOT)) is None
+    assert judge(make_joint_command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
+    assert judge(make_joint_command(ROBOT, tick=5), now_ns=1000) is None
+    assert judge(make_joint_command(ROBOT, valid_for_ns=10), age_ns=10) is None
+    assert judge(make_joint_command(ROBOT, valid_for_ns=0), age_ns=0) is None
+    assert judge(make_joint_command(ROBOT, mode=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]), limits=SERVOS) is None
 
 
 @pytest.mark.parametrize(("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases])
-def test_refused_with_its_reason(reason: Refusal, case: tuple[dict[str, Any], dict[str, Any]]) -> None:
+def test_refused_with_its_reason(reason: RejectionReason, case: tuple[dict[str, Any], dict[str, Any]]) -> None:
     changes, circumstances = case
-    assert judge(command(ROBOT, **changes), **circumstances) == reason
+    assert judge(make_joint_command(ROBOT, **changes), **circumstances) == reason
 
 
 def test_every_reason_is_tried() -> None:
-    assert list(REFUSED) == list(get_args(Refusal))
+    assert list(REFUSED) == list(get_args(RejectionReason))
 
 
 def test_what_is_checked_first_is_told_first() -> None:
-    worse: list[tuple[Refusal, dict[str, Any], dict[str, Any]]] = [
+    worse: list[tuple[RejectionReason, dict[str, Any], dict[str, Any]]] = [
         ("not_finite", {"target": [NAN] * JOINTS}, {}),
         ("wrong_length", {"torque_limit_nm": [1.0]}, {}),
         ("wrong_layout", {"layout": "other"}, {}),
@@ -97,7 +97,7 @@ def test_what_is_checked_first_is_told_first() -> None:
     for reason, changes, circumstances in worse:
         worst |= changes
         around |= circumstances
-        assert judge(command(ROBOT, **worst), **around) == reason
+        assert judge(make_joint_command(ROBOT, **worst), **around) == reason
 
 
 # --- heat ------------------------------------------------------------------------------------------------------
@@ -124,22 +124,22 @@ def test_limiter_hot_joint_has_lower_torque_limit(
     commanded_limit_nm: float | None, applied_limit_nm: list[float], reasons: dict[int, str]
 ) -> None:
     limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINTS
-    asked = command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=limits_nm)
+    asked = make_joint_command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=limits_nm)
     assert limit_hot_joints(asked) == (applied_limit_nm, reasons)
 
 
 def test_limiter_cool_joint_with_excessive_torque_is_limited_by_rating() -> None:
-    _, reasons = limit_hot_joints(command(ROBOT, 9.0, Mode.TORQUE))
+    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, Mode.TORQUE))
     assert reasons == {0: "torque", 1: "thermal", 2: "thermal"}
 
 
 def test_limiter_changed_target_of_hot_joint_names_target_limit() -> None:
-    _, reasons = limit_hot_joints(command(ROBOT, 9.0, Mode.POSITION))
+    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, Mode.POSITION))
     assert reasons == dict.fromkeys(range(JOINTS), "angle")
 
 
 def test_limiter_passive_hot_joint_is_not_limited() -> None:
-    _, reasons = limit_hot_joints(command(ROBOT, 9.0, Mode.PASSIVE))
+    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, Mode.PASSIVE))
     assert reasons == {}
 
 
@@ -167,13 +167,13 @@ def test_limiter_passive_hot_joint_is_not_limited() -> None:
     ],
 )
 def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word: str | None) -> None:
-    asked = command(ROBOT, [0.0, wanted, 0.0], mode)
+    asked = make_joint_command(ROBOT, [0.0, wanted, 0.0], mode)
     applied = limited(asked, every(), before(mode))
     assert words(asked, applied, every()) == ({} if word is None else {1: word})
 
 
 def test_set_points_for_the_backend_are_plain_python() -> None:
-    applied = applied_for(command(ROBOT, 0.01))
+    applied = applied_for(make_joint_command(ROBOT, 0.01))
     points = make_safe_setpoints(applied, frozenset({1}))
     assert points.isolated == {1}
     assert points.mode == [Mode.POSITION] * JOINTS
@@ -191,9 +191,9 @@ def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: 
     sensor = SensorDescription(key=keys.JOINTS, rate_hz=100.0, delay_s=delay_ms * 1e-3)
     lease_ns = min(max(5 * period_ns, 50_000_000), 100_000_000)
     robot = msgspec.structs.replace(ROBOT, period_ns=period_ns, lease_ns=lease_ns, sensors=[sensor])
-    assert JointLimits.from_description(robot).oldest_state_ns == oldest_ms * 1_000_000
+    assert JointLimits.from_description(robot).max_state_age_ns == oldest_ms * 1_000_000
 
 
 def test_limiter_without_joint_sensor_assumes_oldest_allowed_state() -> None:
     robot = msgspec.structs.replace(ROBOT, sensors=[])
-    assert JointLimits.from_description(robot).oldest_state_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns
+    assert JointLimits.from_description(robot).max_state_age_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns

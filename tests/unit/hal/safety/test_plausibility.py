@@ -9,27 +9,27 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.safety.joint_limits import Applied, JointLimits, Mask
-from snakesim_hal.safety.plausibility import PlausibilityCheck, replace_unreadable
+from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, JointMask
+from snakesim_hal.safety.plausibility import PlausibilityChecker, replace_non_finite_values
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointState, Mode
 from snakesim_testing.hal.limiter_rig import JOINTS, LIMITS, ROBOT
-from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, description, state
+from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, make_description, make_joint_state
 
 REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
 WORD = "state_invalid"
-NOBODY: Mask = np.zeros(JOINTS, dtype=np.bool_)
+NOBODY: JointMask = np.zeros(JOINTS, dtype=np.bool_)
 
 
-def targets(target: Any = 0.0, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Applied:
-    return Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit))
+def targets(target: Any = 0.0, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> AppliedSetpoints:
+    return AppliedSetpoints(np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit))
 
 
 class Bench:
     """A watch that gets a sample a period."""
 
     def __init__(self, **values: Any) -> None:
-        self.watch = PlausibilityCheck(LIMITS)
+        self.watch = PlausibilityChecker(LIMITS)
         self.timestamp_ns = 0
         assert self.see(**values) is None
 
@@ -37,14 +37,14 @@ class Bench:
         self,
         angle: Any = 0.0,
         *values: Any,
-        applied: Applied | None = None,
+        applied: AppliedSetpoints | None = None,
         periods: float = 1,
         late_ns: int = 0,
-        aside: Mask = NOBODY,
+        aside: JointMask = NOBODY,
         **other: Any,
     ) -> Fault | None:
         self.timestamp_ns += round(periods * PERIOD_NS)
-        seen = state(ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **other)
+        seen = make_joint_state(ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **other)
         doubt = self.watch.check(seen, now_ns=self.timestamp_ns + late_ns, applied=applied, isolated=aside)
         self.doubted = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
         return None if doubt is None else doubt.fault
@@ -63,7 +63,7 @@ def test_the_first_angle_is_believed_wherever_it_is() -> None:
 
 @pytest.mark.parametrize("applied", [None, targets()])
 @pytest.mark.parametrize("side", [1, -1])
-def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(applied: Applied | None, side: int) -> None:
+def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(applied: AppliedSetpoints | None, side: int) -> None:
     bench = Bench()
     assert bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied) is None
     fault = bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
@@ -77,7 +77,7 @@ def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(applied: Appl
 
 @pytest.mark.parametrize("applied", [None, targets()])
 @pytest.mark.parametrize("side", [1, -1])
-def test_plausibility_jumping_joint_keeps_last_valid_angle(applied: Applied | None, side: int) -> None:
+def test_plausibility_jumping_joint_keeps_last_valid_angle(applied: AppliedSetpoints | None, side: int) -> None:
     bench = Bench()
     bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied)
     bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
@@ -191,11 +191,11 @@ def test_plausibility_unknown_joint_leaves_others_unchanged(bad: dict[str, Any])
 
 
 def test_a_long_story_fits_into_a_message() -> None:
-    robot = description(chain__modules=100)
-    watch = PlausibilityCheck(JointLimits.from_description(robot))
+    robot = make_description(chain__modules=100)
+    watch = PlausibilityChecker(JointLimits.from_description(robot))
     nobody = np.zeros(100, dtype=np.bool_)
-    watch.check(state(robot), now_ns=0, applied=None, isolated=nobody)
-    doubt = watch.check(state(robot, 1.0), now_ns=0, applied=None, isolated=nobody)
+    watch.check(make_joint_state(robot), now_ns=0, applied=None, isolated=nobody)
+    doubt = watch.check(make_joint_state(robot, 1.0), now_ns=0, applied=None, isolated=nobody)
     assert doubt is not None
     assert len(doubt.fault.cause) == 400
     assert doubt.joints.all()
@@ -239,17 +239,17 @@ def test_plausibility_angle_exactly_at_reach_is_accepted() -> None:
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm"])
 def test_what_is_published_has_numbers_only(column: str) -> None:
     bench = Bench(angle=0.1)
-    sound = state(ROBOT, 0.12, 0.2, 0.3)
-    assert replace_unreadable(sound, bench.watch.measured) is sound
+    sound = make_joint_state(ROBOT, 0.12, 0.2, 0.3)
+    assert replace_non_finite_values(sound, bench.watch.measured) is sound
     corrupted = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
-    published = replace_unreadable(corrupted, bench.watch.measured)
+    published = replace_non_finite_values(corrupted, bench.watch.measured)
     assert published.valid == [True, False, True]
     assert published.angle_rad[1] == 0.1
     assert published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
     assert getattr(published, column)[::2] == [0.5, 0.7]
     assert published.age_ns == sound.age_ns
     assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [0.1, 0.0, 0.0]
-    assert replace_unreadable(
+    assert replace_non_finite_values(
         msgspec.structs.replace(corrupted, valid=[False, True, True]), bench.watch.measured
     ).valid == [
         False,
@@ -260,8 +260,8 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
 
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm", "valid"])
 def test_plausibility_state_of_wrong_length_is_published_unchanged(column: str) -> None:
-    odd = msgspec.structs.replace(state(ROBOT, float("nan")), **{column: [float("nan")]})
-    assert replace_unreadable(odd, Bench().watch.measured) is odd
+    odd = msgspec.structs.replace(make_joint_state(ROBOT, float("nan")), **{column: [float("nan")]})
+    assert replace_non_finite_values(odd, Bench().watch.measured) is odd
 
 
 # --- stuck sensors ---------------------------------------------------------------------------------------------
@@ -369,7 +369,7 @@ def test_a_sample_that_is_only_old_is_not_frozen() -> None:
 # --- the shortcut for ordinary states ----------------------------------------------------------------------------
 
 
-class Whole(PlausibilityCheck):
+class Whole(PlausibilityChecker):
     """The checks without the shortcut."""
 
     def _is_ordinary(self, joints: JointState) -> bool:
@@ -377,10 +377,10 @@ class Whole(PlausibilityCheck):
         return False
 
 
-def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied | None]]:
+def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedSetpoints | None]]:
     """States at the edges of every check, in which at most one joint is not like the others; and what was applied."""
     timestamp_ns, target, angle = 0, 0.0, [0.4] * JOINTS
-    limit_ns = LIMITS.oldest_state_ns
+    limit_ns = LIMITS.max_state_age_ns
     for _ in range(length):
         timestamp_ns += rng.choice((0, PERIOD_NS, PERIOD_NS, PERIOD_NS, LEASE_NS))
         target += rng.choice((0.0, 0.08))
@@ -403,7 +403,9 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied 
             case _:
                 pass
         count = 0 if rng.random() < 0.02 else JOINTS
-        seen = state(ROBOT, angle[:count], velocity, torque, timestamp_ns=timestamp_ns, age_ns=ages, valid=valid)
+        seen = make_joint_state(
+            ROBOT, angle[:count], velocity, torque, timestamp_ns=timestamp_ns, age_ns=ages, valid=valid
+        )
         yield seen, targets(target) if rng.random() < 0.9 else None
 
 
@@ -411,7 +413,7 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied 
 def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
     rng = random.Random(5)
     for _ in range(300):
-        quick, whole = PlausibilityCheck(LIMITS), Whole(LIMITS)
+        quick, whole = PlausibilityChecker(LIMITS), Whole(LIMITS)
         for seen, applied in walk(rng, 24):
             taken = [
                 one.check(seen, now_ns=seen.timestamp_ns, applied=applied, isolated=NOBODY) for one in (quick, whole)
@@ -421,8 +423,8 @@ def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
                 assert good.tolist() == expected.tolist()
 
 
-@pytest.mark.parametrize("check", [PlausibilityCheck, Whole])
-def test_an_angle_may_differ_by_the_noise_at_once(check: type[PlausibilityCheck]) -> None:
+@pytest.mark.parametrize("check", [PlausibilityChecker, Whole])
+def test_an_angle_may_differ_by_the_noise_at_once(check: type[PlausibilityChecker]) -> None:
     watch = check(LIMITS)
     for angle in (0.0, 0.05):
-        assert watch.check(state(ROBOT, angle), now_ns=0, applied=targets(), isolated=NOBODY) is None
+        assert watch.check(make_joint_state(ROBOT, angle), now_ns=0, applied=targets(), isolated=NOBODY) is None

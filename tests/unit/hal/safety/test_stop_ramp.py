@@ -9,14 +9,14 @@ from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import Mode
 from snakesim_testing.hal.limiter_rig import ANGLE_STEP, JOINTS, TINY, before, every
-from snakesim_testing.hal.small_robots import description
+from snakesim_testing.hal.small_robots import make_description
 
-ROBOT = description(motor__damping_nm_s_per_rad=2.0)
+ROBOT = make_description(motor__damping_nm_s_per_rad=2.0)
 LIMITS = JointLimits.from_description(ROBOT)
 
 
 def beginning(angle: float, velocity: float, torque: float, mode: Mode, target: float) -> StopRamp:
-    return StopRamp.begin(every(angle, velocity, torque), before(mode, target), LIMITS)
+    return StopRamp.start(every(angle, velocity, torque), before(mode, target), LIMITS)
 
 
 def targets(halt: StopRamp, periods: int) -> list[float]:

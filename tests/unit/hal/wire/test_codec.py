@@ -21,7 +21,13 @@ from snakesim_hal.wire.messages import (
     Message,
     Mode,
 )
-from snakesim_testing.hal.strategies import messages_of, places, plain_example, poisons, replaced
+from snakesim_testing.hal.strategies import (
+    iter_places,
+    list_invalid_values,
+    make_plain_example,
+    make_strategy,
+    replace_at,
+)
 from snakesim_testing.messages import raises_error
 
 ALL = list(VERSIONS)
@@ -44,7 +50,7 @@ def take(message: type[Message], payload: bytes) -> Message | None:
 @given(data=st.data())
 @settings(max_examples=25)
 def test_codec_round_trip_returns_an_equal_message(message: type[Message], data: st.DataObject) -> None:
-    sent = data.draw(messages_of(message))
+    sent = data.draw(make_strategy(message))
     payload = encode(sent)
     assert take(message, payload) == sent
     assert encode(take(message, payload)) == payload
@@ -52,17 +58,17 @@ def test_codec_round_trip_returns_an_equal_message(message: type[Message], data:
 
 @each_message
 def test_every_field_refuses_what_is_out_of_its_bounds(message: type[Message]) -> None:
-    example = plain_example(message)
+    example = make_plain_example(message)
     assert take(message, encode(example)) is not None
-    for at, info in places(example, inspect.type_info(message)):
-        for poison in poisons(info):
-            payload = encode(replaced(example, at, poison))
+    for at, info in iter_places(example, inspect.type_info(message)):
+        for poison in list_invalid_values(info):
+            payload = encode(replace_at(example, at, poison))
             assert take(message, payload) is None, f"{message.__name__} {at} took {poison!r}"
 
 
 @each_message
 def test_no_number_and_no_list_of_the_contract_is_unbounded(message: type[Message]) -> None:
-    for at, info in places(plain_example(message), inspect.type_info(message)):
+    for at, info in iter_places(make_plain_example(message), inspect.type_info(message)):
         if isinstance(info, inspect.FloatType | inspect.IntType):
             assert info.ge is not None or info.gt is not None, at
             assert info.le is not None or info.lt is not None, at
@@ -72,17 +78,17 @@ def test_no_number_and_no_list_of_the_contract_is_unbounded(message: type[Messag
 
 @each_message
 def test_lists_longer_than_allowed_are_refused(message: type[Message]) -> None:
-    example: Any = plain_example(message)
-    for at, info in places(example, inspect.type_info(message)):
+    example: Any = make_plain_example(message)
+    for at, info in iter_places(example, inspect.type_info(message)):
         if isinstance(info, inspect.ListType) and info.max_length is not None:
             entry = reduce(lambda inner, step: inner[step], at, example)[0]
-            assert take(message, encode(replaced(example, at, [entry] * info.max_length))) is not None, at
-            assert take(message, encode(replaced(example, at, [entry] * (info.max_length + 1)))) is None, at
+            assert take(message, encode(replace_at(example, at, [entry] * info.max_length))) is not None, at
+            assert take(message, encode(replace_at(example, at, [entry] * (info.max_length + 1)))) is None, at
 
 
 @each_message
 def test_codec_missing_required_field_is_refused_and_new_one_ignored(message: type[Message]) -> None:
-    example = plain_example(message)
+    example = make_plain_example(message)
     info = inspect.type_info(message)
     assert isinstance(info, inspect.StructType)
     for field in info.fields:
@@ -109,7 +115,7 @@ def test_codec_missing_required_field_is_refused_and_new_one_ignored(message: ty
     ],
 )
 def test_a_foreign_encoding_is_refused_with_its_reason(encoding: str, reason: str) -> None:
-    payload = encode(plain_example(JointCommand))
+    payload = encode(make_plain_example(JointCommand))
     with pytest.raises(WireError) as caught:
         DECODERS[JointCommand].decode(payload, encoding)
     assert caught.value.reason == reason
@@ -121,7 +127,7 @@ def test_a_foreign_encoding_is_refused_with_its_reason(encoding: str, reason: st
 
 @each_message
 def test_every_truncation_and_a_byte_too_many_are_refused(message: type[Message]) -> None:
-    payload = encode(plain_example(message))
+    payload = encode(make_plain_example(message))
     assert take(message, payload) is not None
     for length in range(len(payload)):
         assert take(message, payload[:length]) is None, length
@@ -137,7 +143,7 @@ def test_deep_nesting_is_refused(depth: int, nest: bytes) -> None:
 
 
 def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
-    valid = plain_example(JointState)
+    valid = make_plain_example(JointState)
     fits = encode({**valid, "other": b"x" * (MAX_PAYLOAD_BYTES - 1000)})
     assert take(JointState, fits) is not None
     too_large = encode({**valid, "other": b"x" * MAX_PAYLOAD_BYTES})
@@ -147,17 +153,17 @@ def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
 
 def test_codec_accepts_largest_images_and_no_other_large_message() -> None:
     for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColorImage, "rgb", b"\1\2\3")):
-        largest = {**plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
+        largest = {**make_plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
         taken = take(message, encode(largest))
         assert taken is not None
         assert getattr(taken, field) == largest[field]
         assert take(message, encode({**largest, field: largest[field] + b"\1"})) is None
-        assert take(JointState, encode({**plain_example(JointState), "other": largest[field]})) is None
+        assert take(JointState, encode({**make_plain_example(JointState), "other": largest[field]})) is None
 
 
 def test_nobody_but_the_contract_can_write_a_mode() -> None:
     """A mode travels as its number, and only the four numbers of the contract are modes."""
-    example = plain_example(JointCommand)
+    example = make_plain_example(JointCommand)
     for number in range(-2, 10):
         found = take(JointCommand, encode({**example, "mode": [number]}))
         assert (found is not None) == (number in set(Mode))

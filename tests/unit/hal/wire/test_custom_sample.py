@@ -19,7 +19,7 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     decoded = Decoder(kind.message).decode(encode(sample), format_encoding(Skin))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
     assert kind.units == {"pressed_n": "N", "flow_m_s": "m/s", "wet": "1", "count": "1"}
-    assert kind.numbers(decoded) == pytest.approx(
+    assert kind.extract_numeric_values(decoded) == pytest.approx(
         {"pressed_n.0": 1.5, "pressed_n.1": float("nan"), "wet": 1, "count": 4}
         | {f"flow_m_s.{i}": i + 1 for i in range(3)},
         nan_ok=True,

@@ -9,7 +9,7 @@ from msgspec import inspect
 
 from snakesim_hal.wire import keys, messages
 from snakesim_hal.wire.messages import VERSIONS, Message, Mode
-from snakesim_testing.hal.strategies import places, plain_example
+from snakesim_testing.hal.strategies import iter_places, make_plain_example
 
 each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)
 
@@ -28,7 +28,7 @@ def declared() -> set[type[Message]]:
 
 def parts_of(message: type[Message]) -> set[type[Any]]:
     """Every Struct inside a message."""
-    found = places(plain_example(message), inspect.type_info(message))
+    found = iter_places(make_plain_example(message), inspect.type_info(message))
     return {info.cls for _, info in found if isinstance(info, inspect.StructType)} - {message}
 
 

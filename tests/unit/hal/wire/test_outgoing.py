@@ -15,7 +15,13 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, Message, Trajectory
 from snakesim_hal.wire.outgoing import encode_checked
-from snakesim_testing.hal.strategies import messages_of, places, plain_example, poisons, replaced
+from snakesim_testing.hal.strategies import (
+    iter_places,
+    list_invalid_values,
+    make_plain_example,
+    make_strategy,
+    replace_at,
+)
 
 STREAMED = {row.message: row.key for row in keys.SPACE if row.kind == "stream" and row.message and "*" not in row.key}
 each_message = pytest.mark.parametrize("message", STREAMED, ids=lambda message: message.__name__)
@@ -25,29 +31,29 @@ each_message = pytest.mark.parametrize("message", STREAMED, ids=lambda message: 
 @given(data=st.data())
 @settings(max_examples=10)
 def test_outgoing_valid_message_is_sent_unchanged(message: type[Message], data: st.DataObject) -> None:
-    sent = data.draw(messages_of(message))
+    sent = data.draw(make_strategy(message))
     assert encode_checked(STREAMED[message], sent) == encode(sent)
 
 
 @each_message
 def test_outgoing_value_out_of_bounds_is_named_by_field(message: type[Message]) -> None:
-    example = plain_example(message)
-    for at, info in places(example, inspect.type_info(message)):
-        for poison in poisons(info) if at else ():
+    example = make_plain_example(message)
+    for at, info in iter_places(example, inspect.type_info(message)):
+        for poison in list_invalid_values(info) if at else ():
             with pytest.raises(WireError) as caught:
-                encode_checked(STREAMED[message], message(**replaced(example, at, poison)))
+                encode_checked(STREAMED[message], message(**replace_at(example, at, poison)))
             assert caught.value.detail.startswith(f"{message.__name__}.{at[0]}"), (at, poison)
             assert ", must be " in caught.value.detail
 
 
 def contacts(**wrong: Any) -> Contacts:
-    example = plain_example(Contacts)
+    example = make_plain_example(Contacts)
     one = example["contacts"][0]
     return Contacts(**{**example, "contacts": [one, one, {**one, **wrong}]})
 
 
 def trajectory(*points: Any) -> Trajectory:
-    return Trajectory(**{**plain_example(Trajectory), "path_w": list(points)})
+    return Trajectory(**{**make_plain_example(Trajectory), "path_w": list(points)})
 
 
 INFINITE, SHORT, ARRAY = (1.0, math.inf), (1.0,), np.ones(2)

@@ -4,11 +4,11 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.commissioning.jog import KEY_HOLD_S, MAX_LEAD_RAD, JogRequest, JogTarget
-from snakesim_testing.hal.small_robots import description
+from snakesim_testing.hal.small_robots import make_description
 from snakesim_testing.messages import raises_error
 
 PERIOD_S = 0.01
-JOINT = description().joints[0]
+JOINT = make_description().joints[0]
 
 
 def held(jog: JogTarget, key: str, seconds: float, *, blocked_rad: float | None = None) -> float:
@@ -25,7 +25,7 @@ def test_jog_moves_at_its_speed_only_while_key_repeats() -> None:
     assert held(jog, "up", 1.0) == pytest.approx(0.1)
     for _ in range(100):
         jog.advance(PERIOD_S, jog.target_rad)
-    assert not jog.moves
+    assert not jog.is_moving
     assert 0.1 < jog.target_rad <= 0.1 + 0.1 * KEY_HOLD_S
     assert held(jog, "down", 0.5) < 0.07
     at = jog.target_rad

@@ -8,8 +8,8 @@ import pytest
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import Drive
-from snakesim_operator.features.commissioning.check import report_lines
-from snakesim_operator.features.commissioning.judge import AS_IN_FILE, JointVerdict, judge_joints
+from snakesim_operator.features.commissioning.check import format_report
+from snakesim_operator.features.commissioning.judge import MATCHES_FILE, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import CheckMeasurements, remove_clamped_targets
 
 PERIOD_S = 0.01
@@ -44,7 +44,7 @@ def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: floa
     velocity: Floats = np.diff(angle, axis=0, append=0.0) / PERIOD_S
     return CheckMeasurements(
         period_s=PERIOD_S,
-        names=["joint_1", "joint_2", "joint_3"],
+        joint_names=["joint_1", "joint_2", "joint_3"],
         axes=["yaw", "pitch", "yaw"],
         drives=[Drive(), Drive(sign=-1, zero_rad=0.3), Drive()],
         angle_rad=angle,
@@ -53,7 +53,7 @@ def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: floa
         target_rad=angle,
         link_rate_rad_s=link_rates,
         link_force_m_s2=force,
-        base_turn_rad=np.full((TICKS, 3), np.nan),
+        base_rotation_rad=np.full((TICKS, 3), np.nan),
     )
 
 
@@ -68,7 +68,7 @@ def behind_backlash(drive_rad: Floats, backlash_rad: float) -> Floats:
 
 
 def verdicts(run: CheckMeasurements) -> list[str]:
-    return [row.summary for row in judge_joints(run, straight=True)]
+    return [row.summary for row in judge_joints(run, was_laid_straight=True)]
 
 
 def states(row: JointVerdict) -> dict[str, str]:
@@ -84,18 +84,18 @@ def without_imus(run: CheckMeasurements, *links: int) -> CheckMeasurements:
 
 
 def test_a_sound_robot_is_as_its_file_says() -> None:
-    assert verdicts(measurements()) == [AS_IN_FILE] * JOINTS
+    assert verdicts(measurements()) == [MATCHES_FILE] * JOINTS
 
 
 def test_judge_without_imus_confirms_only_encoders_and_detects_wrong_zero() -> None:
     run = without_imus(measurements(), *range(JOINTS + 1))
     run = replace(run, angle_rad=run.angle_rad + np.array((0.15, 0.0, 0.0)))
-    rows = [row.confirmed_by_hand(["order", "sign"]) for row in judge_joints(run, straight=True)]
+    rows = [row.confirm_by_hand(["order", "sign"]) for row in judge_joints(run, was_laid_straight=True)]
     assert states(rows[0]) == {"gear": "unknown", "zero": "wrong"}
     assert rows[0].summary == "its zero is off by +0.150 rad: zero_rad = 0.150"
     assert states(rows[1]) == {"gear": "unknown"}
     assert not rows[1].all_confirmed
-    lines = report_lines(rows)
+    lines = format_report(rows)
     assert "0 of 3 joints match the robot file; 1 wrong; 2 unknown" in lines[JOINTS]
     assert lines[JOINTS + 1].startswith("unknown: gear of every joint: ")
     assert "`snakesim robot calibrate gear`" in lines[JOINTS + 1]
@@ -111,7 +111,7 @@ def test_judge_zeros_are_unknown_until_straight_or_measured_by_gravity() -> None
 @pytest.mark.parametrize("allowed", [False, True])
 def test_backlash_is_named_and_is_no_gear(allowed: bool) -> None:
     run = measurements(backlash_rad=0.035)
-    rows = judge_joints(run, straight=True, allowed_backlash_rad=0.04 if allowed else 0.01)
+    rows = judge_joints(run, was_laid_straight=True, allowed_backlash_rad=0.04 if allowed else 0.01)
     assert [row.all_confirmed for row in rows[1:]] == [True, True]
     verdict = rows[0].summary
     if allowed:
@@ -125,27 +125,27 @@ def test_backlash_is_named_and_is_no_gear(allowed: bool) -> None:
 def test_a_gear_of_another_ratio_is_no_backlash() -> None:
     assert verdicts(measurements(gear=1.5)) == [
         "turns 0.67 as far as its drive measures: gear = 1.5",
-        AS_IN_FILE,
-        AS_IN_FILE,
+        MATCHES_FILE,
+        MATCHES_FILE,
     ]
 
 
 def test_judge_gravity_reveals_zero_of_a_bent_pitch_joint() -> None:
     run = measurements(pitched_rad=0.2)  # the encoder says 0
-    assert verdicts(run) == [AS_IN_FILE, "its zero is off by -0.200 rad: zero_rad = 0.500", AS_IN_FILE]
-    assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0)))) == [AS_IN_FILE] * JOINTS
+    assert verdicts(run) == [MATCHES_FILE, "its zero is off by -0.200 rad: zero_rad = 0.500", MATCHES_FILE]
+    assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0)))) == [MATCHES_FILE] * JOINTS
 
 
 def test_judge_torque_against_its_motion_has_wrong_sign() -> None:
     run = measurements()
     wrong = replace(run, torque_nm=run.torque_nm * np.array((-1.0, 1.0, 1.0)))
     assert verdicts(wrong)[0].startswith("its torque has the wrong sign")
-    assert verdicts(wrong)[1:] == [AS_IN_FILE, AS_IN_FILE]
+    assert verdicts(wrong)[1:] == [MATCHES_FILE, MATCHES_FILE]
 
 
 @pytest.mark.parametrize("link", [0, 1])
 def test_a_joint_beside_a_link_without_an_imu_is_unknown(link: int) -> None:
-    row = judge_joints(without_imus(measurements(), link), straight=True)[0]
+    row = judge_joints(without_imus(measurements(), link), was_laid_straight=True)[0]
     assert row.turned is None
     assert not row.all_confirmed
     assert states(row) == {"sign": "unknown", "gear": "unknown"}
@@ -153,7 +153,7 @@ def test_a_joint_beside_a_link_without_an_imu_is_unknown(link: int) -> None:
 
 def test_judge_two_imus_cannot_separate_joints_of_equal_effect() -> None:
     run = replace(measurements(), axes=["yaw", "yaw", "yaw"])
-    row = judge_joints(without_imus(run, 2, 3), straight=True)[0]
+    row = judge_joints(without_imus(run, 2, 3), was_laid_straight=True)[0]
     assert states(row) == {"order": "unknown"}
     assert "joint_2, joint_3" in row.findings["order"].reason
 
@@ -161,13 +161,13 @@ def test_judge_two_imus_cannot_separate_joints_of_equal_effect() -> None:
 def test_judge_joint_without_its_motion_is_not_confirmed() -> None:
     run = measurements()
     ended = replace(run, target_rad=run.target_rad * np.array((1.0, 1.0, 0.0)))
-    unmoved = judge_joints(ended, straight=True)[2]
+    unmoved = judge_joints(ended, was_laid_straight=True)[2]
     assert states(unmoved) == dict.fromkeys(("drive", "order", "sign", "gear"), "unknown")
     dead = judge_joints(
-        replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), straight=True
+        replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), was_laid_straight=True
     )[0]
     assert dead.summary.startswith("did not move")
-    assert not dead.confirmed_by_hand(["order", "sign", "gear"]).all_confirmed
+    assert not dead.confirm_by_hand(["order", "sign", "gear"]).all_confirmed
 
 
 def test_judge_dead_joint_swung_by_others_affects_no_verdict() -> None:
@@ -179,7 +179,7 @@ def test_judge_dead_joint_swung_by_others_affects_no_verdict() -> None:
     target_rad = remove_clamped_targets(target_rad, angle_rad, max_step_rad=0.35)
     assert target_rad[:, 2] == pytest.approx(0.0)
     swung = replace(run, angle_rad=angle_rad, target_rad=target_rad, link_rate_rad_s=run.link_rate_rad_s)
-    rows = judge_joints(swung, straight=True)
+    rows = judge_joints(swung, was_laid_straight=True)
     assert [row.findings["zero"].state for row in rows] == ["confirmed"] * JOINTS
     assert rows[0].all_confirmed
     assert not rows[2].all_confirmed
@@ -190,5 +190,5 @@ def test_motion_capture_of_the_base_stands_for_its_imu() -> None:
     run.link_rate_rad_s[:, 1:, 2] -= run.velocity_rad_s[:, :1]  # the tail link turned, and the body stayed
     turn = np.zeros((TICKS, 3))
     turn[:, 2] = -run.angle_rad[:, 0]
-    assert verdicts(replace(run, base_turn_rad=turn))[0] == AS_IN_FILE
-    assert "the other way" in verdicts(replace(run, base_turn_rad=-turn))[0]
+    assert verdicts(replace(run, base_rotation_rad=turn))[0] == MATCHES_FILE
+    assert "the other way" in verdicts(replace(run, base_rotation_rad=-turn))[0]

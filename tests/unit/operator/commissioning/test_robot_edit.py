@@ -7,19 +7,27 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord
-from snakesim_hal.model.files import SHIPPED, decode, read_part
-from snakesim_hal.model.robot import RobotFile, with_modes
-from snakesim_operator.features.commissioning.robot_edit import change_joints, joints_on_drives, write_checked
+from snakesim_hal.model.files import SHIPPED_FILES_DIR, decode_table, read_table_with_base
+from snakesim_hal.model.robot import RobotFile, restrict_drive_modes
+from snakesim_operator.features.commissioning.robot_edit import (
+    read_joints_with_drive_modes,
+    write_check_record,
+    write_joint_fields,
+)
 from snakesim_testing.messages import raises_error
 
 
 @pytest.mark.parametrize(("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)])
 def test_robot_edit_drives_of_running_robot_match_the_edited_file(tmp_path: Path, changed: str, same: bool) -> None:
     path = tmp_path / "snake.toml"
-    path.write_text((SHIPPED / "robots" / "planar13.toml").read_text())
-    running = with_modes(decode(read_part(str(path), "robots"), RobotFile), ("position", "torque")).joint_table
+    path.write_text((SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text())
+    running = restrict_drive_modes(
+        decode_table(read_table_with_base(str(path), "robots"), RobotFile), ("position", "torque")
+    ).joint_table
     path.write_text(path.read_text() + changed)
-    assert ([joint.drive for joint in joints_on_drives(path, running)] == [joint.drive for joint in running]) is same
+    assert (
+        [joint.drive for joint in read_joints_with_drive_modes(path, running)] == [joint.drive for joint in running]
+    ) is same
 
 
 def test_robot_edit_follows_symbolic_link_and_keeps_permissions_and_text(tmp_path: Path) -> None:
@@ -28,7 +36,7 @@ def test_robot_edit_follows_symbolic_link_and_keeps_permissions_and_text(tmp_pat
     real.write_text('extends = "planar13" # ours\nname = "snake"\n')
     real.chmod(0o640)
     link.symlink_to(real)
-    change_joints(link, {"joint_1": {"zero_rad": 0.25}}, "straight pose")
+    write_joint_fields(link, {"joint_1": {"zero_rad": 0.25}}, "straight pose")
     assert link.is_symlink()
     assert "zero_rad = 0.25" in real.read_text()
     assert "# ours" in real.read_text()
@@ -41,7 +49,7 @@ def test_robot_edit_invalid_change_leaves_file_unchanged(tmp_path: Path) -> None
     path.write_text('extends = "planar13"\nname = "snake"\n')
     before = path.read_bytes()
     with raises_error(ConfigError, code="config/out-of-range"):
-        change_joints(path, {"joint_1": {"gear": -1.0}}, "by mistake")
+        write_joint_fields(path, {"joint_1": {"gear": -1.0}}, "by mistake")
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["snake.toml"]
 
@@ -60,5 +68,5 @@ def test_robot_edit_checks_are_read_back_as_written(tmp_path: Path) -> None:
         allowed_backlash_rad=0.02,
     )
     for _ in range(2):  # once more, over the first
-        write_checked(path, checked)
-        assert decode(read_part(str(path), "robots"), RobotFile).checked == checked
+        write_check_record(path, checked)
+        assert decode_table(read_table_with_base(str(path), "robots"), RobotFile).checked == checked

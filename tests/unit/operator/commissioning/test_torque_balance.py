@@ -41,7 +41,7 @@ def test_torque_balance_intervals_have_their_coverage(scaled: bool) -> None:
     truth = TRUTH | {"torque_scale": SCALE if scaled else 1.0}
     for name, value in truth.items():
         values = [getattr(trial, name) for trial in trials]
-        covered = np.mean([one.covers(value) for one in values])
+        covered = np.mean([one.contains(value) for one in values])
         assert covered >= 0.87, f"{name}: {covered}"  # 95 % of 60, less three standard deviations
         assert np.median([one.half_width for one in values]) < 0.1 * value, name
         assert abs(np.mean([one.value for one in values]) / value - 1) < 0.05, name

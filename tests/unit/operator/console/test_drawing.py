@@ -8,9 +8,9 @@ import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.wire.messages import DepthImage, Obstacle
-from snakesim_operator.features.console.page.force_polygon import force_polygon, push_point_table
+from snakesim_operator.features.console.page.force_polygon import draw_force_polygon, format_push_point_table
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.scene.drawing import LONGEST_M, M_PER_N, draw
+from snakesim_operator.features.console.scene.drawing import M_PER_N, MAX_FORCE_ARROW_M, draw
 from snakesim_testing.operator.drawn_samples import COUNT, ROBOT, contact, joints, pushing, world
 
 
@@ -63,12 +63,12 @@ def test_drawing_requested_force_without_contact_is_no_contact_force():
     assert drawing.desired_forces[:, 0, 0] == pytest.approx([0.1])
     assert drawing.forces_without_contact[:, 0, 0] == pytest.approx([0.3])
     assert drawing.forces_without_contact[0, 1] - drawing.forces_without_contact[0, 0] == pytest.approx(
-        [0.0, LONGEST_M, 0.0]
+        [0.0, MAX_FORCE_ARROW_M, 0.0]
     )
-    table = push_point_table(control)
+    table = format_push_point_table(control)
     assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table
     assert "<td>clear</td><td>30.0</td><td>0.0</td>" in table
-    assert push_point_table(msgspec.structs.replace(control, measured_force_n=[])) == ""
+    assert format_push_point_table(msgspec.structs.replace(control, measured_force_n=[])) == ""
 
 
 def test_drawing_strong_force_has_arrow_of_limited_length():
@@ -76,17 +76,17 @@ def test_drawing_strong_force_has_arrow_of_limited_length():
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([point], [])), None)
     assert drawing is not None
     start, end = drawing.measured_forces[0]
-    assert end - start == pytest.approx([0.0, LONGEST_M, 0.0])
+    assert end - start == pytest.approx([0.0, MAX_FORCE_ARROW_M, 0.0])
     assert start[2] > ROBOT.links[0].radius_m
     assert drawing.contacts_w[0] == pytest.approx(point.position_w)
 
 
 def test_the_force_polygon_names_every_force_and_their_resultant():
     later, first = (contact((*at_n, 0.0), "<b>", body_s_m=s_m) for s_m, at_n in ((0.3, (0.0, 4.0)), (0.1, (3.0, 0.0))))
-    drawn = force_polygon(RobotSnapshot(robot=ROBOT, world=world([later, first], [])))
+    drawn = draw_force_polygon(RobotSnapshot(robot=ROBOT, world=world([later, first], [])))
     assert "resultant 5.0 N" in drawn
     assert drawn.index(">3.0 N<") < drawn.index(">4.0 N<") < drawn.index(">5.0 N<")
-    assert "no contact force" in force_polygon(RobotSnapshot(robot=ROBOT, world=world([], [])))
+    assert "no contact force" in draw_force_polygon(RobotSnapshot(robot=ROBOT, world=world([], [])))
 
 
 def test_what_a_map_tells_is_not_drawn_as_perceived():

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pytest import approx
 
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.features.console.page import page_html
 from snakesim_operator.features.console.page.camera_tab import draw_picture
 from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
@@ -14,15 +14,15 @@ from snakesim_operator.run.in_process import simulate
 
 def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> None:
     sets = ["duration_s=2", 'faults=["nan:joint_3@1"]']
-    simulate(load("triplet", [parse_set(one) for one in sets]).config, tmp_path / "run")
+    simulate(load_scenario("triplet", [parse_set_option(one) for one in sets]).config, tmp_path / "run")
     recorded = RunPlayback(tmp_path / "run")
-    moving, (_, end_s) = recorded.snapshot_at(0.5), recorded.span_s
+    moving, (_, end_s) = recorded.make_snapshot(0.5), recorded.span_s
     assert moving.status is not None
     assert moving.status.lifecycle == "armed"
     assert not moving.status.faults
     assert moving.power is not None
     assert "armed by" in page_html.format_header(moving, recorded="run")
-    over = recorded.snapshot_at(end_s)
+    over = recorded.make_snapshot(end_s)
     assert over.status is not None
     assert over.status.lifecycle == "fault"
     assert "joint_3" in page_html.format_state_table(over)
@@ -34,9 +34,9 @@ def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_cameras_rates_and_charts_are_those_of_the_instant(tmp_path: Path) -> None:
-    simulate(load("clutter", [parse_set("duration_s=1.5")]).config, tmp_path / "run")
+    simulate(load_scenario("clutter", [parse_set_option("duration_s=1.5")]).config, tmp_path / "run")
     recorded = RunPlayback(tmp_path / "run")
-    early, late = recorded.snapshot_at(0.3), recorded.snapshot_at(1.4)
+    early, late = recorded.make_snapshot(0.3), recorded.make_snapshot(1.4)
     (seen,), (later,) = early.images.values(), late.images.values()
     assert [*early.images] == ["sensor/depth/head"]
     assert abs(seen.timestamp_ns * 1e-9 - 0.3) < 0.1

@@ -11,11 +11,11 @@ import optuna
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import find_file
+from snakesim_hal.model.files import resolve_file_path
 from snakesim_hal.model.textfiles import read_text
 from snakesim_operator.features.evaluate import optimize as search
 from snakesim_operator.features.evaluate.case import Case, CaseOutcome
-from snakesim_operator.features.evaluate.optimize import SearchRequest, optimize
+from snakesim_operator.features.evaluate.optimize import SearchRequest, run_optimization
 from snakesim_testing.messages import raises_error
 
 PROPULSION = "control.propulsion_n"
@@ -36,10 +36,10 @@ def quick_runs() -> Iterator[None]:
     """Every run has a result at once: its propulsion, and something for its seed."""
 
     class InstantWorkers:
-        def size(self) -> int:
+        def count_workers(self) -> int:
             return 2
 
-        def solve(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
+        def run_cases(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
             for case in cases:
                 config = msgspec.json.decode(case.config)
                 value = config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
@@ -50,7 +50,7 @@ def quick_runs() -> Iterator[None]:
         yield InstantWorkers()
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(search, "workers", instant_workers)
+        patched.setattr(search, "start_workers", instant_workers)
         yield
 
 
@@ -63,7 +63,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def searched(storage: Path, **other: Any) -> None:
-    assert optimize(SearchRequest(**{**FIRST, **other, "storage": storage})) == 0
+    assert run_optimization(SearchRequest(**{**FIRST, **other, "storage": storage})) == 0
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -93,7 +93,7 @@ def test_another_search_is_refused_with_every_difference(kept: Path, other: dict
 
 def test_a_scenario_file_that_has_changed_is_another_search(tmp_path: Path) -> None:
     scenario = tmp_path / "own.toml"
-    text = read_text(find_file("triplet", "scenarios"))
+    text = read_text(resolve_file_path("triplet", "scenarios"))
     scenario.write_text(text)
     searched(tmp_path / "search.db", scenario=str(scenario))
     assert "rate_hz = 100" in text

@@ -6,11 +6,11 @@ import msgspec
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import list_shipped
+from snakesim_hal.model.files import list_shipped_names
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.cli import main
 from snakesim_operator.features.evaluate.case import Case
-from snakesim_operator.features.evaluate.suite import Suite, make_cases, make_settings, read_suite
+from snakesim_operator.features.evaluate.suite import Suite, make_cases, make_suite_settings, read_suite
 from snakesim_testing.messages import raises_error
 
 ROWS = """
@@ -46,11 +46,11 @@ def config(case: Case) -> RunConfig:
 
 def test_suite_contains_every_row_in_every_combination(tmp_path: Path) -> None:
     suite, source = read(tmp_path, ROWS)
-    names = [setting.name for setting in make_settings(suite, source)]
+    names = [setting.name for setting in make_suite_settings(suite, source)]
     assert len(names) == 12
     assert names[0] == "as shipped, density_per_m2 4, friction 0.1"
     assert names[-1] == "pegs only, density_per_m2 8, friction 0.3"
-    cases = make_cases(suite, source, ["hold", "path_following"], 2, seed=7)
+    cases = make_cases(suite, source, ["hold", "path_following"], 2, first_field=7)
     assert len(cases) == 12 * 2 * 2
     assert len({case.id for case in cases}) == len(cases)
     last = config(cases[-1])
@@ -76,12 +76,13 @@ QUICK = {"pushing"}  # the others are tried by `make verify`
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in list_shipped("suites")]
+    "name",
+    [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in list_shipped_names("suites")],
 )
 def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
     assert suite.title
-    assert len(make_cases(suite, source, suite.controllers[:1], 1, seed=1)) >= 1
+    assert len(make_cases(suite, source, suite.controllers[:1], 1, first_field=1)) >= 1
 
 
 @pytest.mark.parametrize(
@@ -139,7 +140,7 @@ without = ["scene.pegs_along_route.0.friction"]
 
 def test_a_field_has_its_own_draw_whoever_crosses_it(tmp_path: Path) -> None:
     suite, source = read(tmp_path, LAB)
-    cases = make_cases(suite, source, ["hold", "path_following"], 3, seed=7)
+    cases = make_cases(suite, source, ["hold", "path_following"], 3, first_field=7)
     drawn = [(case.field, config(case).scene) for case in cases]
     of_field = {field: scene.random_field[0].friction for field, scene in drawn}
     assert len(set(of_field.values())) == 3
@@ -149,6 +150,6 @@ def test_a_field_has_its_own_draw_whoever_crosses_it(tmp_path: Path) -> None:
     assert launch == [of_field[field] for field, _ in drawn[:6]] + [0.0] * 6
     wrong, source = read(tmp_path, LAB.replace('without = ["scene.pegs', 'without = ["pegs'))
     with raises_error(ConfigError, code="command/invalid-option"):
-        make_settings(wrong, source)
+        make_suite_settings(wrong, source)
     with raises_error(ConfigError, code="config/invalid-value", field="low", value=0.1):
         read(tmp_path, LAB.replace("high = 0.3", "high = 0.03"))

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.figures.run_groups import group_by_seed, make_single_groups, split_arguments
+from snakesim_operator.features.figures.run_groups import (
+    group_runs_by_configuration,
+    make_single_run_groups,
+    split_runs_and_signals,
+)
 from snakesim_operator.results.metrics.intervals import find_mean_and_half_width
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.operator.recorded_triplet import triplet
@@ -16,37 +20,37 @@ from snakesim_testing.operator.recorded_triplet import triplet
 
 def make_run(folder: str, seed: int, duration_s: float = 10.0) -> RunRecord:
     config = msgspec.structs.replace(triplet().config, seed=seed, duration_s=duration_s)
-    return dataclasses.replace(triplet(), folder=Path(folder), config=config)
+    return dataclasses.replace(triplet(), path=Path(folder), config=config)
 
 
 def test_arguments_are_runs_and_then_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "b").mkdir()
-    runs, names = split_arguments(["runs/a", "b", "angle_rad", "torque_nm.joint_1"])
+    runs, names = split_runs_and_signals(["runs/a", "b", "angle_rad", "torque_nm.joint_1"])
     assert runs == [Path("runs/a"), Path("b")]
     assert names == ["angle_rad", "torque_nm.joint_1"]
-    assert split_arguments(["missing"]) == ([Path("missing")], [])
+    assert split_runs_and_signals(["missing"]) == ([Path("missing")], [])
 
 
 def test_runs_that_differ_in_the_seed_are_one_group() -> None:
     runs = [make_run("a", 1), make_run("b", 2), make_run("c", 1, 5.0), make_run("d", 3)]
-    groups = group_by_seed(runs)
-    assert [[run.folder.name for run in group.records] for group in groups] == [["a", "b", "d"], ["c"]]
+    groups = group_runs_by_configuration(runs)
+    assert [[run.path.name for run in group.records] for group in groups] == [["a", "b", "d"], ["c"]]
     assert [group.label for group in groups] == ["duration_s 10 (mean of 3 runs)", "duration_s 5 (1 run)"]
 
 
 def test_no_mean_of_runs_that_are_not_repetitions() -> None:
     with pytest.raises(ConfigError, match="differ in their seeds"):
-        group_by_seed([make_run("a", 1), make_run("b", 1, 5.0)])
+        group_runs_by_configuration([make_run("a", 1), make_run("b", 1, 5.0)])
 
 
 def test_no_mean_of_one_run_given_twice() -> None:
     with pytest.raises(ConfigError, match="count as one run"):
-        group_by_seed([make_run("a", 1), make_run("b", 1), make_run("c", 2)])
+        group_runs_by_configuration([make_run("a", 1), make_run("b", 1), make_run("c", 2)])
 
 
 def test_equal_folder_names_are_told_apart_by_their_paths() -> None:
-    groups = make_single_groups([make_run("x/run", 1), make_run("y/run", 2)])
+    groups = make_single_run_groups([make_run("x/run", 1), make_run("y/run", 2)])
     assert [group.label for group in groups] == ["x/run", "y/run"]
 
 

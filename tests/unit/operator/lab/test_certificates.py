@@ -8,12 +8,17 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.cli import main
-from snakesim_operator.features.lab.certificates import issue, make_authority, read_certificate, write_certificates
-from snakesim_operator.features.lab.identities import identities
-from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
+from snakesim_operator.features.lab.certificates import (
+    issue_certificate,
+    load_or_create_authority,
+    read_certificate,
+    write_certificates,
+)
+from snakesim_operator.features.lab.identities import iterate_identities
+from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH, load_lab
 from snakesim_testing.messages import raises_error
 
-LAB = load_lab(EXAMPLE)
+LAB = load_lab(EXAMPLE_PATH)
 
 
 def states(folder: Path, *, rotate: bool = False) -> dict[str, str]:
@@ -22,9 +27,9 @@ def states(folder: Path, *, rotate: bool = False) -> dict[str, str]:
 
 
 def test_private_keys_are_their_owners_and_never_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["lab", "certs", str(EXAMPLE), "--out", str(tmp_path)]) == 0
+    assert main(["lab", "certs", str(EXAMPLE_PATH), "--out", str(tmp_path)]) == 0
     keys = list(tmp_path.rglob("*.key"))
-    assert len(keys) == len(list(identities(LAB))) + 1
+    assert len(keys) == len(list(iterate_identities(LAB))) + 1
     assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}
     assert stat.S_IMODE((tmp_path / "authority").stat().st_mode) == 0o700
     said = capsys.readouterr()
@@ -35,9 +40,11 @@ def test_private_keys_are_their_owners_and_never_printed(tmp_path: Path, capsys:
 def test_certificate_is_renewed_in_last_third_of_its_life(tmp_path: Path) -> None:
     assert set(states(tmp_path).values()) == {"made"}
     assert set(states(tmp_path).values()) == {"kept"}
-    old = next(identity for identity in identities(LAB) if identity.role == "gnc")
+    old = next(identity for identity in iterate_identities(LAB) if identity.role == "gnc")
     at = tmp_path / "ws1" / "tls" / "gnc.planar13.pem"
-    certificate, key = issue(make_authority(tmp_path / "authority", LAB), old, LAB, timedelta(minutes=4))
+    certificate, key = issue_certificate(
+        load_or_create_authority(tmp_path / "authority", LAB), old, LAB, timedelta(minutes=4)
+    )
     at.write_bytes(certificate)
     at.with_suffix(".key").write_bytes(key)
     after = states(tmp_path)

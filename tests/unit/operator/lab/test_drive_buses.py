@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.programs.arguments import add_host, add_service, load_scenario
-from snakesim_operator.features.lab.check import Findings, check_what_moves
-from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
-from snakesim_operator.features.lab.render import rendered
-from snakesim_testing.hal.small_robots import description
+from snakesim_hal.programs.arguments import add_host_arguments, add_service_arguments, load_scenario_from_arguments
+from snakesim_operator.features.lab.check import CheckResults, check_emulation
+from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH, load_lab
+from snakesim_operator.features.lab.render import render_files
+from snakesim_testing.hal.small_robots import make_description
 from snakesim_testing.messages import raises_error
 
 BY_ID = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT4-if00-port0"
@@ -61,7 +61,7 @@ DEVICES = {"slcan": ["/dev/ttyACM0"], "dynamixel": ["/dev/ttyUSB0", BY_ID], "mix
 
 def lab_text(robot: str) -> str:
     """The example with another robot."""
-    text, count = re.subn(r'backend = "sim".*\ncan = .*\n', f"{robot}\n", EXAMPLE.read_text())
+    text, count = re.subn(r'backend = "sim".*\ncan = .*\n', f"{robot}\n", EXAMPLE_PATH.read_text())
     assert count == 1
     return text
 
@@ -69,7 +69,7 @@ def lab_text(robot: str) -> str:
 def files_of(robot: str, folder: Path) -> dict[str, str]:
     path = folder / "lab.toml"
     path.write_text(lab_text(robot))
-    return {f"{machine}/{name}": text for (machine, name), text in rendered(load_lab(path))}
+    return {f"{machine}/{name}": text for (machine, name), text in render_files(load_lab(path))}
 
 
 def command_of(unit: str) -> list[str]:
@@ -83,15 +83,15 @@ def test_the_host_is_given_its_buses(tmp_path: Path, name: str) -> None:
     """And its services have the same configuration, or they would be refused as set up differently."""
     files = files_of(ROBOTS[name], tmp_path)
     host_parser, service_parser = argparse.ArgumentParser(), argparse.ArgumentParser()
-    add_host(host_parser)
-    add_service(service_parser)
+    add_host_arguments(host_parser)
+    add_service_arguments(service_parser)
     host = host_parser.parse_args(command_of(files["robot1/systemd/snakesim-robot.planar13.service"]))
-    config = load_scenario(host).config
+    config = load_scenario_from_arguments(host).config
     given = {section: settings for section, settings in config.backends.items() if settings}
     assert given == BUSES[name]
     assert config.clock_mode == ("realtime" if BUSES[name] else "lockstep")
     control = service_parser.parse_args(command_of(files["ws1/systemd/snakesim-gnc.planar13-control.service"]))
-    assert load_scenario(control).config == config
+    assert load_scenario_from_arguments(control).config == config
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -175,9 +175,9 @@ def test_check_marks_robot_that_contradicts_lab_file(
 ) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(lab_text(ROBOTS[name]))
-    described = None if emulated is None else msgspec.structs.replace(description(), emulated=emulated)
+    described = None if emulated is None else msgspec.structs.replace(make_description(), emulated=emulated)
     said: list[str] = []
-    found = Findings(said.append)
-    check_what_moves(load_lab(path).file.robots["planar13"], described, found)
+    found = CheckResults(said.append)
+    check_emulation(load_lab(path).file.robots["planar13"], described, found)
     assert found.wrong == bool(wrong)
     assert wrong in said[0]

@@ -5,16 +5,16 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.roles import ROLE_DESCRIPTIONS, TABLE, Role, list_permissions
-from snakesim_operator.features.lab.identities import identities
-from snakesim_operator.features.lab.lab_file import EXAMPLE, load_lab
+from snakesim_hal.wire.roles import ACCESS_RULES, ROLE_DESCRIPTIONS, Role, iterate_permissions
+from snakesim_operator.features.lab.identities import iterate_identities
+from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH, load_lab
 from snakesim_testing.messages import raises_error
 
-TEXT = EXAMPLE.read_text()
+TEXT = EXAMPLE_PATH.read_text()
 
 
 def test_lab_example_assigns_every_role() -> None:
-    held = list(identities(load_lab(EXAMPLE)))
+    held = list(iterate_identities(load_lab(EXAMPLE_PATH)))
     assert {identity.role for identity in held} == {*Role, None}
     assert len({identity.common_name for identity in held}) == len(held)
 
@@ -48,17 +48,17 @@ def test_lab_file_errors_name_the_conflict(tmp_path: Path, old: str, new: str) -
 
 def test_every_key_has_a_role_that_writes_it() -> None:
     """A key that is new in the key space names a writer that `snakesim_hal/wire/roles.py` knows."""
-    assert not [line.key for line in TABLE if not line.writers or (line.kind == "query" and not line.answerers)]
+    assert not [line.key for line in ACCESS_RULES if not line.writers or (line.kind == "query" and not line.answerers)]
     assert set(ROLE_DESCRIPTIONS) == set(Role)
 
 
 def test_lab_rights_only_gnc_commands_and_only_robot_publishes() -> None:
     """What the rules are for; the rest is in the table."""
     for role in Role:
-        granted = list(list_permissions(role, ["control"], faults=True))
+        granted = list(iterate_permissions(role, ["control"], allow_fault_injection=True))
         puts = {key for flow, message, key in granted if (flow, message) == ("ingress", "put")}
         assert ("actuator/joints" in puts) == (role is Role.GNC)
         own = {key for key in puts if key.startswith(("hal/", "sensor/")) and not key.startswith("hal/done/")}
         assert bool(own) == (role is Role.ROBOT)
-    faults = {message for role in Role for _, message, key in list_permissions(role) if key.startswith("fault/")}
+    faults = {message for role in Role for _, message, key in iterate_permissions(role) if key.startswith("fault/")}
     assert not faults

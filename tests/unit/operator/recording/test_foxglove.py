@@ -18,23 +18,23 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, ControlState, DepthImage
 from snakesim_operator.recording import shapes
-from snakesim_operator.recording.body_frames import BodyMessages
-from snakesim_operator.recording.foxglove import FoxgloveChannels
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.body_frames import BodyMessageEncoder
+from snakesim_operator.recording.foxglove import FoxgloveConverter
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
-from snakesim_testing.hal.small_robots import description
-from snakesim_testing.hal.small_robots import state as joint_state
+from snakesim_testing.hal.small_robots import make_description
+from snakesim_testing.hal.small_robots import make_joint_state as joint_state
 from snakesim_testing.runs.in_process_command import run_to_summary
 
 ROBOT = "/planar13_camera"
@@ -57,7 +57,12 @@ FACTORIES = [DecoderFactory(), Json()]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("shown") / "run"
-    simulate(load("triplet", [parse_set("robot=planar13_camera"), parse_set("duration_s=0.8")]).config, out)
+    simulate(
+        load_scenario(
+            "triplet", [parse_set_option("robot=planar13_camera"), parse_set_option("duration_s=0.8")]
+        ).config,
+        out,
+    )
     return out
 
 
@@ -88,11 +93,11 @@ def in_the_world(chain: Any) -> tuple[Any, Any]:
 
 
 def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
-    found, record = shown(run / RECORDING), RunRecord.load(run)
+    found, record = shown(run / RECORDING_FILENAME), RunRecord.load(run)
     moving = [(at, one) for at, one in found[f"{ROBOT}/tf"] if len(one.transforms) > 1]
     at_ns, update = moving[-1]
-    row = record.row_at(at_ns * 1e-9)
-    nodes = record.nodes_w(row)
+    row = record.find_nearest_row(at_ns * 1e-9)
+    nodes = record.find_body_points_w(row)
     assert nodes is not None
     assert len(update.transforms) == len(record.description.links)
     behind = ["world", *(link.name for link in record.description.links[:-1])]
@@ -107,8 +112,8 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
 
 
 def test_foxglove_joint_states_equal_reference_encoder_to_the_byte() -> None:
-    robot, time_ns = description(), 1_234_567_890_123
-    names, frames = [joint.name for joint in robot.joints], BodyMessages(robot)
+    robot, time_ns = make_description(), 1_234_567_890_123
+    names, frames = [joint.name for joint in robot.joints], BodyMessageEncoder(robot)
     for angle, speed, torque in (([0.1, -0.2, 3.0], 0.5, -1e-300), ([1.0, 2.0, 3.0], 4.0, 0.0)):
         joints = joint_state(robot, angle, speed, torque)
         rows = zip(names, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)
@@ -122,9 +127,9 @@ def test_foxglove_joint_states_equal_reference_encoder_to_the_byte() -> None:
 
 
 def test_foxglove_joints_forces_and_state_keep_robot_rates(run: Path) -> None:
-    raw = list(RecordingReader(run / RECORDING).read_messages())
+    raw = list(RecordingReader(run / RECORDING_FILENAME).read_messages())
     wire = Counter(one.key for one in raw)
-    with (run / RECORDING).open("rb") as file:
+    with (run / RECORDING_FILENAME).open("rb") as file:
         read = list(make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages())
     topics = Counter(channel.topic for _, channel, *_ in read)
     assert topics[f"{ROBOT}/joint_states"] == wire[keys.JOINTS] > 80
@@ -132,7 +137,7 @@ def test_foxglove_joints_forces_and_state_keep_robot_rates(run: Path) -> None:
     assert topics[f"{ROBOT}/joint_references"] <= wire[keys.CONTROL_STATE] <= topics[f"{ROBOT}/state"]
     forces = {at.log_time: one for _, channel, at, one in read if channel.topic == f"{ROBOT}/contact_forces"}
     touching = [one for one in raw if one.key == keys.CONTACTS and CONTACTS.decode(one.payload).contacts][-1]
-    felt, contacts = forces[touching.time_ns], CONTACTS.decode(touching.payload).contacts
+    felt, contacts = forces[touching.robot_time_ns], CONTACTS.decode(touching.payload).contacts
     for axis, name in enumerate(("along_n", "left_n", "up_n")):
         links = [sum(c.force_l[axis] for c in contacts if c.link == link) for link in range(14)]
         assert felt[name] == pytest.approx(links)
@@ -140,7 +145,7 @@ def test_foxglove_joints_forces_and_state_keep_robot_rates(run: Path) -> None:
 
 def test_raw_only_leaves_out_what_is_for_viewers(tmp_path: Path) -> None:
     run_to_summary(tmp_path / "raw", "triplet", "--duration", "0.2", "--raw-only")
-    with (tmp_path / "raw" / RECORDING).open("rb") as file:
+    with (tmp_path / "raw" / RECORDING_FILENAME).open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
     topics = {channel.topic for channel in summary.channels.values()}
@@ -149,12 +154,12 @@ def test_raw_only_leaves_out_what_is_for_viewers(tmp_path: Path) -> None:
 
 
 def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
-    found, record = shown(run / RECORDING), RunRecord.load(run)
+    found, record = shown(run / RECORDING_FILENAME), RunRecord.load(run)
     scene = {topic.rpartition("/")[2]: update.entities for topic, messages in found.items()
              if "/scene/" in topic for _, update in messages[-1:]}  # fmt: skip
     assert [entity.frame_id for entity in scene["body"]] == [link.name for link in record.description.links]
     truth = scene["obstacles"][0]
-    assert len(truth.cylinders) + len(truth.cubes) + len(truth.spheres) == len(record.placed)
+    assert len(truth.cylinders) + len(truth.cubes) + len(truth.spheres) == len(record.placed_obstacles)
     assert len(scene["path"][0].lines[0].points) in {len(reported.path_w) for reported in record.trajectories}
     arrows = [arrow for _, update in found[f"{ROBOT}/scene/forces"] for arrow in update.entities[0].arrows]
     turns = [arrow.pose.orientation for arrow in arrows]
@@ -163,7 +168,7 @@ def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
 
 
 def test_images_come_with_their_camera(run: Path) -> None:
-    found = shown(run / RECORDING)
+    found = shown(run / RECORDING_FILENAME)
     at_ns, image = found[f"{ROBOT}/head/depth/image_raw"][-1]
     pinhole = dict(found[f"{ROBOT}/head/depth/camera_info"])[at_ns]
     assert image.encoding == "16UC1"
@@ -179,8 +184,10 @@ def test_images_come_with_their_camera(run: Path) -> None:
 
 
 def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
-    channels, key = FoxgloveChannels(ROBOT), "sensor/depth/head"
-    sent = {one.key: one.payload for one in RecordingReader(run / RECORDING).read_messages((keys.DESCRIPTION, key))}
+    channels, key = FoxgloveConverter(ROBOT), "sensor/depth/head"
+    sent = {
+        one.key: one.payload for one in RecordingReader(run / RECORDING_FILENAME).read_messages((keys.DESCRIPTION, key))
+    }
     whole = msgspec.msgpack.decode(sent[key], type=DepthImage)
     torn = msgspec.msgpack.encode(msgspec.structs.replace(whole, depth=whole.depth[:-1]))
     channels.convert(keys.DESCRIPTION, sent[keys.DESCRIPTION], 0)
@@ -189,8 +196,8 @@ def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
 
 
 def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
-    record, logged = RunRecord.load(run), [one for _, one in shown(run / RECORDING)[f"{ROBOT}/log"]]
-    with (run / RECORDING).open("rb") as file:
+    record, logged = RunRecord.load(run), [one for _, one in shown(run / RECORDING_FILENAME)[f"{ROBOT}/log"]]
+    with (run / RECORDING_FILENAME).open("rb") as file:
         read = list(make_reader(file).iter_messages(topics=[f"{ROBOT}/state"]))
     schema, channel, _ = read[0]
     assert schema is not None
@@ -201,14 +208,14 @@ def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
     assert all(set(wanted["required"]) <= set(state) <= set(wanted["properties"]) for state in states)
     assert [one["lifecycle"] for one in states[-2:]] == ["armed", "disarmed"]
     assert states[-2]["path_s_m"] > 0
-    assert {one["locomotion"] for one in states} <= {reported.state for reported in record.control} | {""}
+    assert {one["locomotion"] for one in states} <= {reported.state for reported in record.control_states} | {""}
     assert any(one.name == "hal" and one.message.startswith("armed: armed by") for one in logged)
     assert any(one.name == "control" and one.message.startswith("Locomoting: ") for one in logged)
 
 
 def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
     layout, newest = json.loads(LAYOUT.read_text()), {}
-    with (run / RECORDING).open("rb") as file:
+    with (run / RECORDING_FILENAME).open("rb") as file:
         for _, channel, _, one in make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages():
             if channel.topic.startswith("/"):
                 newest[channel.topic.replace(ROBOT, "/planar13")] = one  # as docs/how-to/foxglove.md shows
@@ -234,8 +241,8 @@ def test_foxglove_unfinished_recording_has_transforms_joints_and_images(run: Pat
     """As one that was killed: test_recording.py kills one."""
     torn = tmp_path / "torn.mcap"
     recording = RecordingWriter(torn, "planar13_camera")
-    for number, one in enumerate(RecordingReader(run / RECORDING).read_messages()):
-        recording.write_arrival(Arrival(one.key, one.payload, one.encoding, one.wall_ns))
+    for number, one in enumerate(RecordingReader(run / RECORDING_FILENAME).read_messages()):
+        recording.write_arrival(Arrival(one.key, one.payload, one.encoding, one.wall_time_ns))
         if number % 100 == 0:
             recording.flush()
     found: dict[str, Any] = {}
@@ -259,12 +266,12 @@ def test_foxglove_reason_with_changing_number_is_logged_once() -> None:
     reported, logged = StateMessages(), []
     for k in range(20):
         control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
-        logged += reported.update(None, control, k).new_logs
+        logged += reported.update_state(None, control, k).new_logs
     assert [one.message for one in logged] == ["Locomoting: pushes with 0.5 N"]
 
 
 def test_foxglove_state_of_silent_controller_is_not_shown_current() -> None:
-    channels, robot = FoxgloveChannels("snake"), description()
+    channels, robot = FoxgloveConverter("snake"), make_description()
     control = ControlState(tick=0, timestamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
     seen: list[tuple[str, list[str]]] = []
     channels.convert(keys.DESCRIPTION, encode(robot), 0)

@@ -8,15 +8,15 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Contacts
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recover import recover_recording
-from snakesim_operator.recording.stamps import STAMPS
+from snakesim_operator.recording.stamps import CLOCK_ENTRY
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
@@ -29,8 +29,8 @@ PERIOD_NS = 10_000_000
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("stamps") / "run"
-    simulate(load("triplet", [parse_set("duration_s=0.5")]).config, out)
-    return out / RECORDING
+    simulate(load_scenario("triplet", [parse_set_option("duration_s=0.5")]).config, out)
+    return out / RECORDING_FILENAME
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_copy_with_wall_stamps_keeps_both_times_of_every_message(recording: Path
     found = read_with_stock_reader(wall)
     assert found
     for channel, message, _ in found:
-        assert channel.metadata[STAMPS] == "wall"
+        assert channel.metadata[CLOCK_ENTRY] == "wall"
         assert message.log_time > YEAR_2020_NS
         assert message.publish_time < MAX_ROBOT_NS
     assert list(RecordingReader(wall).read_messages()) == list(RecordingReader(recording).read_messages())
@@ -82,7 +82,7 @@ def test_copy_of_a_copy_is_in_robot_time_again(recording: Path, wall: Path, tmp_
     recover_recording(wall, tmp_path / "robot.mcap", "robot")
     found = read_with_stock_reader(tmp_path / "robot.mcap")
     original = read_with_stock_reader(recording)
-    assert all(STAMPS not in channel.metadata for channel, _, _ in found)
+    assert all(CLOCK_ENTRY not in channel.metadata for channel, _, _ in found)
     found_times, original_times = (
         [(channel.topic, message.log_time, message.publish_time, message.data) for channel, message, _ in messages]
         for messages in (found, original)
@@ -98,7 +98,7 @@ def test_copy_without_a_choice_keeps_the_stamps(wall: Path, tmp_path: Path) -> N
 
 
 def test_recorder_writes_wall_stamps(tmp_path: Path) -> None:
-    writer = RecordingWriter(tmp_path / "a.mcap", stamps="wall")
+    writer = RecordingWriter(tmp_path / "a.mcap", log_time_clock="wall")
     contacts = Contacts(tick=3, timestamp_ns=3 * PERIOD_NS, contacts=[])
     before_ns = time.time_ns()
     writer.write_arrival(Arrival(keys.CONTACTS, encode(contacts), format_encoding(Contacts), time.monotonic_ns()))
@@ -107,4 +107,4 @@ def test_recorder_writes_wall_stamps(tmp_path: Path) -> None:
     assert message.publish_time == 3 * PERIOD_NS
     assert message.log_time == pytest.approx(before_ns, abs=10**9)
     (read,) = RecordingReader(tmp_path / "a.mcap").read_messages()
-    assert (read.time_ns, read.wall_ns) == (message.publish_time, message.log_time)
+    assert (read.robot_time_ns, read.wall_time_ns) == (message.publish_time, message.log_time)

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scenario import Override, load
-from snakesim_operator.results.summary import summarise
+from snakesim_hal.model.scenario import Override, load_scenario
+from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import Result, simulate
 
 HEADING = {"kind": "heading", "distance_m": 0.3}
@@ -22,12 +22,12 @@ def simulate_run(controller: str, duration_s: float = 2.5, goal: str = "") -> Re
         "points": {"kind": "waypoints", "points_m": [[1.7, 0.0], [1.9, 0.0]], "within_m": 0.05},
     }
     asked = {"controller": controller, "duration_s": duration_s, **({"mission.goal": goals[goal]} if goal else {})}
-    return simulate(load("peg_row", [Override(key, value, "--set") for key, value in asked.items()]).config)
+    return simulate(load_scenario("peg_row", [Override(key, value, "--set") for key, value in asked.items()]).config)
 
 
 def center_m(result: Result, row: int) -> float:
     """Along x; all links of this robot weigh the same."""
-    nodes = result.record.nodes_w(row)
+    nodes = result.record.find_body_points_w(row)
     assert nodes is not None
     return float(np.mean(0.5 * (nodes[:-1, 0] + nodes[1:, 0])))
 
@@ -39,7 +39,7 @@ def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
     assert reported.goal_m == reported.advance_m == 0.3
     assert reported.crossed_s is not None
     assert reported.advance_m_s == pytest.approx(0.3 / reported.crossed_s)
-    row = record.row_at(record.time_s[0] + reported.crossed_s)
+    row = record.find_nearest_row(record.time_s[0] + reported.crossed_s)
     assert center_m(result, row) - center_m(result, 0) == pytest.approx(0.3, abs=0.01)
     used_j = np.abs(record.torque_nm * record.velocity_rad_s)[: row + 1].sum() * 0.01
     assert reported.energy_j_per_m == pytest.approx(used_j / 0.3, rel=0.02)
@@ -67,13 +67,15 @@ def test_advance_backward_is_zero() -> None:
 @pytest.mark.slow
 def test_points_are_passed_by_the_head() -> None:
     result = simulate_run("path_following", goal="points")
-    reported, nodes = result.summary, result.record.nodes_w(0)
+    reported, nodes = result.summary, result.record.find_body_points_w(0)
     assert nodes is not None
     head = nodes[-1, :2]
     assert reported.goal_m == pytest.approx(np.hypot(1.7 - head[0], head[1]) + 0.2)
     assert reported.crossed is True
     assert reported.crossed_s is not None
-    last = result.record.nodes_w(result.record.row_at(result.record.time_s[0] + reported.crossed_s))
+    last = result.record.find_body_points_w(
+        result.record.find_nearest_row(result.record.time_s[0] + reported.crossed_s)
+    )
     assert last is not None
     assert np.hypot(1.9 - last[-1, 0], last[-1, 1]) < 0.06
 
@@ -120,7 +122,7 @@ def test_advance_of_sideways_travel_has_metrics_along_both_directions() -> None:
         1.0,
         1.0,
     ]  # as if it had gone to its left, by a quarter of a turn
-    sideways = summarise(dataclasses.replace(record, position_w_m=turned), "complete")
+    sideways = summarize_run(dataclasses.replace(record, position_w_m=turned), "complete")
     assert sideways.net_displacement_m == pytest.approx(straight.summary.net_displacement_m, rel=0.1)
     assert sideways.heading_advance_m is not None
     assert sideways.heading_advance_m < 0.1

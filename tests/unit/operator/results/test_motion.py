@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_operator.results.metrics.motion import measure_motion
-from snakesim_operator.results.report.verdict import verdict
+from snakesim_operator.results.metrics.motion import find_stops
+from snakesim_operator.results.report.verdict import make_verdict
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import summarise
+from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.conclusion import print_summary
 from snakesim_testing.operator.recorded_triplet import SECONDS, changed
 
@@ -25,27 +25,27 @@ def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
 def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> None:
     time_s = record.time_s - record.time_s[0]
     goes = moved_as(record, 0.1 * np.interp(time_s, [0, 2, 4.5, 7, 10], [0, 2, 2, 4.5, 4.5]))
-    motion = measure_motion(goes)
+    motion = find_stops(goes)
     assert motion is not None
     spans = [(span.start_s, span.end_s) for span in motion.stops]
     assert np.array(spans) == pytest.approx(np.array([[2.0, 4.5], [7.0, SECONDS]]), abs=0.15)
     assert motion.moving_fraction == pytest.approx(4.5 / SECONDS, abs=0.03)
     assert motion.final_stop == motion.stops[-1]
-    assert [span.what for span in motion.spans] == ["moving", "standing still"] * 2
+    assert [span.label for span in motion.all_intervals] == ["moving", "standing still"] * 2
 
 
 @pytest.mark.parametrize(("amplitude_m", "moves"), [(0.004, False), (0.06, True)])
 def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, amplitude_m: float, moves: bool) -> None:
     time_s = record.time_s - record.time_s[0]
-    motion = measure_motion(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
+    motion = find_stops(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
     assert motion is not None
     assert motion.moving_fraction == (1.0 if moves else 0.0)
 
 
 def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
     blind = changed(record, position_w_m=record.position_w_m * np.nan, worlds=[])
-    assert measure_motion(blind) is None
-    reported = summarise(blind, "complete")
+    assert find_stops(blind) is None
+    reported = summarize_run(blind, "complete")
     assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
     assert reported.reported_state == "NotLocomoting"
 
@@ -56,21 +56,22 @@ def test_motion_uses_measured_pose_but_not_dead_reckoning(record: RunRecord) -> 
     for source, fraction in (("sensor", pytest.approx(0.63, abs=0.03)), ("dead_reckoning", None)):
         worlds = [msgspec.structs.replace(world, pose_from=source) for world in record.worlds]
         known = changed(blind, worlds=worlds)
-        summary = summarise(known, "complete")
+        summary = summarize_run(known, "complete")
         assert summary.locomoting_fraction == fraction
-        assert verdict(known, summary).words.startswith("Ran for 10.0 s; the distance is unknown;")
+        assert make_verdict(known, summary).text.startswith("Ran for 10.0 s; the distance is unknown;")
 
 
 def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.CaptureFixture[str]) -> None:
     names = [joint.name for joint in record.description.joints]
     control = [
-        msgspec.structs.replace(state, propulsion_joint=names[i // 5 % 3]) for i, state in enumerate(record.control)
+        msgspec.structs.replace(state, propulsion_joint=names[i // 5 % 3])
+        for i, state in enumerate(record.control_states)
     ]
-    many = changed(record, control=control)
-    summary = summarise(many, "complete")
+    many = changed(record, control_states=control)
+    summary = summarize_run(many, "complete")
     print_summary(summary)
     printed = re.search(r"\((\d+) hand-overs in all\)", capsys.readouterr().out)
-    said = re.search(r"handed over (\d+) times among 3 joints", verdict(many, summary).words)
+    said = re.search(r"handed over (\d+) times among 3 joints", make_verdict(many, summary).text)
     assert printed is not None
     assert said is not None
     assert int(printed[1]) == int(said[1]) == summary.hand_overs == len(summary.propulsion_joints or []) - 1 > 30
@@ -79,8 +80,8 @@ def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.C
 def test_the_terminal_shows_both_directions_and_what_control_reported_besides(
     record: RunRecord, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    claims = [msgspec.structs.replace(one, state="Locomoting", reason="pushing") for one in record.control]
-    summary = summarise(changed(record, control=claims), "complete")
+    claims = [msgspec.structs.replace(one, state="Locomoting", reason="pushing") for one in record.control_states]
+    summary = summarize_run(changed(record, control_states=claims), "complete")
     sideways = msgspec.structs.replace(summary, energy_j_per_m=None, displacement_energy_j_per_m=50.4)
     print_summary(sideways)
     printed = capsys.readouterr().out
@@ -89,5 +90,5 @@ def test_the_terminal_shows_both_directions_and_what_control_reported_besides(
     assert (
         "energy per meter      50.4 J/m along its displacement, too little advance along the first heading" in printed
     )
-    print_summary(summarise(record, "complete"))
+    print_summary(summarize_run(record, "complete"))
     assert "control reported" not in capsys.readouterr().out

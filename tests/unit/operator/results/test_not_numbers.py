@@ -19,16 +19,16 @@ from snakesim_hal.run_log.black_box import Layout
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.compare import page as compare_page
-from snakesim_operator.results.compare.difference import differ
-from snakesim_operator.results.compare.table import table
-from snakesim_operator.results.report import page
+from snakesim_operator.results.compare.difference import compute_difference
+from snakesim_operator.results.compare.table import format_comparison
+from snakesim_operator.results.report import render_report
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.run_reader import CONFIG
-from snakesim_operator.results.signals import recorded_arrays
-from snakesim_operator.results.summary import RunSummary, summarise
+from snakesim_operator.results.run_reader import CONFIG_FILENAME
+from snakesim_operator.results.signals import get_recorded_signals
+from snakesim_operator.results.summary import RunSummary, summarize_run
 from snakesim_testing.operator.recorded_triplet import Reader, triplet
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
@@ -56,27 +56,27 @@ WRONG = st.sampled_from(WRONG_NUMBERS)
 
 def write_record(folder: Path, record: RunRecord) -> None:
     """A record as a run leaves it."""
-    write_config(record.config, folder / CONFIG)
+    write_config(record.config, folder / CONFIG_FILENAME)
     (folder / DESCRIPTION).write_bytes(msgspec.json.encode(record.description))
     (folder / HOST_RECORD).write_bytes(msgspec.json.encode(record.host))
-    messages = [(keys.CONTROL_STATE, state) for state in record.control] + [
+    messages = [(keys.CONTROL_STATE, state) for state in record.control_states] + [
         (keys.WORLD, world) for world in record.worlds
     ]
-    layout, count = Layout.for_robot(record.description), len(record.time_s)
+    layout, count = Layout.make_for_robot(record.description), len(record.time_s)
     encoded = [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in messages]
     record_messages(folder, encoded, count)
     rows = bytearray(count * layout.row_bytes)
-    columns = layout.arrays(rows)  # pyright: ignore[reportArgumentType]
+    columns = layout.decode_rows(rows)  # pyright: ignore[reportArgumentType]
     columns["tick"][:] = FIRST_TICK + np.arange(count)
     for column in layout.columns[1:]:
         columns[column.name][:] = getattr(record, column.name)
-    (folder / BLACK_BOX).write_bytes(layout.header() + rows)
+    (folder / BLACK_BOX).write_bytes(layout.encode_header() + rows)
 
 
 def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int) -> None:
     """A recording with these messages, and the setpoints of so many ticks, of which only the number is read."""
-    (folder / RECORDING).unlink(missing_ok=True)
-    recording = RecordingWriter(folder / RECORDING)
+    (folder / RECORDING_FILENAME).unlink(missing_ok=True)
+    recording = RecordingWriter(folder / RECORDING_FILENAME)
     for key, payload in [*payloads, *[(keys.APPLIED, b"")] * ticks]:
         message = keys.find_message(key)
         assert message is not None
@@ -88,11 +88,11 @@ def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int)
 def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     folder = tmp_path_factory.mktemp("base")
     whole = triplet()
-    kept = {name: value[FIRST:LAST] for name, value in recorded_arrays(whole).items()}
+    kept = {name: value[FIRST:LAST] for name, value in get_recorded_signals(whole).items()}
     begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
     record = dataclasses.replace(
         whole,
-        control=[state for state in whole.control if begin_ns <= state.timestamp_ns <= end_ns],
+        control_states=[state for state in whole.control_states if begin_ns <= state.timestamp_ns <= end_ns],
         worlds=[world for world in whole.worlds if begin_ns <= world.timestamp_ns <= end_ns],
         host=msgspec.structs.replace(whole.host, ticks=LAST - FIRST),
         **kept,
@@ -107,8 +107,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
 def summary_and_page(record: RunRecord) -> tuple[RunSummary, Reader]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        summary = summarise(record, "complete")
-        reader = Reader(page(record, summary))
+        summary = summarize_run(record, "complete")
+        reader = Reader(render_report(record, summary))
     numbers = [value for value in msgspec.structs.astuple(summary) if isinstance(value, float)]
     assert len(numbers) > 5
     assert all(map(math.isfinite, numbers))
@@ -121,9 +121,9 @@ def summary_and_page(record: RunRecord) -> tuple[RunSummary, Reader]:
 def compared(a: RunRecord, b: RunRecord) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        difference = differ(a, b)
-        text = "\n".join(table(difference))
-        reader = Reader(compare_page.page(difference))
+        difference = compute_difference(a, b)
+        text = "\n".join(format_comparison(difference))
+        reader = Reader(compare_page.render_comparison_page(difference))
     assert not re.search(r"\b(nan|inf)\b", text + reader.text)
     for record in (a, b):
         for lack in record.missing:
@@ -182,7 +182,9 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_recording_with_nan_is_summarized(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
     write_record(tmp_path, base)
-    messages = [(keys.CONTROL_STATE, state) for state in base.control] + [(keys.WORLD, world) for world in base.worlds]
+    messages = [(keys.CONTROL_STATE, state) for state in base.control_states] + [
+        (keys.WORLD, world) for world in base.worlds
+    ]
     payloads = [(key, msgspec.msgpack.encode(message)) for key, message in messages]
     refused = 0
     for number in data.draw(st.sets(st.integers(0, len(payloads) - 1), min_size=1, max_size=8)):
@@ -199,7 +201,7 @@ def test_recording_with_nan_is_summarized(base: RunRecord, tmp_path: Path, data:
         refused += not may_be_unknown
     record_messages(tmp_path, payloads, len(base.time_s))
     record = RunRecord.load(tmp_path)
-    assert len(record.control) + len(record.worlds) == len(payloads) - refused
+    assert len(record.control_states) + len(record.worlds) == len(payloads) - refused
     lacking = [re.match(r"recording: (\d+) messages? cannot be read, (control/state|guidance/world)", lack)
             for lack in record.missing]  # fmt: skip
     assert sum(int(found[1]) for found in lacking if found) == refused

@@ -13,17 +13,17 @@ import pytest
 
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
-from snakesim_operator.results.page.charts import strongest, thinned
+from snakesim_operator.results.page.charts import find_strongest_per_bucket, select_rows_to_draw
 from snakesim_operator.results.page.html import LIBRARY
-from snakesim_operator.results.report import page as report_page
-from snakesim_operator.results.report.events import drawn_snapshots, find_events
+from snakesim_operator.results.report import render_report as report_page
+from snakesim_operator.results.report.events import find_events, select_snapshots_to_draw
 from snakesim_operator.results.report.page import ELSEWHERE
-from snakesim_operator.results.report.reasons import why_empty
-from snakesim_operator.results.report.snapshots import balanced_snapshots
-from snakesim_operator.results.report.timeline import reference_rad, state_bands
-from snakesim_operator.results.report.view import nodes_xy_w
+from snakesim_operator.results.report.reasons import explain_push_points_without_contact
+from snakesim_operator.results.report.snapshots import find_snapshots_with_force_balance
+from snakesim_operator.results.report.timeline import compute_reference_rad, find_state_intervals
+from snakesim_operator.results.report.view import find_body_points_xy_w
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import RunSummary, summarise
+from snakesim_operator.results.summary import RunSummary, summarize_run
 from snakesim_testing.operator.recorded_triplet import LOST, SECONDS, Reader, changed, read
 
 HAND_OVERS_S = (0.0, 0.28, 1.28, 2.42, 3.56, 4.72, 5.78, 6.1)
@@ -50,7 +50,7 @@ def test_report_verdict_states_distance_and_hand_overs(page: Reader) -> None:
 
 def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
     late = dataclasses.replace(record, host=msgspec.structs.replace(record.host, answered_ticks=100))
-    html = report_page(late, summarise(late, "complete"))
+    html = report_page(late, summarize_run(late, "complete"))
     red = re.findall(r'class="tile alarming">.*?<span>(.*?)</span>(?:<span class="why">(.*?)</span>)?</div>', html)
     why = {what.partition(";")[0]: reason for what, reason in red}
     assert why.keys() >= {"of the push-points carried nothing", "commands refused", "ticks whose command came in time"}
@@ -64,7 +64,7 @@ def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
     )
     assert apart is not None
     assert sum(map(int, apart.groups())) == 100
-    assert "the record does not show why" in why_empty(
+    assert "the record does not show why" in explain_push_points_without_contact(
         dataclasses.replace(late, position_w_m=late.position_w_m * np.nan)
     )
 
@@ -110,38 +110,38 @@ def test_every_series_of_the_run_is_a_chart(page: Reader) -> None:
 
 
 def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page: Reader) -> None:
-    found = find_events(record, summarise(record, "complete"))
-    assert [one.joint for one in found if one.joint is not None] == list(INTERVALS_S)
-    assert found[0].words == "Start"
-    assert found[-1].words == "Stop"
-    assert sum(one.words.startswith("Largest contact force") for one in found) == 1
-    drawn = drawn_snapshots(record, found)
-    bodies = [nodes_xy_w(record, instant.row) for _, instant in drawn]
+    found = find_events(record, summarize_run(record, "complete"))
+    assert [one.joint_index for one in found if one.joint_index is not None] == list(INTERVALS_S)
+    assert found[0].description == "Start"
+    assert found[-1].description == "Stop"
+    assert sum(one.description.startswith("Largest contact force") for one in found) == 1
+    drawn = select_snapshots_to_draw(record, found)
+    bodies = [find_body_points_xy_w(record, instant.row) for _, instant in drawn]
     assert all(np.abs(a - b).max() > 0.004 for a, b in itertools.combinations(bodies, 2))
-    said = "; ".join(event.words for event, _ in drawn)
+    said = "; ".join(event.description for event, _ in drawn)
     for words in ("Start", "joint_10 begins to propel", "Hand-over to joint_4", "Largest contact force", "Stop"):
         assert words in said
     assert len([title for title in page.titles if title.startswith("Top view at")]) == len(drawn)
 
 
 def test_forces_balance_and_add_up_to_the_commanded_one(record: RunRecord) -> None:
-    found = balanced_snapshots(record)
+    found = find_snapshots_with_force_balance(record)
     assert len(found) > 50
     for one in found:
-        assert one.balance is not None
-        assert one.balance.gap_n < 1e-9
+        assert one.force_balance is not None
+        assert one.force_balance.closure_error_n < 1e-9
         assert one.state is not None
         assert one.state.propulsion_n is not None
-        ahead = one.state.propulsion_n * np.array(one.balance.contacts[0].tangent_w[:2])
-        assert np.allclose(one.balance.resultant_n, ahead, atol=1e-9)
+        ahead = one.state.propulsion_n * np.array(one.force_balance.contacts[0].tangent_w[:2])
+        assert np.allclose(one.force_balance.resultant_force_n, ahead, atol=1e-9)
 
 
 def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, record: RunRecord) -> None:
     figure = r'<svg viewBox="[^"]*" class="figure" role="img" aria-label="Force polygon.*?</svg>'
     polygons = re.findall(figure, page.html)
     lengths = [math.dist(*edge) for svg in polygons for edge in drawn_edges(svg, "commanded")]
-    drawn = drawn_snapshots(record, find_events(record, summarise(record, "complete")))
-    forces_n = [one.state.propulsion_n for _, one in drawn if one.balance is not None and one.state is not None]
+    drawn = select_snapshots_to_draw(record, find_events(record, summarize_run(record, "complete")))
+    forces_n = [one.state.propulsion_n for _, one in drawn if one.force_balance is not None and one.state is not None]
     assert len(lengths) == len(polygons) == len(forces_n) > 2
     assert lengths == pytest.approx([lengths[0] / (forces_n[0] or 0) * (force_n or 0) for force_n in forces_n], abs=0.5)
     ring = drawn_edges(polygons[0], "solved")
@@ -191,10 +191,11 @@ def drawn_edges(svg: str, kind: str) -> list[tuple[tuple[float, float], tuple[fl
 
 def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
     more = [
-        msgspec.structs.replace(one, desired_force_n=[1.3 * f for f in one.desired_force_n]) for one in record.control
+        msgspec.structs.replace(one, desired_force_n=[1.3 * f for f in one.desired_force_n])
+        for one in record.control_states
     ]
-    wrong = changed(record, control=more)
-    assert balanced_snapshots(wrong) == []
+    wrong = changed(record, control_states=more)
+    assert find_snapshots_with_force_balance(wrong) == []
     assert "whose forces balance" in read(wrong).text
 
 
@@ -209,7 +210,7 @@ def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page
 
 
 def test_report_contains_the_command_of_the_run(page: Reader, record: RunRecord) -> None:
-    assert f"snakesim run {record.folder}/config.json --backend sim --seed 1" in page.html
+    assert f"snakesim run {record.path}/config.json --backend sim --seed 1" in page.html
     assert "&#34;amplitude_m&#34;: 0.045" in page.html
 
 
@@ -218,17 +219,17 @@ def test_report_contains_the_command_of_the_run(page: Reader, record: RunRecord)
 
 def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
     intervals = find_propulsion_intervals(record)
-    assert [one.joint for one in intervals] == list(INTERVALS_S)
+    assert [one.joint_index for one in intervals] == list(INTERVALS_S)
     for one in intervals:
-        assert (one.start_s, one.end_s) == pytest.approx(INTERVALS_S[one.joint], abs=0.051)
-    assert [band.what for band in state_bands(record)] == ["NotLocomoting", "Locomoting", "NotLocomoting"]
-    assert state_bands(record)[-1].end_s == pytest.approx(SECONDS)
+        assert (one.start_s, one.end_s) == pytest.approx(INTERVALS_S[one.joint_index], abs=0.051)
+    assert [band.label for band in find_state_intervals(record)] == ["NotLocomoting", "Locomoting", "NotLocomoting"]
+    assert find_state_intervals(record)[-1].end_s == pytest.approx(SECONDS)
 
 
 def test_report_reference_depends_on_mode_of_joint(
     record: RunRecord,
 ) -> None:
-    reference = reference_rad(record, 6)
+    reference = compute_reference_rad(record, 6)
     free = record.mode[:, 6] == Mode.TORQUE
     assert np.array_equal(reference[~free], record.target[~free, 6])
     assert np.abs(reference[free] - record.target[free, 6]).max() > 1  # no torque is taken for an angle
@@ -239,12 +240,12 @@ def test_report_reference_depends_on_mode_of_joint(
 def test_thinning_keeps_extremes_and_gaps() -> None:
     values = np.sin(np.linspace(0.0, 100.0, 100_000))
     values[54_321], values[12_345], values[70_000:71_000] = 9.0, -9.0, np.nan
-    kept = values[thinned(values)]
+    kept = values[select_rows_to_draw(values)]
     assert len(kept) <= 1510
     assert np.nanmax(kept) == 9.0
     assert np.nanmin(kept) == -9.0
     assert np.isnan(kept).any()
-    columns = strongest(np.stack([values, np.full_like(values, np.nan)], axis=1), 480)
+    columns = find_strongest_per_bucket(np.stack([values, np.full_like(values, np.nan)], axis=1), 480)
     assert columns.shape == (480, 2)
     assert np.nanmax(columns) == 9.0
     assert np.nanmin(columns) == -9.0
@@ -262,7 +263,7 @@ def test_report_yielding_obstacle_is_dashed_and_described(page: Reader, record: 
     made = msgspec.structs.replace(row, lean_rad=0.2, stiffness_n_per_m=800.0, mass_kg=2.0, base_friction=0.5)
     scene = msgspec.structs.replace(record.config.scene, pegs_along_route=[made])
     loose = dataclasses.replace(record, config=msgspec.structs.replace(record.config, scene=scene))
-    html = report_page(loose, summarise(loose, "complete"))
+    html = report_page(loose, summarize_run(loose, "complete"))
     assert 'class="peg yields"' in html
     assert 'class="peg yields"' not in page.html
     said = (

@@ -15,12 +15,12 @@ from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
 from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
-from snakesim_operator.results.report import page as report_page
-from snakesim_operator.results.report.verdict import Verdict, verdict
+from snakesim_operator.results.report import render_report as report_page
+from snakesim_operator.results.report.verdict import Verdict, make_verdict
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.summary import summarise
-from snakesim_operator.run.conclusion import note_reasons
-from snakesim_operator.run.ending import Ending
+from snakesim_operator.results.summary import summarize_run
+from snakesim_operator.run.conclusion import add_end_causes
+from snakesim_operator.run.ending import RunEnding
 from snakesim_testing.operator.recorded_triplet import (
     ARMED_S,
     LOST,
@@ -45,7 +45,7 @@ MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
 
 
 def test_report_without_recording_has_all_sections(short_record: RunRecord) -> None:
-    page = read(changed(short_record, control=[], worlds=[]))
+    page = read(changed(short_record, control_states=[], worlds=[]))
     assert "recording holds no message of the controller" in page.text
     assert "No joint propelled" in page.text
     assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
@@ -64,9 +64,9 @@ def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
             for k in range(times)
             for one in reported
         ]
-        for reported in (record.control, record.worlds)
+        for reported in (record.control_states, record.worlds)
     ]
-    page = read(changed(record, control=later[0], worlds=later[1], **long))  # holds the size against the limit
+    page = read(changed(record, control_states=later[0], worlds=later[1], **long))  # holds the size against the limit
     assert len(page.film["frames"]) <= 300
     assert "handed over 419 times among 7 joints" in page.text
 
@@ -79,7 +79,7 @@ def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
     page = read(blind)
     assert "No playback: no valid pose was recorded." in page.text
     assert "pose sensor" not in page.text
-    assert "pose sensor" not in verdict(blind, summarise(blind, "complete")).words  # the robot has one
+    assert "pose sensor" not in make_verdict(blind, summarize_run(blind, "complete")).text  # the robot has one
     assert not [title for title in page.titles if title.startswith("Top view")]
     assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
 
@@ -98,7 +98,7 @@ def test_report_without_ticks_names_the_end(short_record: RunRecord) -> None:
         name: getattr(short_record, name)[:0] for name in fields if isinstance(getattr(short_record, name), np.ndarray)
     }
     host = msgspec.structs.replace(short_record.host, ticks=0, armed_ticks=0, answered_ticks=0)
-    page = read(changed(short_record, control=[], worlds=[], host=host, **empty), "the host never became ready")
+    page = read(changed(short_record, control_states=[], worlds=[], host=host, **empty), "the host never became ready")
     assert "Nothing was recorded: the robot was never armed (the host never became ready)." in page.text
 
 
@@ -111,9 +111,9 @@ def test_report_without_contact_sensor_has_all_sections(short_record: RunRecord)
 
 def test_report_of_controller_without_push_points_has_all_sections(short_record: RunRecord) -> None:
     nothing = {"push_points": [], "desired_force_n": [], "propulsion_joint": None, "propulsion_n": None}
-    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in short_record.control]
+    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in short_record.control_states]
     config_ = msgspec.structs.replace(short_record.config, controller="hold")
-    page = read(changed(short_record, control=plain, config=config_))
+    page = read(changed(short_record, control_states=plain, config=config_))
     assert "controller hold solved for no push-points" in page.text
     assert "controller hold named no propulsion joint" in page.text
     assert re.search("measured contacts?, in sum", page.text)
@@ -135,16 +135,14 @@ def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
 def test_report_of_harmless_fault_says_run_continued(short_record: RunRecord, joint: str | None) -> None:
     """The host noted it before the first arming; the run was complete."""
     noting = Authority(short_record.description)
-    noting.record_fault(
-        Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint)
-    )
+    noting.log_fault(Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint))
     host = msgspec.structs.replace(short_record.host, faults=noting.faults, ended="complete")
     page = read(changed(short_record, host=host))
     assert "Stopped by a fault" not in page.text
     assert "went on without" not in page.text
     assert "a fault (supply and heat are unknown, and ignored), 2 commands refused" in page.text
-    ending = Ending()
-    note_reasons(ending, host, short_record.config)
+    ending = RunEnding()
+    add_end_causes(ending, host, short_record.config)
     assert ending.reason is None, "or `snakesim run` ends with exit code 1"
 
 
@@ -170,67 +168,72 @@ def test_report_of_run_jammed_later_says_jammed(record: RunRecord) -> None:
         msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")
         if state.timestamp_ns > (ARMED_S + 6.09) * 1e9
         else state
-        for state in record.control
+        for state in record.control_states
     ]
-    page = read(changed(record, control=stuck))
+    page = read(changed(record, control_states=stuck))
     assert "Jammed at 6.3 s of 10.0 s: wedged. Moved 0.62 m along the path" in page.text
 
 
 def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
     """The same run, in which nothing moves any more from a time on, and control reports this."""
-    row = record.row_at(float(record.time_s[0]) + at_s)
+    row = record.find_nearest_row(float(record.time_s[0]) + at_s)
     held = {name: getattr(record, name).copy() for name in MOVING}
     for column in held.values():
         column[row:] = column[row]
     since_ns = (float(record.time_s[0]) + at_s) * 1e9
-    control = [msgspec.structs.replace(one, **state) if one.timestamp_ns > since_ns else one for one in record.control]
-    return changed(record, control=control, **held)
+    control = [
+        msgspec.structs.replace(one, **state) if one.timestamp_ns > since_ns else one for one in record.control_states
+    ]
+    return changed(record, control_states=control, **held)
 
 
 def judged(record: RunRecord) -> Verdict:
-    return verdict(record, summarise(record, "complete"))
+    return make_verdict(record, summarize_run(record, "complete"))
 
 
 def test_report_of_mostly_standing_run_is_not_good(record: RunRecord) -> None:
-    assert judged(record).kind == "good"
+    assert judged(record).rating == "good"
     lost = judged(stopped_at(record, 4.0, state="NotLocomoting", reason=LOST))
-    assert lost.kind == "poor"
-    assert lost.words.startswith(f"Stopped at 4.0 s of 10.0 s: {LOST}. Moved 0.")
+    assert lost.rating == "poor"
+    assert lost.text.startswith(f"Stopped at 4.0 s of 10.0 s: {LOST}. Moved 0.")
     late = judged(stopped_at(record, 5.5, state="NotLocomoting", reason=LOST))
-    assert late.kind == "good"
-    assert f"Locomotion ended at 5.4 s of 10.0 s: {LOST}" in late.words
+    assert late.rating == "good"
+    assert f"Locomotion ended at 5.4 s of 10.0 s: {LOST}" in late.text
 
 
 def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
     """A controller that tries again and again, and each time says for a moment that it moves."""
     stuck = stopped_at(record, 6.0, state="NotLocomoting", reason="jammed: wedged", jammed=True)
-    trying = [*stuck.control[:-1], msgspec.structs.replace(stuck.control[-1], state="Locomoting", reason="pushing")]
-    found = judged(changed(stuck, control=trying))
-    assert found.kind == "poor"
-    assert found.words.startswith("Jammed at 6.0 s of 10.0 s: wedged. Moved")
+    trying = [
+        *stuck.control_states[:-1],
+        msgspec.structs.replace(stuck.control_states[-1], state="Locomoting", reason="pushing"),
+    ]
+    found = judged(changed(stuck, control_states=trying))
+    assert found.rating == "poor"
+    assert found.text.startswith("Jammed at 6.0 s of 10.0 s: wedged. Moved")
     claims = judged(stopped_at(record, 4.0, state="Locomoting", reason="pushing"))
-    assert claims.kind == "poor"
-    assert claims.words.startswith("Stopped at 4.0 s of 10.0 s: standing still: less than 20 mm in 1 s. Moved 0.")
-    assert "reported" not in claims.words, "`pushing` is what control measured, not a report of the controller"
+    assert claims.rating == "poor"
+    assert claims.text.startswith("Stopped at 4.0 s of 10.0 s: standing still: less than 20 mm in 1 s. Moved 0.")
+    assert "reported" not in claims.text, "`pushing` is what control measured, not a report of the controller"
 
 
 def test_report_of_rest_at_path_end_is_no_failure(record: RunRecord) -> None:
     rests = judged(stopped_at(record, 4.0, state="Idle", reason="no motion intended: the path is finished"))
-    assert rests.kind == "good"
-    assert "Locomotion ended at 4.0 s" in rests.words
+    assert rests.rating == "good"
+    assert "Locomotion ended at 4.0 s" in rests.text
 
 
 def test_report_motion_is_measured_despite_control_reports(record: RunRecord) -> None:
     """State and share of time are the same for a controller that reports nothing, falls silent, or claims to stand."""
-    whole = summarise(record, "complete")
+    whole = summarize_run(record, "complete")
     assert whole.locomoting_fraction == pytest.approx(0.63, abs=0.01)
-    silent = [state for state in record.control if state.timestamp_ns < (ARMED_S + 4.0) * 1e9]
-    claims = [msgspec.structs.replace(one, state="NotLocomoting", reason="lost") for one in record.control]
+    silent = [state for state in record.control_states if state.timestamp_ns < (ARMED_S + 4.0) * 1e9]
+    claims = [msgspec.structs.replace(one, state="NotLocomoting", reason="lost") for one in record.control_states]
     for control in (silent, [], claims):
-        reported = summarise(changed(record, control=control), "complete")
+        reported = summarize_run(changed(record, control_states=control), "complete")
         assert reported.locomoting_fraction == whole.locomoting_fraction
         assert reported.last_state == "NotLocomoting"
-    moving = summarise(changed(record, control=[]), "complete")
+    moving = summarize_run(changed(record, control_states=[]), "complete")
     assert moving.last_reason == "standing still: less than 20 mm in 1 s"
     assert moving.reported_state is None
 
@@ -238,8 +241,8 @@ def test_report_motion_is_measured_despite_control_reports(record: RunRecord) ->
 def test_report_of_standing_run_contradicts_its_controller(record: RunRecord) -> None:
     stands = stopped_at(record, 0.0, state="Locomoting", reason="moving")
     found = judged(stands)
-    assert "Did not locomote: standing still: less than 20 mm in 1 s." in found.words
-    reported = summarise(stands, "complete")
+    assert "Did not locomote: standing still: less than 20 mm in 1 s." in found.text
+    reported = summarize_run(stands, "complete")
     assert reported.last_state == "NotLocomoting"
     assert reported.reported_state == "Locomoting"
     assert reported.locomoting_fraction == 0
@@ -253,13 +256,13 @@ def test_report_of_moving_run_contradicts_its_controller(record: RunRecord) -> N
         msgspec.structs.replace(one, state="NotLocomoting", reason="contacts lost")
         if one.timestamp_ns > since_ns
         else one
-        for one in record.control
+        for one in record.control_states
     ]
-    found = judged(changed(record, control=lost))
-    assert found.kind == "good"
-    assert found.words.startswith("Moved 0.62 m along the path in 10.0 s;")
-    assert "Locomotion ended at 6.3 s of 10.0 s: contacts lost." in found.words
-    said = re.search(r'For (\d\.\d) s of its motion control reported "contacts lost"\.', found.words)
+    found = judged(changed(record, control_states=lost))
+    assert found.rating == "good"
+    assert found.text.startswith("Moved 0.62 m along the path in 10.0 s;")
+    assert "Locomotion ended at 6.3 s of 10.0 s: contacts lost." in found.text
+    said = re.search(r'For (\d\.\d) s of its motion control reported "contacts lost"\.', found.text)
     assert said is not None
     assert float(said[1]) == pytest.approx(6.3 - 2.2, abs=0.15)
 
@@ -268,20 +271,26 @@ def test_report_of_run_moving_to_its_end_says_so(record: RunRecord) -> None:
     rows = slice(0, 500)
     fields = [field.name for field in dataclasses.fields(record)]
     short = {name: getattr(record, name)[rows] for name in fields if isinstance(getattr(record, name), np.ndarray)}
-    cut = changed(record, **short, control=[one for one in record.control if one.timestamp_ns < (ARMED_S + 5.0) * 1e9])
+    cut = changed(
+        record,
+        **short,
+        control_states=[one for one in record.control_states if one.timestamp_ns < (ARMED_S + 5.0) * 1e9],
+    )
     found = judged(cut)
-    assert found.kind == "good"
-    assert "along the path in 10.0 s, and was still moving at the end;" in found.words
-    assert summarise(cut, "complete").locomoting_fraction == 1.0
+    assert found.rating == "good"
+    assert "along the path in 10.0 s, and was still moving at the end;" in found.text
+    assert summarize_run(cut, "complete").locomoting_fraction == 1.0
 
 
 def test_report_escapes_text_of_the_run(short_record: RunRecord) -> None:
     nasty = '<script>alert("x")</script>&'
     config_ = msgspec.structs.replace(short_record.config, title=nasty)
-    reported = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in short_record.control]
+    reported = [
+        msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in short_record.control_states
+    ]
     host = msgspec.structs.replace(short_record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
-    hurt = changed(short_record, config=config_, control=reported, host=host)
-    page = report_page(hurt, summarise(hurt, nasty))
+    hurt = changed(short_record, config=config_, control_states=reported, host=host)
+    page = report_page(hurt, summarize_run(hurt, nasty))
     assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert") >= 5
     assert nasty in Reader(page).text
@@ -294,7 +303,7 @@ def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> No
         msgspec.structs.replace(one, propulsion_joint=one.propulsion_joint.replace("joint_", nasty))
         if one.propulsion_joint
         else one
-        for one in short_record.control
+        for one in short_record.control_states
     ]
     pegs_ = [
         msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(short_record.config.scene.cylinder)
@@ -302,9 +311,12 @@ def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> No
     scene = msgspec.structs.replace(short_record.config.scene, cylinder=pegs_)
     config_ = msgspec.structs.replace(short_record.config, scene=scene)
     hurt = changed(
-        short_record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_
+        short_record,
+        description=msgspec.json.decode(encoded, type=Description),
+        control_states=reported,
+        config=config_,
     )
-    page = report_page(hurt, summarise(hurt, "complete"))
+    page = report_page(hurt, summarize_run(hurt, "complete"))
     assert find_propulsion_intervals(hurt)
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
@@ -319,7 +331,7 @@ def test_report_map_of_upward_snake_is_rotated(short_record: RunRecord) -> None:
         position_w_m=short_record.position_w_m[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
         orientation_wxyz=np.tile(quaternion_from_yaw(math.pi / 2 + 0.4), (count, 1)),
         worlds=[],
-        control=[],
+        control_states=[],
     )
     sizes = [
         [float(n) for n in value.split()][2:]

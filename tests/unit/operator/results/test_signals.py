@@ -9,10 +9,17 @@ from snakesim_hal.wire import messages as m
 from snakesim_operator.results.contact_log import MAX_OBSTACLES, OTHER, UNIDENTIFIED, ContactCollector
 from snakesim_operator.results.metrics.directions import measure_slip
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.signals import UNITS, arrays, name_parts, select_columns, table, unit_of
-from snakesim_operator.results.signals.contact_forces import find_contact_signals
-from snakesim_operator.results.signals.motion import find_motion_signals
-from snakesim_operator.results.summary import summarise
+from snakesim_operator.results.signals import (
+    UNITS,
+    compute_signals,
+    find_unit,
+    list_component_names,
+    make_signal_columns,
+    select_columns,
+)
+from snakesim_operator.results.signals.contact_forces import compute_contact_signals
+from snakesim_operator.results.signals.motion import compute_motion_signals
+from snakesim_operator.results.summary import summarize_run
 
 SPEED_M_S = 0.2
 YAW_RAD = 0.5
@@ -47,7 +54,7 @@ def make_straight_run(record: RunRecord, direction_rad: float, turn_rate_rad_s: 
 
 def test_velocity_is_in_world_and_body_frame(record: RunRecord) -> None:
     sideways = make_straight_run(record, YAW_RAD + np.pi / 2)
-    motion = find_motion_signals(sideways)
+    motion = compute_motion_signals(sideways)
     expected_w = SPEED_M_S * np.array([-np.sin(YAW_RAD), np.cos(YAW_RAD), 0.0])
     assert motion["velocity_w_m_s"] == pytest.approx(np.tile(expected_w, (len(record.time_s), 1)), abs=1e-9)
     assert motion["velocity_b_m_s"] == pytest.approx(np.tile([0.0, SPEED_M_S, 0.0], (len(record.time_s), 1)), abs=1e-9)
@@ -55,7 +62,7 @@ def test_velocity_is_in_world_and_body_frame(record: RunRecord) -> None:
 
 
 def test_turn_rate_has_no_jump_where_the_heading_passes_half_a_turn(record: RunRecord) -> None:
-    motion = find_motion_signals(make_straight_run(record, 0.0, turn_rate_rad_s=1.0))
+    motion = compute_motion_signals(make_straight_run(record, 0.0, turn_rate_rad_s=1.0))
     assert motion["turn_rate_rad_s"] == pytest.approx(np.ones(len(record.time_s)))
 
 
@@ -63,14 +70,14 @@ def test_no_velocity_reaches_over_a_gap(record: RunRecord) -> None:
     run = make_straight_run(record, 0.0)
     time_s = run.time_s.copy()
     time_s[500:] += 2.0  # the body goes on at its place after two seconds
-    velocity_w = find_motion_signals(dataclasses.replace(run, time_s=time_s))["velocity_w_m_s"]
+    velocity_w = compute_motion_signals(dataclasses.replace(run, time_s=time_s))["velocity_w_m_s"]
     assert velocity_w[:, 0] == pytest.approx(np.full(len(time_s), SPEED_M_S))
 
 
 def test_body_frame_is_unknown_while_head_and_tail_meet(record: RunRecord) -> None:
     angle_rad = np.zeros_like(record.angle_rad)
     angle_rad[:, len(record.description.links) // 2 - 1] = np.pi  # folded in the middle
-    motion = find_motion_signals(dataclasses.replace(make_straight_run(record, 0.0), angle_rad=angle_rad))
+    motion = compute_motion_signals(dataclasses.replace(make_straight_run(record, 0.0), angle_rad=angle_rad))
     assert np.isnan(motion["heading_w_rad"]).all()
     assert np.isnan(motion["velocity_b_m_s"]).all()
     assert np.isfinite(motion["velocity_w_m_s"]).all()
@@ -86,33 +93,33 @@ def test_forces_add_up_on_links_and_obstacles(record: RunRecord) -> None:
         make_contact(2, None, (0.0, 0.0, 2.0)),
         make_contact(60, "peg_2", (9.0, 9.0, 9.0)),  # no link of this robot
     ]
-    collector.add(m.Contacts(tick=first_tick + 2, timestamp_ns=0, contacts=contacts))
-    collector.add(m.Contacts(tick=first_tick + 4, timestamp_ns=0, contacts=[]))
+    collector.add_sample(m.Contacts(tick=first_tick + 2, timestamp_ns=0, contacts=contacts))
+    collector.add_sample(m.Contacts(tick=first_tick + 4, timestamp_ns=0, contacts=[]))
     run = dataclasses.replace(make_straight_run(record, 0.0), contact_log=collector.make_log())
-    forces = find_contact_signals(run)
+    forces = compute_contact_signals(run)
 
     assert np.isnan(forces["link_force_n"][:2]).all()
     assert forces["link_force_l_n"][2, 0].tolist() == [4.0, 3.0, 0.0]
     assert forces["link_force_n"][3, 0] == 5.0  # the newest sample counts
     assert (forces["link_force_n"][4:] == 0.0).all()
-    assert name_parts("obstacle_force_n", run) == ["peg_2", "peg_10", UNIDENTIFIED]
+    assert list_component_names("obstacle_force_n", run) == ["peg_2", "peg_10", UNIDENTIFIED]
     assert forces["obstacle_force_n"][2].tolist() == pytest.approx([4.0, 4.0, 2.0])
     left_w = [-np.sin(YAW_RAD), np.cos(YAW_RAD), 0.0]
     assert forces["obstacle_force_w_n"][2, 0] == pytest.approx(4.0 * np.array(left_w))
-    columns = table(run)
+    columns = make_signal_columns(run)
     assert columns["obstacle_force_n.peg_10"][2] == pytest.approx(4.0)
     assert list(select_columns("link_force_l_n.link_5", columns)) == [f"link_force_l_n.link_5.{axis}" for axis in "xyz"]
 
 
 def test_forces_of_obstacles_have_a_magnitude_without_a_pose(record: RunRecord) -> None:
     collector = ContactCollector()
-    collector.add(
+    collector.add_sample(
         m.Contacts(tick=int(record.ticks[0]), timestamp_ns=0, contacts=[make_contact(1, "peg", (0.0, 3.0, 4.0))])
     )
     blind = dataclasses.replace(
         record, position_w_m=np.full_like(record.position_w_m, np.nan), contact_log=collector.make_log()
     )
-    forces = find_contact_signals(blind)
+    forces = compute_contact_signals(blind)
     assert forces["obstacle_force_n"][0, 0] == pytest.approx(5.0)
     assert np.isnan(forces["obstacle_force_w_n"]).all()
 
@@ -121,7 +128,7 @@ def test_number_of_obstacle_columns_is_bounded() -> None:
     collector = ContactCollector()
     contacts = [make_contact(0, f"peg_{i}", (1.0, 0.0, 0.0)) for i in range(MAX_OBSTACLES + 20)]
     for tick, contact in enumerate(contacts):
-        collector.add(m.Contacts(tick=tick, timestamp_ns=0, contacts=[contact]))
+        collector.add_sample(m.Contacts(tick=tick, timestamp_ns=0, contacts=[contact]))
     log = collector.make_log()
     assert len(log.obstacles) == MAX_OBSTACLES + 1
     assert OTHER in log.obstacles
@@ -129,17 +136,17 @@ def test_number_of_obstacle_columns_is_bounded() -> None:
 
 def test_strongest_link_force_of_a_run_is_that_of_its_contacts(record: RunRecord) -> None:
     """The run as recorded: the sensor's own mean over 50 ms cannot be above the strongest force."""
-    forces = arrays(record)["link_force_n"]
+    forces = compute_signals(record)["link_force_n"]
     assert np.nanmax(forces) >= np.nanmax(record.contact_peak_n) > 1.0
 
 
 def test_every_signal_has_a_unit(record: RunRecord) -> None:
-    for name in [*arrays(record), *table(record)]:
-        assert unit_of(name, record) == UNITS[name.partition(".")[0]]
+    for name in [*compute_signals(record), *make_signal_columns(record)]:
+        assert find_unit(name, record) == UNITS[name.partition(".")[0]]
 
 
 def test_sideways_motion_counts_along_the_displacement(record: RunRecord) -> None:
-    summary = summarise(make_straight_run(record, YAW_RAD + np.pi / 2), "complete")
+    summary = summarize_run(make_straight_run(record, YAW_RAD + np.pi / 2), "complete")
     assert summary.heading_advance_m == pytest.approx(0.0, abs=1e-6)
     assert summary.heading_energy_j_per_m is None
     assert summary.displacement_m_s == pytest.approx(SPEED_M_S, rel=0.01)
@@ -161,7 +168,7 @@ def test_body_that_slides_to_and_fro_slips(record: RunRecord) -> None:
     position_w = run.position_w_m.copy()
     turn = round(0.75 * len(position_w))
     position_w[turn:] = position_w[turn - 1] - (position_w[turn:] - position_w[turn - 1])
-    summary = summarise(dataclasses.replace(run, position_w_m=position_w), "complete")
+    summary = summarize_run(dataclasses.replace(run, position_w_m=position_w), "complete")
     assert summary.displacement_slip == pytest.approx(0.5, abs=0.02)
     assert summary.lateral_slip == pytest.approx(0.0, abs=1e-9)
 
@@ -169,5 +176,5 @@ def test_body_that_slides_to_and_fro_slips(record: RunRecord) -> None:
 def test_slip_of_a_resting_body_is_unknown(record: RunRecord) -> None:
     run = make_straight_run(record, 0.0)
     slip = measure_slip(dataclasses.replace(run, position_w_m=np.zeros_like(run.position_w_m)), 0.0)
-    assert slip.along_path is None
+    assert slip.longitudinal is None
     assert slip.lateral is None

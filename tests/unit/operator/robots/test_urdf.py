@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import decode, list_shipped, read_part
+from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
+from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, parse_set_option
 from snakesim_operator.cli import main
 from snakesim_operator.features.robots.command import export_robot, import_robot
-from snakesim_operator.features.robots.exporting import export_urdf
+from snakesim_operator.features.robots.exporting import format_urdf
 from snakesim_operator.features.robots.imported import ImportOptions, ImportResult
 from snakesim_operator.features.robots.importing import import_urdf
-from snakesim_operator.features.robots.meshes import read_vertices
+from snakesim_operator.features.robots.meshes import read_mesh_vertices
 from snakesim_operator.features.robots.toml_text import format_toml
 from snakesim_operator.run.in_process import simulate
-from snakesim_sim_backend.model.build import build
+from snakesim_sim_backend.model.build import build_sim_model
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
 
@@ -30,11 +30,11 @@ READ_ALL = '<mujoco><compiler fusestatic="false" discardvisual="false" strippath
 
 
 def config(scenario: str, robot: Path, *sets: str) -> RunConfig:
-    return load(scenario, [Override("robot", str(robot), "--set"), *map(parse_set, sets)]).config
+    return load_scenario(scenario, [Override("robot", str(robot), "--set"), *map(parse_set_option, sets)]).config
 
 
 def robot_at(name: str | Path) -> RobotFile:
-    return decode(read_part(str(name), "robots"), RobotFile)
+    return decode_table(read_table_with_base(str(name), "robots"), RobotFile)
 
 
 def by_mujoco(text: str, meshes: Path = HERE) -> mujoco.MjModel:
@@ -62,10 +62,10 @@ def ours(found: ImportResult, tmp_path: Path) -> mujoco.MjModel:
 def simulated(robot: Path) -> mujoco.MjModel:
     """The simulator's model, the robot beside the obstacles."""
     beside = config("peg_row", robot, "start.on_route=false", "start.position_m=[-9.0, 9.0]")
-    return build(beside, SimSettings()).model
+    return build_sim_model(beside, SimSettings()).model
 
 
-@pytest.mark.parametrize("name", list_shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped_names("robots"))
 def test_urdf_round_trip_keeps_every_shipped_robot(name: str, tmp_path: Path) -> None:
     file, back = tmp_path / "robot.urdf", tmp_path / "robot.toml"
     export_robot(name, file)
@@ -84,7 +84,7 @@ def test_urdf_round_trip_keeps_limits_and_friction_of_each_joint(tmp_path: Path)
     import_robot(tmp_path / "own.urdf", ImportOptions(), back)
     robot = robot_at(own)
     assert robot_at(back) == robot
-    theirs = by_mujoco(export_urdf(robot))
+    theirs = by_mujoco(format_urdf(robot))
     assert theirs.joint("joint_2").range == pytest.approx([-0.4, 1.5708])
     assert theirs.joint("joint_5").range == pytest.approx([-0.8, 0.8])
     assert theirs.joint("joint_5").frictionloss[0] == 0.1
@@ -106,10 +106,10 @@ def test_urdf_import_has_exceptions_only_for_differing_joints() -> None:
     assert sides == [(-1.5, 1.5), (-1.4, 1.6), *[(-1.5, 1.5)] * 4], "its angle is negated"
 
 
-@pytest.mark.parametrize("name", list_shipped("robots"))
+@pytest.mark.parametrize("name", list_shipped_names("robots"))
 def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str) -> None:
     robot = robot_at(name)
-    theirs = by_mujoco(export_urdf(robot))
+    theirs = by_mujoco(format_urdf(robot))
     own = simulated(Path(name))
     np.testing.assert_allclose(hinge_inertia(theirs), hinge_inertia(own), rtol=1e-6, atol=1e-9)
     for i in range(robot.chain.modules + 1):
@@ -243,11 +243,11 @@ def test_urdf_mesh_is_text_or_binary_and_missing_one_reported(tmp_path: Path) ->
     (tmp_path / "a.stl").write_text(
         "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 2 0\n"
     )
-    assert read_vertices(tmp_path / "a.stl").max(axis=0).tolist() == [1.0, 2.0, 0.0]
-    assert read_vertices(HERE / "meshes" / "segment.stl").max(axis=0) == pytest.approx([90.0, 32.0, 32.0])
+    assert read_mesh_vertices(tmp_path / "a.stl").max(axis=0).tolist() == [1.0, 2.0, 0.0]
+    assert read_mesh_vertices(HERE / "meshes" / "segment.stl").max(axis=0) == pytest.approx([90.0, 32.0, 32.0])
     (tmp_path / "b.stl").write_bytes(b"solid\nvertex a b c\n")
     with raises_error(ConfigError, code="urdf/invalid"):
-        read_vertices(tmp_path / "b.stl")
+        read_mesh_vertices(tmp_path / "b.stl")
     (tmp_path / "far.urdf").write_text(SLIDER.read_text())
     assert "mesh 'package://slider_description/meshes/head.obj' left out: not on this computer" in "\n".join(
         import_urdf(tmp_path / "far.urdf", ImportOptions()).left_out

@@ -18,14 +18,14 @@ import msgspec
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.command import import_robot
-from snakesim_operator.features.robots.exporting import export_urdf
+from snakesim_operator.features.robots.exporting import format_urdf
 from snakesim_operator.features.robots.imported import ImportOptions, ImportResult
 from snakesim_operator.features.robots.importing import import_urdf
-from snakesim_operator.features.robots.joint_limits import NUMBERS
+from snakesim_operator.features.robots.joint_limits import JOINT_NUMBERS
 from snakesim_testing.messages import raises_error
 
 SNAKE = (Path(__file__).parent / "urdf" / "every_attribute.urdf").read_text()
@@ -391,9 +391,9 @@ def test_bounds_are_those_of_a_robot_file() -> None:
         "limits": (Limits, dict.fromkeys(("angle_rad", "acceleration_rad_s2", "torque_rate_nm_s"), 1.0)),
         "motor": (Motor, dict.fromkeys((*motor, "armature_kg_m2"), 0.5)),
     }
-    for number in NUMBERS:
+    for number in JOINT_NUMBERS:
         struct, values = good[number.section]
-        values = values | {other.key: 0.5 for other in NUMBERS if other.section == number.section}
+        values = values | {other.key: 0.5 for other in JOINT_NUMBERS if other.section == number.section}
         msgspec.convert({**values, number.key: number.maximum}, struct)
         with pytest.raises(msgspec.ValidationError):
             msgspec.convert({**values, number.key: number.maximum * 1.001}, struct)
@@ -401,7 +401,7 @@ def test_bounds_are_those_of_a_robot_file() -> None:
 
 def test_urdf_report_edit_of_our_export_counts_or_is_listed(tmp_path: Path) -> None:
     file = tmp_path / "robot.urdf"
-    text = export_urdf(decode(read_part("planar13_camera", "robots"), RobotFile))
+    text = format_urdf(decode_table(read_table_with_base("planar13_camera", "robots"), RobotFile))
     file.write_text(text)
     back = import_urdf(file, ImportOptions())
     assert not back.changed

@@ -8,12 +8,12 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.wire import messages as m
-from snakesim_operator.features.ros2.bag import convert_recording
+from snakesim_operator.features.ros2.bag import convert_recording_to_rosbag
 from snakesim_operator.features.ros2.contact_wrenches import sum_wrenches
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.signals import arrays
+from snakesim_operator.results.signals import compute_signals
 from snakesim_operator.run.in_process import simulate
 
 YEAR_2020_S = 1_577_836_800
@@ -22,7 +22,7 @@ YEAR_2020_S = 1_577_836_800
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("bag") / "run"
-    simulate(load("triplet", [parse_set("duration_s=0.5")]).config, out)
+    simulate(load_scenario("triplet", [parse_set_option("duration_s=0.5")]).config, out)
     return out
 
 
@@ -61,11 +61,11 @@ def test_wrench_of_a_link_is_the_sum_about_its_frame() -> None:
 
 def test_bag_has_the_run_in_the_types_of_ros(run: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    assert convert_recording(run, tmp_path / "bag", lines.append, wall_time=False) == 0
+    assert convert_recording_to_rosbag(run, tmp_path / "bag", lines.append, wall_time=False) == 0
     assert sorted(file.name for file in (tmp_path / "bag").iterdir()) == ["bag.mcap", "metadata.yaml"]
     found = read_bag(tmp_path / "bag")
     record = RunRecord.load(run)
-    forces_l_n = arrays(record)["link_force_l_n"]
+    forces_l_n = compute_signals(record)["link_force_l_n"]
     names = [link.name for link in record.description.links]
     assert {"/joint_states", "/tf", "/tf_static", "/robot_description", "/diagnostics", "/clock"} <= set(found)
 
@@ -90,7 +90,7 @@ def test_bag_has_the_run_in_the_types_of_ros(run: Path, tmp_path: Path) -> None:
 
 
 def test_bag_with_wall_stamps_has_no_clock(run: Path, tmp_path: Path) -> None:
-    convert_recording(run, tmp_path / "bag", lambda _line: None, wall_time=True)
+    convert_recording_to_rosbag(run, tmp_path / "bag", lambda _line: None, wall_time=True)
     found = read_bag(tmp_path / "bag")
     assert "/clock" not in found
     time_ns, message = found["/joint_states"][0]
@@ -101,4 +101,4 @@ def test_bag_with_wall_stamps_has_no_clock(run: Path, tmp_path: Path) -> None:
 def test_bag_is_never_overwritten(run: Path, tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     with pytest.raises(ConfigError, match="such a folder already"):
-        convert_recording(run, tmp_path / "bag", lambda _line: None, wall_time=False)
+        convert_recording_to_rosbag(run, tmp_path / "bag", lambda _line: None, wall_time=False)

@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion, yaw_from_rotation
+from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion, yaw_from_rotation
 from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, Frames, make_ros_name
 from snakesim_operator.features.ros2.messages import Transform
 from snakesim_operator.features.ros2.urdf import make_urdf
-from snakesim_testing.hal.small_robots import pose, state
+from snakesim_testing.hal.small_robots import make_joint_state, make_pose
 from snakesim_testing.operator.ros2_rig import of_robot
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -34,9 +34,13 @@ def test_ros_frame_tree_equals_kinematics(name: str) -> None:
     random = np.random.default_rng(3)
     angles = random.uniform(-0.9, 0.9, len(robot.joints)).tolist()
     turned = (float(np.cos(0.3)), 0.0, 0.0, float(np.sin(0.3)))
-    at = pose(position_w=(1.0, 2.0, 0.05), orientation_wxyz=turned)
-    tree = [*frames.fixed, frames.make_base_transform(at), *frames.make_joint_transforms(state(robot, angles))]
-    origins, rotations = link_frames(
+    at = make_pose(position_w=(1.0, 2.0, 0.05), orientation_wxyz=turned)
+    tree = [
+        *frames.fixed,
+        frames.make_base_transform(at),
+        *frames.make_joint_transforms(make_joint_state(robot, angles)),
+    ]
+    origins, rotations = compute_link_frames(
         at.position_w,
         rotation_from_quaternion(turned),
         angles,

@@ -7,8 +7,8 @@ from snakesim_operator.features.ros2.graph import make_attachment
 from snakesim_operator.features.ros2.message_age import (
     MAX_AGE_NS,
     SenderClocks,
-    explain_age_refusal,
-    explain_request_age_refusal,
+    find_age_problem,
+    find_request_age_problem,
 )
 
 SECOND = 10**9
@@ -69,13 +69,13 @@ def test_message_age_of_late_arm_request_refuses_with_advice() -> None:
     def request(sent_s: float) -> bytes:
         return make_attachment(1, round(sent_s * SECOND), GID)
 
-    assert explain_request_age_refusal(request(100.0), 103 * SECOND) == ""
-    assert "was sent 30 s ago, by the clock of its sender" in explain_request_age_refusal(request(100.0), 130 * SECOND)
-    assert "was sent 3600 s in the future" in explain_request_age_refusal(request(3700.0), 100 * SECOND)
-    assert explain_request_age_refusal(b"", 0) == "the request has no time attached"
+    assert find_request_age_problem(request(100.0), 103 * SECOND) == ""
+    assert "was sent 30 s ago, by the clock of its sender" in find_request_age_problem(request(100.0), 130 * SECOND)
+    assert "was sent 3600 s in the future" in find_request_age_problem(request(3700.0), 100 * SECOND)
+    assert find_request_age_problem(b"", 0) == "the request has no time attached"
 
 
 def test_a_reason_names_the_limit_and_the_way_out() -> None:
-    assert explain_age_refusal(MAX_AGE_NS, "its stamp") == ""
-    assert explain_age_refusal(MAX_AGE_NS + 1, "its stamp") == "is older than 0.5 s by its stamp"
-    assert "use_sim_time" in explain_age_refusal(-SECOND, "its stamp")
+    assert find_age_problem(MAX_AGE_NS, "its stamp") == ""
+    assert find_age_problem(MAX_AGE_NS + 1, "its stamp") == "is older than 0.5 s by its stamp"
+    assert "use_sim_time" in find_age_problem(-SECOND, "its stamp")

@@ -18,7 +18,7 @@ from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import Marker, Transform
 from snakesim_operator.features.ros2.steering import CmdVelSteering
 from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
-from snakesim_testing.hal.strategies import messages_of
+from snakesim_testing.hal.strategies import make_strategy
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 12_345_678_901
@@ -41,7 +41,7 @@ def test_type_hashes_are_those_of_later_distributions(store: Stores) -> None:
 
 
 @FEW
-@given(messages_of(m.JointState))
+@given(make_strategy(m.JointState))
 def test_ros_joint_states_omit_invalid_joints(joints: m.JointState) -> None:
     count = min(map(len, (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid)))
     joints = m.JointState(
@@ -79,7 +79,7 @@ def test_ros_transforms_match_kinematics() -> None:
 
 
 @FEW
-@given(st.lists(messages_of(m.WorldContact), max_size=3))
+@given(st.lists(make_strategy(m.WorldContact), max_size=3))
 def test_contacts_are_arrows_along_their_forces(contacts: list[m.WorldContact]) -> None:
     payload = ros.encode_markers(STAMP_NS, "odom", robot_in_ros.make_contact_markers(contacts))
     first, *arrows = read(ros.MARKERS, payload).markers
@@ -230,7 +230,7 @@ def test_ros_imu_message_marks_orientation_as_missing() -> None:
 
 
 @FEW
-@given(messages_of(m.Ranges))
+@given(make_strategy(m.Ranges))
 def test_ros_scan_contains_the_ranges(sent: m.Ranges) -> None:
     seen = read(ros.LASER_SCAN, robot_in_ros.encode_laser_scan(STAMP_NS, "f", sent))
     expected = [np.inf if range_m is None else np.float32(range_m) for range_m in sent.range_m]
@@ -246,7 +246,7 @@ def test_ros_scan_contains_the_ranges(sent: m.Ranges) -> None:
 def test_custom_sensor_numbers_have_field_and_unit() -> None:
     kind = parse_custom_message(make_message_schema(Skin, "skin"))
     sample: Any = kind.message(**PLACE, **GOOD)
-    seen = read(ros.NUMBERS, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
+    seen = read(ros.FLOAT64_ARRAY, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
     assert seen.data.tolist() == pytest.approx([1.5, np.nan], nan_ok=True)
     (dimension,) = seen.layout.dim
     assert dimension.label == "pressed_n [N]"
@@ -254,7 +254,7 @@ def test_custom_sensor_numbers_have_field_and_unit() -> None:
 
 
 @FEW
-@given(messages_of(m.Status))
+@given(make_strategy(m.Status))
 def test_ros_diagnostics_contain_the_status(status: m.Status) -> None:
     (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(STAMP_NS, status)).status
     assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
@@ -310,7 +310,7 @@ class TestSteering:
         assert fresh.timestamp_ns == 1_600_000_000
         assert fresh.valid_for_ns == 500_000_000
         assert steering.make_intent(self.twist(0.2), 2 * 10**9, None, age_ns=600_000_000) is None
-        assert steering.rejected == 1
+        assert steering.rejected_count == 1
         assert steering.reason == "is older than 0.5 s by the times of its sender's messages"
         stop = steering.make_intent(self.twist(), 2 * 10**9, None, age_ns=60 * 10**9)
         assert stop is not None
@@ -336,10 +336,10 @@ class TestSteering:
     def test_ros_invalid_payload_is_counted(self, bad: bytes) -> None:
         steering = CmdVelSteering()
         assert steering.make_intent(bad, 0, 0.0) is None
-        assert steering.rejected == 1
+        assert steering.rejected_count == 1
 
     @pytest.mark.parametrize(("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)])
     def test_ros_twist_impossible_for_a_snake_is_rejected(self, x: float, turn: float) -> None:
         steering = CmdVelSteering()
         assert steering.make_intent(self.twist(x, turn), 0, 0.0) is None
-        assert steering.rejected == 1
+        assert steering.rejected_count == 1

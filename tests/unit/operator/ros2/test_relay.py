@@ -13,7 +13,7 @@ class FakeSession:
     def __init__(self) -> None:
         self.samples: list[Imu] = []
 
-    def reader(self, *_key_and_type: Any, depth: int | None) -> "FakeSession":
+    def declare_reader(self, *_key_and_type: Any, depth: int | None) -> "FakeSession":
         assert depth is None, "each sample may have an IMU that no other has"
         return self
 

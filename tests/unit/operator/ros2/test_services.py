@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import Clock, JointState, LifecycleState, Mode
 from snakesim_operator.features.ros2 import graph
 from snakesim_operator.features.ros2 import service_types as types
 from snakesim_operator.features.ros2.graph import NodeName, Topic, make_token
-from snakesim_operator.features.ros2.joint_commands import VALID_NS, RosJointTargets
+from snakesim_operator.features.ros2.joint_commands import TARGET_LIFETIME_NS, RosJointTargets
 from snakesim_operator.features.ros2.parameters import NOT_SET, _encode_value, _make_descriptor
 from snakesim_operator.robot_commands.parameters import Parameter
 from snakesim_testing.hal import small_robots as rig
@@ -79,16 +79,16 @@ class TestJointTargets:
         return bytes(JAZZY.serialize_cdr(kinds[kind](header, names, *fields), kind))
 
     def clock(self, timestamp_ns: int, lifecycle: LifecycleState = "armed") -> Clock:
-        return msgspec.structs.replace(rig.clock(1), arm_session=1, timestamp_ns=timestamp_ns, lifecycle=lifecycle)
+        return msgspec.structs.replace(rig.make_clock(1), arm_session=1, timestamp_ns=timestamp_ns, lifecycle=lifecycle)
 
     def joints(self, angle_rad: float) -> JointState:
-        return rig.state(self.robot, angle_rad)
+        return rig.make_joint_state(self.robot, angle_rad)
 
     def test_named_joints_follow_and_the_others_stay(self) -> None:
         targets = RosJointTargets(self.robot)
         targets.make_setpoints(self.clock(0), self.joints(0.1))
-        assert targets.accept(self.said(["joint_3"], position=[0.5]), 10)
-        assert targets.accept(self.said(["joint_4"], effort=[-1.0]), 10)
+        assert targets.accept_message(self.said(["joint_3"], position=[0.5]), 10)
+        assert targets.accept_message(self.said(["joint_4"], effort=[-1.0]), 10)
         points = targets.make_setpoints(self.clock(20), self.joints(0.2))
         assert points.target[2] == 0.5
         assert points.mode[3] == Mode.TORQUE
@@ -98,10 +98,10 @@ class TestJointTargets:
 
     def test_ros_joint_commands_that_stop_hold_the_joint(self) -> None:
         targets = RosJointTargets(self.robot)
-        targets.accept(self.said(["joint_3"], velocity=[1.0]), 0)
-        targets.make_setpoints(self.clock(VALID_NS), self.joints(0.3))
+        targets.accept_message(self.said(["joint_3"], velocity=[1.0]), 0)
+        targets.make_setpoints(self.clock(TARGET_LIFETIME_NS), self.joints(0.3))
         for angle_rad in (0.4, 0.45):
-            points = targets.make_setpoints(self.clock(VALID_NS + 1), self.joints(angle_rad))
+            points = targets.make_setpoints(self.clock(TARGET_LIFETIME_NS + 1), self.joints(angle_rad))
         assert points.mode[2] == Mode.POSITION
         assert points.target[2] == 0.4
 
@@ -125,20 +125,20 @@ class TestJointTargets:
         targets.make_setpoints(self.clock(0), self.joints(0.1))
         message, now_ns = self.said(["joint_3"], stamp_s=stamp_s, position=[0.5]), 10 * 10**9
         ros_now_ns = None if ros_now_s is None else round(ros_now_s * 1e9)
-        taken = targets.accept(message, now_ns, ros_now_ns, round(age_s * 1e9))
+        taken = targets.accept_message(message, now_ns, ros_now_ns, round(age_s * 1e9))
         assert taken == (not why)
         assert why in targets.reason
         assert targets.make_setpoints(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
 
     def test_a_command_ends_half_a_second_after_it_was_sent(self) -> None:
         targets = RosJointTargets(self.robot)
-        assert targets.accept(self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000)
+        assert targets.accept_message(self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000)
         assert targets.make_setpoints(self.clock(1_100_000_000), self.joints(0.1)).target[2] == 0.5
         assert targets.make_setpoints(self.clock(1_100_000_001), self.joints(0.1)).target[2] == 0.1
 
     def test_what_was_said_before_arming_moves_nothing(self) -> None:
         targets = RosJointTargets(self.robot)
-        targets.accept(self.said(["joint_3"], position=[0.5]), 0)
+        targets.accept_message(self.said(["joint_3"], position=[0.5]), 0)
         targets.make_setpoints(self.clock(1, "disarmed"), self.joints(0.1))
         assert targets.make_setpoints(self.clock(2), self.joints(0.1)).target[2] == 0.1
 
@@ -154,8 +154,8 @@ class TestJointTargets:
     )
     def test_a_message_is_taken_whole_or_not_at_all(self, names: list[str], numbers: dict[str, Any], why: str) -> None:
         targets = RosJointTargets(self.robot)
-        assert not targets.accept(self.said(names, **numbers), 0)
-        assert targets.rejected == 1
+        assert not targets.accept_message(self.said(names, **numbers), 0)
+        assert targets.rejected_count == 1
         assert why in targets.reason
-        assert not targets.accept(b"\0\1\0\0\1", 0)
+        assert not targets.accept_message(b"\0\1\0\0\1", 0)
         assert set(targets.make_setpoints(self.clock(1), self.joints(0.1)).target) == {0.1}

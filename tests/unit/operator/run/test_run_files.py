@@ -21,8 +21,8 @@ class Disk:
         self._write, self._whole = os.write, under_test.write_atomically
         monkeypatch.setattr(under_test.os, "write", self.write)
         monkeypatch.setattr(under_test, "write_atomically", self.write_whole)
-        monkeypatch.setattr(under_test, "RETRY_S", 0.02)
-        monkeypatch.setattr(under_test, "LIMIT_S", 0.3)
+        monkeypatch.setattr(under_test, "RETRY_PERIOD_S", 0.02)
+        monkeypatch.setattr(under_test, "DISK_TIMEOUT_S", 0.3)
 
     def _take(self, size: int) -> int:
         if self.hangs:
@@ -57,7 +57,7 @@ def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
     files.rename("never.log", "never-1.log")  # what nobody appended to has nothing to give
     files.append("a.log", b"new\n")
     files.write_file("whole.json", b"{}")
-    files.settle()
+    files.wait_until_written()
     assert (tmp_path / "a-1.log").read_bytes() == b"".join(b"%d\n" % i for i in range(1000))
     assert (tmp_path / "a.log").read_bytes() == b"new\n"
     assert (tmp_path / "whole.json").read_bytes() == b"{}"
@@ -75,7 +75,7 @@ def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: D
     wait_until(lambda: warned, "a warning")
     assert (tmp_path / "a.log").read_bytes() == b"0123456789"
     began = time.monotonic()
-    files.settle()
+    files.wait_until_written()
     assert time.monotonic() - began < 0.2  # it knows that it would be in vain
     disk.space = 2**30
     wait_until(lambda: (tmp_path / "whole.json").exists(), "the second file")
@@ -100,7 +100,7 @@ def test_run_files_on_full_disk_are_absent_and_reported(tmp_path: Path, disk: Di
 def test_run_files_on_hanging_disk_block_nobody_within_bounded_memory(
     tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(under_test, "MEMORY_BYTES", 10_000)
+    monkeypatch.setattr(under_test, "MAX_PENDING_BYTES", 10_000)
     files = RunFiles(tmp_path, lambda _: None)
     disk.hangs = True
     began = time.monotonic()
@@ -116,8 +116,8 @@ def test_run_files_on_hanging_disk_block_nobody_within_bounded_memory(
 def test_what_comes_too_fast_for_a_slow_disk_is_told(
     tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(under_test, "MEMORY_BYTES", 10_000)
-    monkeypatch.setattr(under_test, "LIMIT_S", 5.0)
+    monkeypatch.setattr(under_test, "MAX_PENDING_BYTES", 10_000)
+    monkeypatch.setattr(under_test, "DISK_TIMEOUT_S", 5.0)
     files = RunFiles(tmp_path, lambda _: None)
     disk.hangs = True
     for i in range(200):
@@ -133,16 +133,16 @@ def test_run_files_without_folder_are_not_kept() -> None:
     files = RunFiles(None, pytest.fail)
     files.append("a.log", b"x")
     files.write_file("whole.json", b"{}")
-    files.settle()
+    files.wait_until_written()
     assert files.close() == ""
 
 
 def test_run_log_that_floods_is_cut_and_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(under_test, "FILE_BYTES", 2 * 2**20)
+    monkeypatch.setattr(under_test, "MAX_LOG_BYTES", 2 * 2**20)
     files = RunFiles(tmp_path, lambda _: None)
     for _ in range(300):
         files.append("a.log", b"x" * 10_000)
-        files.settle()
+        files.wait_until_written()
     files.append("b.log", b"x")
     assert files.close() == "a.log is longer than 2 MiB: the rest of it is lost"
     assert (tmp_path / "a.log").stat().st_size == 2_090_000

@@ -7,20 +7,20 @@ import pytest
 
 from docs.site.configuration_page import PAGE, documented_structs, fields_without_description, make_page
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scenario import Loaded, load, parse_set
+from snakesim_hal.model.scenario import LoadedScenario, load_scenario, parse_set_option
 from snakesim_operator.this_computer.explain import explain_key
-from snakesim_operator.this_computer.scenario_files import list_values
-from snakesim_operator.this_computer.scenario_keys import list_keys
+from snakesim_operator.this_computer.scenario_files import collect_values
+from snakesim_operator.this_computer.scenario_keys import collect_keys
 
 PER_SCENARIO = ("triplet", "peg_row", "surveyed_clutter")
 
 
-def explain(loaded: Loaded, key: str, capsys: pytest.CaptureFixture[str]) -> str:
+def explain(loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]) -> str:
     assert explain_key(loaded, key, as_json=False) == 0
     return capsys.readouterr().out
 
 
-def explain_as_json(loaded: Loaded, key: str, capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+def explain_as_json(loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
     assert explain_key(loaded, key, as_json=True) == 0
     return json.loads(capsys.readouterr().out)
 
@@ -49,9 +49,9 @@ def test_all_kinds_of_files_and_plugins_are_on_the_page() -> None:
 
 @pytest.mark.parametrize("scenario", PER_SCENARIO)
 def test_every_key_of_a_scenario_is_explained(scenario: str, capsys: pytest.CaptureFixture[str]) -> None:
-    loaded = load(scenario)
-    keys = list_keys(loaded)
-    for name, value, origin in list_values(loaded):
+    loaded = load_scenario(scenario)
+    keys = collect_keys(loaded)
+    for name, value, origin in collect_values(loaded):
         key = keys[name]
         assert key.doc.description, name
         if name != "robot.joints":  # a key for each joint
@@ -61,7 +61,7 @@ def test_every_key_of_a_scenario_is_explained(scenario: str, capsys: pytest.Capt
 
 
 def test_a_value_has_its_documentation_and_where_it_comes_from(capsys: pytest.CaptureFixture[str]) -> None:
-    loaded = load("triplet", [parse_set("control.propulsion_n=20")])
+    loaded = load_scenario("triplet", [parse_set_option("control.propulsion_n=20")])
     lines = explain(loaded, "control.propulsion_n", capsys).splitlines()
     assert lines[0] == "controllers.obstacle_triplet.propulsion_n"
     assert lines[1].startswith("  Maximum propulsion force")
@@ -77,17 +77,17 @@ def test_a_value_has_its_documentation_and_where_it_comes_from(capsys: pytest.Ca
 
 
 def test_explain_json_has_the_same_content(capsys: pytest.CaptureFixture[str]) -> None:
-    described = explain_as_json(load("triplet"), "rate_hz", capsys)
+    described = explain_as_json(load_scenario("triplet"), "rate_hz", capsys)
     assert described["unit"] == "Hz"
     assert described["value"] == 100.0
     assert str(described["origin"]).endswith("triplet.toml")
-    table = explain_as_json(load("triplet"), "robot.module", capsys)
+    table = explain_as_json(load_scenario("triplet"), "robot.module", capsys)
     assert isinstance(table["keys"], dict)
     assert list(table["keys"]) == ["length_m", "radius_m", "mass_kg"]
 
 
 def test_a_table_has_one_line_for_each_key(capsys: pytest.CaptureFixture[str]) -> None:
-    lines = explain(load("triplet"), "robot.module", capsys).splitlines()
+    lines = explain(load_scenario("triplet"), "robot.module", capsys).splitlines()
     at = lines.index("keys")
     assert [line.split()[0] for line in lines[at + 2 :]] == ["length_m", "radius_m", "mass_kg"]
 
@@ -106,15 +106,15 @@ def test_a_table_has_one_line_for_each_key(capsys: pytest.CaptureFixture[str]) -
     ],
 )
 def test_keys_that_the_scenario_does_not_give_are_explained(key: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert explain(load("triplet"), key, capsys).startswith(key)
+    assert explain(load_scenario("triplet"), key, capsys).startswith(key)
 
 
 def test_explain_lists_plugin_values_without_running_its_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wave.py").write_text("class Wave: ...\nraise SystemExit")
-    overrides = [parse_set(f"controller={tmp_path}/wave.py:Wave"), parse_set("control.lag_rad=0.5")]
-    lines = explain(load("triplet", overrides), "control.lag_rad", capsys).splitlines()
+    overrides = [parse_set_option(f"controller={tmp_path}/wave.py:Wave"), parse_set_option("control.lag_rad=0.5")]
+    lines = explain(load_scenario("triplet", overrides), "control.lag_rad", capsys).splitlines()
     assert lines[:2] == ["controllers.Wave.lag_rad", "  Checked by the code of its plugin."]
     assert "  value    0.5" in lines
 
@@ -134,5 +134,5 @@ def test_explain_lists_plugin_values_without_running_its_code(
 )
 def test_an_unknown_key_is_an_error_with_a_suggestion(key: str, hint: str) -> None:
     with pytest.raises(ConfigError, match="there is no such key") as error:
-        explain_key(load("triplet"), key, as_json=False)
+        explain_key(load_scenario("triplet"), key, as_json=False)
     assert hint in str(error.value)

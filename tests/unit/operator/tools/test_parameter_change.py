@@ -4,13 +4,13 @@ import pytest
 
 from snakesim_gnc.control.live_parameters import LiveParameters
 from snakesim_hal.base.errors import ControllerError, RefusedError
-from snakesim_hal.model.scenario import load
+from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState
 from snakesim_operator.robot_commands import parameters
-from snakesim_testing.hal.small_robots import description
+from snakesim_testing.hal.small_robots import make_description
 from snakesim_testing.messages import raises_error
 
 CLOCK = Clock(
@@ -33,15 +33,15 @@ class Control:
     def __init__(self, reported: ControlState | None, *, gone: bool = False) -> None:
         """reported: after a request; None: it is silent. gone: it publishes no parameters after it."""
         self._network = LocalNetwork()
-        session = self._network.session()
-        self._settings = LiveParameters(Client(session, "control"), load("triplet", []).config)
-        self._settings.configure(description())
+        session = self._network.create_session()
+        self._settings = LiveParameters(Client(session, "control"), load_scenario("triplet", []).config)
+        self._settings.configure(make_description())
         self._settings.answer_requests(CLOCK)
-        self._states = session.publisher(keys.CONTROL_STATE, ControlState)
+        self._states = session.declare_publisher(keys.CONTROL_STATE, ControlState)
         self._reported = reported
         self._gone = gone
-        self._network.answer = self._answer
-        self.operator: LocalSession = self._network.session()
+        self._network.run_responders = self._answer
+        self.operator: LocalSession = self._network.create_session()
 
     def _answer(self) -> None:
         self._settings.answer_requests(CLOCK)
@@ -59,7 +59,7 @@ def state(reason: str, *, failed: bool = False) -> ControlState:
 
 @pytest.fixture(autouse=True)
 def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("GONE_S", "GOES_ON_S"):
+    for name in ("MAX_SILENCE_S", "REPORT_TIMEOUT_S"):
         monkeypatch.setattr(parameters, name, 0.05)
 
 

@@ -14,12 +14,18 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.model.files import list_shipped, read_part
-from snakesim_hal.model.scenario import load
+from snakesim_hal.model.files import list_shipped_names, read_table_with_base
+from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.wire.codec import Decoder, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, Message
-from snakesim_operator.this_computer.schemas import contract, write_schemas
-from snakesim_testing.hal.strategies import messages_of, places, plain_example, poisons, replaced
+from snakesim_operator.this_computer.schemas import generate_contract_files, write_schemas
+from snakesim_testing.hal.strategies import (
+    iter_places,
+    list_invalid_values,
+    make_plain_example,
+    make_strategy,
+    replace_at,
+)
 
 if TYPE_CHECKING:
     from jsonschema.protocols import Validator
@@ -34,7 +40,7 @@ def files_under(folder: Path) -> dict[str, str]:
 
 
 def test_the_published_files_are_what_the_code_says() -> None:
-    published, generated = files_under(PUBLISHED), dict(contract())
+    published, generated = files_under(PUBLISHED), dict(generate_contract_files())
     published = {
         name: text for name, text in published.items() if not name.startswith("can/")
     }  # tests/unit/can_backend
@@ -52,7 +58,7 @@ def test_writing_schemas_removes_files_outside_the_contract(tmp_path: Path) -> N
     written = write_schemas(tmp_path)
     found = files_under(tmp_path)
     assert found.pop("README.md") == "by hand"
-    assert found == dict(contract())
+    assert found == dict(generate_contract_files())
     assert {str(path.relative_to(tmp_path)) for path in written} == set(found)
 
 
@@ -68,7 +74,7 @@ def test_writing_schemas_into_foreign_folder_removes_nothing(tmp_path: Path) -> 
 
 @cache
 def published_contract() -> dict[str, str]:
-    return dict(contract())
+    return dict(generate_contract_files())
 
 
 @cache
@@ -93,13 +99,13 @@ def schema_name(message: type[Message]) -> str:
 @given(data=st.data())
 @settings(max_examples=8)
 def test_every_message_fits_its_schema(message: type[Message], data: st.DataObject) -> None:
-    assert fits(data.draw(messages_of(message)), schema_name(message))
+    assert fits(data.draw(make_strategy(message)), schema_name(message))
 
 
 @each_message
 def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> None:
     assert json.loads(published_contract()[schema_name(message)])["encoding"] == format_encoding(message)
-    example = plain_example(message)
+    example = make_plain_example(message)
     assert fits(example, schema_name(message))
     for field in example:
         rest = {name: value for name, value in example.items() if name != field}
@@ -113,12 +119,12 @@ def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> 
 
 @each_message
 def test_schema_and_decoder_agree_on_what_is_out_of_bounds(message: type[Message]) -> None:
-    example = plain_example(message)
-    for at, info in places(example, inspect.type_info(message)):
-        for poison in poisons(info):
+    example = make_plain_example(message)
+    for at, info in iter_places(example, inspect.type_info(message)):
+        for poison in list_invalid_values(info):
             if isinstance(poison, bytes) or (isinstance(poison, float) and not math.isfinite(poison)):
                 continue  # JSON has no such value
-            assert not fits(replaced(example, at, poison), schema_name(message)), f"{at} took {poison!r}"
+            assert not fits(replace_at(example, at, poison), schema_name(message)), f"{at} took {poison!r}"
 
 
 # --- the files that are shipped --------------------------------------------------------------------------------
@@ -126,14 +132,14 @@ def test_schema_and_decoder_agree_on_what_is_out_of_bounds(message: type[Message
 
 @pytest.mark.parametrize(("kind", "schema"), [("robots", "robot"), ("scenes", "scene")])
 def test_every_shipped_file_fits_its_schema_and_names_itself(kind: str, schema: str) -> None:
-    for name in list_shipped(kind):
-        values = read_part(name, kind).values
+    for name in list_shipped_names(kind):
+        values = read_table_with_base(name, kind).values
         assert fits(values, f"files/{schema}.json"), name
         assert values["name"] == name
 
 
-@pytest.mark.parametrize("name", list_shipped("scenarios"))
+@pytest.mark.parametrize("name", list_shipped_names("scenarios"))
 def test_every_shipped_scenario_loads_and_fits_run_schema(name: str) -> None:
-    config = load(name).config
+    config = load_scenario(name).config
     assert config.name == name
     assert fits(config, "files/run.json")

@@ -11,12 +11,12 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, servo_of
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, make_servo
 from snakesim_serial_backend.dynamixel.bring_up import bring_up
 from snakesim_serial_backend.dynamixel.port import Port
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.wire import Pty, SerialWire
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 3
@@ -52,14 +52,16 @@ class SlowBench:
     """Emulated servos that a thread serves, and a driver's port to them."""
 
     def __init__(self) -> None:
-        self._config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=50, clock_mode="realtime")
+        self._config = make_run_config(
+            backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=50, clock_mode="realtime"
+        )
         self.pty = SlowPty()
         self.emulator = DynamixelBackend.make_robot_emulator(
             self._config, SETTINGS, [self.pty], DriverClock(self._config), None
         )
         self._wire = SerialWire(self.pty.path, 1_000_000)
         self.port = Port(self._wire, GAP_S)
-        self.servos = [servo_of(joint, self.port, SETTINGS) for joint in self._config.robot.joint_table]
+        self.servos = [make_servo(joint, self.port, SETTINGS) for joint in self._config.robot.joint_table]
         self._runs = True
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -128,6 +130,6 @@ def test_a_late_answer_that_arrives_with_the_next_one_is_no_surplus(bench: SlowB
     bench.bring_up()
     bench.pty.min_waiting = 2
     first = bench.port.read_alone(2, at.PRESENT, at.present_form.size)
-    assert (len(first.statuses), first.surplus) == (0, 0)
+    assert (len(first.statuses), first.surplus_count) == (0, 0)
     second = bench.port.read_alone(2, at.PRESENT, at.present_form.size)
-    assert (len(second.statuses), second.surplus) == (2, 0)
+    assert (len(second.statuses), second.surplus_count) == (2, 0)

@@ -9,15 +9,15 @@ from hypothesis import strategies as st
 
 from snakesim_serial_backend.dynamixel.packets import (
     ALERT,
-    EVERYBODY,
+    BROADCAST_ID,
     Decoder,
     Instruction,
-    encoded,
-    fast_parts,
-    fast_status,
-    intact_parts,
-    sync_read_request,
-    sync_write,
+    encode_fast_status,
+    encode_packet,
+    encode_sync_read_request,
+    encode_sync_write,
+    split_damaged_fast_status,
+    split_fast_status,
 )
 
 SDK = Protocol2PacketHandler()
@@ -58,7 +58,7 @@ def test_packet_written_is_stuffed_and_checksummed_as_by_sdk(id_: int, address: 
     # Its `txPacket` sends unstuffed what stuffing would make longer; so `addStuffing` itself is asked.
     stuffed = SDK.addStuffing(plain)
     crc = SDK.updateCRC(0, stuffed, len(stuffed) - 2)
-    ours = encoded(id_, Instruction.WRITE, bytes(inside[1:]))
+    ours = encode_packet(id_, Instruction.WRITE, bytes(inside[1:]))
     assert ours == bytes(stuffed[:-2]) + crc.to_bytes(2, "little")
     assert next(iter(Decoder().feed(ours))).parameters[2:] == data
 
@@ -67,17 +67,17 @@ def test_packet_written_is_stuffed_and_checksummed_as_by_sdk(id_: int, address: 
 def test_questions_and_goals_of_several_are_those_of_the_sdk(ids: list[int], fast: bool) -> None:
     line = Line()
     SDK.syncReadTx(line, 126, 10, ids, len(ids), fast)
-    assert line.written == sync_read_request(ids, 126, 10, fast=fast)
+    assert line.written == encode_sync_read_request(ids, 126, 10, fast=fast)
     line = Line()
     each = [(id_, bytes([id_, 1, 2, 0xFF])) for id_ in ids]
     values = [byte for id_, data in each for byte in (id_, *data)]
     SDK.syncWriteTxOnly(line, 116, 4, values, len(values))
-    assert line.written == sync_write(116, each)
+    assert line.written == encode_sync_write(116, each)
 
 
 @given(id_=st.integers(0, 252), data=near_header, noise=st.binary(max_size=8), cut=st.integers(1, 30))
 def test_packet_answers_are_read_by_sdk_and_by_us(id_: int, data: bytes, noise: bytes, cut: int) -> None:
-    status = encoded(id_, Instruction.STATUS, bytes([ALERT]) + data)
+    status = encode_packet(id_, Instruction.STATUS, bytes([ALERT]) + data)
     said, result = SDK.rxPacket(Line(status), False)
     assert result == COMM_SUCCESS
     assert bytes(said[9 : 9 + len(data)]) == data
@@ -93,25 +93,25 @@ def test_fast_answer_is_read_by_sdk_and_to_its_end(parts: list[Any]) -> None:
     ids = list(dict.fromkeys(id_ for _, id_, _ in parts))
     parts = [(0, id_, bytes([id_, *data[:size]])) for id_, (_, _, data) in zip(ids, parts, strict=False)]
     size += 1
-    answer = fast_status(parts, len(parts))
+    answer = encode_fast_status(parts, len(parts))
     group = GroupSyncRead(Line(answer), SDK, 126, size)
     for _, id_, _ in parts:
         group.addParam(id_)
     assert group.fastSyncReadRxPacket() == COMM_SUCCESS
     assert [bytes(group.data_dict[id_]) for _, id_, _ in parts] == [data for _, _, data in parts]
     (packet,) = Decoder().feed(answer)
-    assert packet.id == EVERYBODY
-    assert [(one.id, one.data) for one in fast_parts(packet, size)] == [(id_, data) for _, id_, data in parts]
-    ends_early = fast_status(parts, len(parts) + 1) + b"\x00"
+    assert packet.id == BROADCAST_ID
+    assert [(one.id, one.data) for one in split_fast_status(packet, size)] == [(id_, data) for _, id_, data in parts]
+    ends_early = encode_fast_status(parts, len(parts) + 1) + b"\x00"
     assert list(Decoder().feed(ends_early)) == []
     intact = [(id_, data) for _, id_, data in parts]
-    assert [(one.id, one.data) for one in intact_parts(ends_early, size)] == intact
+    assert [(one.id, one.data) for one in split_damaged_fast_status(ends_early, size)] == intact
     last_is_garbled = answer[:-1] + bytes([answer[-1] ^ 0x10])
-    assert [(one.id, one.data) for one in intact_parts(b"\x00" + last_is_garbled, size)] == intact[:-1]
+    assert [(one.id, one.data) for one in split_damaged_fast_status(b"\x00" + last_is_garbled, size)] == intact[:-1]
 
 
 @pytest.mark.parametrize("at", [4, 5, 8, 10, 12])
 def test_a_changed_byte_is_noticed(at: int) -> None:
-    packet = bytearray(encoded(7, Instruction.WRITE, b"\x74\x00\x10\x20\x30\x40"))
+    packet = bytearray(encode_packet(7, Instruction.WRITE, b"\x74\x00\x10\x20\x30\x40"))
     packet[at] ^= 0x04
     assert list(Decoder().feed(bytes(packet))) == []

@@ -20,7 +20,7 @@ from snakesim_serial_backend.dynamixel.emulator import FIRMWARE, MODEL, Emulated
 from snakesim_serial_backend.dynamixel.packets import ALERT, Refusal
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.wire import Pty
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 
 SDK = Protocol2PacketHandler()
 JOINTS = 3
@@ -58,7 +58,7 @@ class Bench:
     """Emulated servos, and the SDK's port on them. Time is the test's."""
 
     def __init__(self) -> None:
-        config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100)
+        config = make_run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100)
         self.clock, self.pty = DriverClock(config), Pty()
         self.emulator: EmulatedDynamixel = DynamixelBackend.make_robot_emulator(
             config, DynamixelSettings(physics_model="inertia"), [self.pty], self.clock, None
@@ -67,7 +67,7 @@ class Bench:
 
     def pass_time(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
-            self.clock.robot_ns += round(STEP_S * 1e9)
+            self.clock.robot_time_ns += round(STEP_S * 1e9)
             self.emulator()
 
     def enable(self) -> None:
@@ -168,7 +168,7 @@ def test_sdk_alert_stays_in_answers_until_a_restart(bench: Bench) -> None:
     assert SDK.read1ByteTxRx(port, 1, at.TORQUE_ENABLE)[0] == 0
     assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == Refusal.FAILED
     bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=False)
-    bench.emulator.body.thermal.winding_c[:] = 20.0
+    bench.emulator.body.thermal.winding_temperature_c[:] = 20.0
     assert SDK.reboot(port, 1)[0] == COMM_SUCCESS
     assert SDK.ping(port, 1)[1] == COMM_RX_TIMEOUT
     bench.pass_time(0.6)

@@ -18,7 +18,7 @@ from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 4
@@ -29,7 +29,7 @@ class Robot(DriveRig):
     """The backend and its servos."""
 
     def __init__(self, settings: DynamixelSettings | None = None, **dotted: Any) -> None:
-        config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
+        config = make_run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
         settings = settings or DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5)
         super().__init__(config, DynamixelBackend(config, settings))
 
@@ -49,7 +49,7 @@ def test_servos_stop_by_watchdog_when_driver_is_gone(robot: Robot) -> None:
     robot.run(40, "armed")
     robot.mode, robot.target = Mode.TORQUE, 0.5
     robot.run(2, "armed")
-    robot.backend._clock.robot_ns += 190_000_000
+    robot.backend._clock.robot_time_ns += 190_000_000
     robot.emulator()
     assert {servo.table[at.WATCHDOG] for servo in robot.emulator.servos} == {at.TRIPPED}
     found = robot.run(NOTICED, "armed")
@@ -147,7 +147,7 @@ def test_a_servo_outside_of_its_travel_is_refused() -> None:
     ],
 )
 def test_what_servos_cannot_do_is_refused_before_the_start(dotted: dict[str, Any]) -> None:
-    config = run_config(**{"backend": "dynamixel", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted})
+    config = make_run_config(**{"backend": "dynamixel", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted})
     with raises_error(
         ConfigError,
         code=("bus/invalid-channel", "bus/overloaded", "drive/unsupported-setting", "drive/watchdog-too-short"),

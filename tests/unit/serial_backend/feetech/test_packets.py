@@ -9,11 +9,11 @@ from snakesim_serial_backend.feetech.packets import (
     Decoder,
     Instruction,
     Packet,
-    encode,
+    decode_sign_magnitude,
+    encode_packet,
+    encode_sign_magnitude,
     encode_sync_read,
     encode_sync_write,
-    from_signed,
-    to_signed,
 )
 
 near_header = st.lists(st.sampled_from([0x00, 0xFE, 0xFF]), max_size=20).map(bytes) | st.binary(max_size=60)
@@ -21,8 +21,8 @@ near_header = st.lists(st.sampled_from([0x00, 0xFE, 0xFF]), max_size=20).map(byt
 
 def test_packets_are_the_bytes_of_the_protocol() -> None:
     """Each computed by hand: the checksum is the complement of the sum from the id on."""
-    assert encode(1, Instruction.PING).hex(" ") == "ff ff 01 02 01 fb"
-    assert encode(1, Instruction.READ, bytes([56, 2])).hex(" ") == "ff ff 01 04 02 38 02 be"
+    assert encode_packet(1, Instruction.PING).hex(" ") == "ff ff 01 02 01 fb"
+    assert encode_packet(1, Instruction.READ, bytes([56, 2])).hex(" ") == "ff ff 01 04 02 38 02 be"
     assert encode_sync_read([1, 2], 56, 8).hex(" ") == "ff ff fe 06 82 38 08 01 02 36"
     assert encode_sync_write(40, [(1, b"\0"), (2, b"\0")]).hex(" ") == "ff ff fe 08 83 28 01 01 00 02 00 4a"
 
@@ -31,7 +31,7 @@ def test_packets_are_the_bytes_of_the_protocol() -> None:
 def test_packet_is_found_after_noise_without_header(id_: int, error: int, data: bytes, noise: bytes) -> None:
     decoder = Decoder()
     quiet = noise.replace(b"\xff", b"\x01")
-    found = list(decoder.feed(quiet + encode(id_, error, data)))
+    found = list(decoder.feed(quiet + encode_packet(id_, error, data)))
     assert found == [Packet(id_, error, data)]
     assert decoder.garbled == bool(quiet)
 
@@ -39,13 +39,13 @@ def test_packet_is_found_after_noise_without_header(id_: int, error: int, data: 
 @given(data=near_header, cut=st.integers(1, 60))
 def test_packet_in_pieces_is_found_once(data: bytes, cut: int) -> None:
     decoder = Decoder()
-    packet = encode(7, 0, data)
+    packet = encode_packet(7, 0, data)
     assert [*decoder.feed(packet[:cut]), *decoder.feed(packet[cut:])] == [Packet(7, 0, data)]
 
 
 @given(data=near_header, place=st.integers(2, 60), flip=st.integers(1, 255))
 def test_damaged_packet_is_not_taken_for_the_sent_one(data: bytes, place: int, flip: int) -> None:
-    packet = bytearray(encode(7, 0, data))
+    packet = bytearray(encode_packet(7, 0, data))
     place = min(place, len(packet) - 1)
     packet[place] ^= flip
     assert Packet(7, 0, data) not in list(Decoder().feed(bytes(packet)))
@@ -55,8 +55,8 @@ def test_damaged_packet_is_not_taken_for_the_sent_one(data: bytes, place: int, f
     ("value", "bit", "word"), [(-1, 15, 0x8001), (100, 15, 100), (-2047, 11, 0xFFF), (-5, 10, 0x405)]
 )
 def test_sign_is_a_bit_above_the_magnitude(value: int, bit: int, word: int) -> None:
-    assert from_signed(value, bit) == word
-    assert to_signed(word, bit) == value
+    assert encode_sign_magnitude(value, bit) == word
+    assert decode_sign_magnitude(word, bit) == value
 
 
 def test_angle_zero_is_the_middle_of_the_count_and_goals_stay_within_a_revolution() -> None:

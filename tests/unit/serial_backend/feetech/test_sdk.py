@@ -16,7 +16,7 @@ from snakesim_serial_backend.feetech.emulator import MODEL
 from snakesim_serial_backend.feetech.packets import ServoError
 from snakesim_serial_backend.feetech.settings import FeetechSettings
 from snakesim_serial_backend.wire import Pty
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 
 sdk: Any = pytest.importorskip("scservo_sdk", reason="PyPI `feetech-servo-sdk` is not installed")
 JOINTS = 3
@@ -27,7 +27,7 @@ class Bench:
     """Emulated servos, and the SDK's port on them. Time is the test's."""
 
     def __init__(self) -> None:
-        config = run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100)
+        config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100)
         self.clock = DriverClock(config)
         self.pty = Pty()
         settings = FeetechSettings(physics_model="inertia")
@@ -67,7 +67,7 @@ class Bench:
 
     def pass_time(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
-            self.clock.robot_ns += round(STEP_S * 1e9)
+            self.clock.robot_time_ns += round(STEP_S * 1e9)
             self.emulator()
 
     def position(self, servo: int) -> int:
@@ -112,7 +112,7 @@ def test_servos_hold_their_last_goal_without_the_sdk(bench: Bench) -> None:
     """They have no watchdog, and the emulator does not invent one."""
     bench.packets.write2ByteTxRx(bench.port, 1, at.GOALS, bench.position(1) + 100)
     bench.pass_time(3.0)
-    assert bench.emulator.servos[0].on
+    assert bench.emulator.servos[0].is_torque_on
     goal = bench.emulator.servos[0].read_word(at.GOALS)
     assert bench.position(1) == pytest.approx(goal, abs=15)
 

@@ -11,14 +11,14 @@ import pytest
 from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.what_moves import describe_what_moves
-from snakesim_hal.programs.preflight import with_backend_modes
+from snakesim_hal.programs.preflight import apply_backend_modes
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.feetech import registers as at
 from snakesim_serial_backend.feetech.backend import FeetechBackend
 from snakesim_serial_backend.feetech.emulator import EmulatedFeetech, EmulatedServo
 from snakesim_serial_backend.feetech.settings import FeetechSettings
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
-from snakesim_testing.hal.small_robots import run_config
+from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 4
@@ -30,8 +30,8 @@ class Robot(DriveRig):
     """The backend and its servos."""
 
     def __init__(self, settings: FeetechSettings | None = None, **dotted: Any) -> None:
-        config = run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
-        config = with_backend_modes(config, FeetechBackend)
+        config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
+        config = apply_backend_modes(config, FeetechBackend)
         settings = settings or FeetechSettings(physics_model="inertia", bring_up_limit_s=0.5)
         super().__init__(config, FeetechBackend(config, settings))
 
@@ -40,7 +40,7 @@ class Robot(DriveRig):
         return drives_of(self.backend)._emulator
 
     def torques_on(self) -> list[bool]:
-        return [servo.on for servo in self.emulator.servos]
+        return [servo.is_torque_on for servo in self.emulator.servos]
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def delivered(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[list[Emula
 
 
 def check(**settings: Any) -> None:
-    config = with_backend_modes(run_config(backend="feetech", robot__chain__modules=JOINTS), FeetechBackend)
+    config = apply_backend_modes(make_run_config(backend="feetech", robot__chain__modules=JOINTS), FeetechBackend)
     FeetechBackend.check(config, FeetechSettings(**settings))
 
 
@@ -89,7 +89,7 @@ def test_every_joint_is_described_without_watchdog_and_without_torque(robot: Rob
 
 
 def test_mixed_robot_names_the_joints_without_watchdog() -> None:
-    config = run_config(
+    config = make_run_config(
         backend="mixed",
         robot__chain__modules=2,
         robot__drive={"driver": "dynamixel"},
@@ -97,7 +97,7 @@ def test_mixed_robot_names_the_joints_without_watchdog() -> None:
         clock_mode="lockstep",
         rate_hz=50,
     )
-    config = with_backend_modes(config, MixedBackend)
+    config = apply_backend_modes(config, MixedBackend)
     backend = MixedBackend(config, MixedBackend.Settings(physics_model="inertia"))
     description = backend.describe()
     backend.close()
@@ -109,7 +109,7 @@ def test_mixed_robot_names_the_joints_without_watchdog() -> None:
 def test_servos_hold_while_driver_is_away_and_are_off_once_it_runs(robot: Robot) -> None:
     robot.run(20, "armed")
     robot.tick += 100
-    robot.backend._clock.robot_ns += 1_000_000_000
+    robot.backend._clock.robot_time_ns += 1_000_000_000
     robot.emulator()
     assert robot.torques_on() == [True] * JOINTS, "nothing stops a servo whose driver is away"
     faults = robot.run(NOTICED, "armed")
@@ -126,7 +126,7 @@ def test_servos_hold_while_driver_is_away_and_are_off_once_it_runs(robot: Robot)
 def test_short_pause_of_the_driver_is_no_fault(robot: Robot) -> None:
     robot.run(20, "armed")
     robot.tick += 7
-    robot.backend._clock.robot_ns += 70_000_000
+    robot.backend._clock.robot_time_ns += 70_000_000
     assert robot.run(NOTICED, "armed") == []
     assert robot.torques_on() == [True] * JOINTS
 
@@ -153,7 +153,7 @@ def test_closing_switches_the_torque_off() -> None:
     robot.run(20, "armed")
     servos = robot.emulator.servos
     robot.backend.close()
-    assert [servo.on for servo in servos] == [False] * JOINTS
+    assert [servo.is_torque_on for servo in servos] == [False] * JOINTS
 
 
 def test_joint_that_becomes_passive_has_no_torque(robot: Robot) -> None:
@@ -237,15 +237,15 @@ def test_homing_offset_is_kept_and_another_one_is_refused(delivered: Any) -> Non
 
 @pytest.mark.parametrize("drive", [{"zero_rad": 3.0}, {"gear": 8.0}, {"zero_rad": -3.0, "sign": -1}])
 def test_travel_across_the_end_of_the_count_is_refused(drive: dict[str, Any]) -> None:
-    config = run_config(backend="feetech", robot__chain__modules=JOINTS, robot__drive=drive)
+    config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, robot__drive=drive)
     with raises_error(ConfigError, code="drive/unsupported-setting", field="zero_rad"):
-        FeetechBackend.check(with_backend_modes(config, FeetechBackend), FeetechSettings())
+        FeetechBackend.check(apply_backend_modes(config, FeetechBackend), FeetechSettings())
 
 
 @pytest.mark.parametrize("answers", ["collide", "follow each other"])
 def test_second_servo_with_the_same_id_stops_the_robot_and_blocks_start(robot: Robot, answers: str) -> None:
     if answers == "collide":
-        robot.emulator._delay_of_second[1] = 0
+        robot.emulator._second_servo_delays[1] = 0
     robot.run(20, "armed")
     robot.go_wrong("duplicate:joint_2@0-9")
     faults = robot.run(NOTICED, "armed")

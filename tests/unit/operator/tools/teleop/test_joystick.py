@@ -72,7 +72,7 @@ def test_joystick_lost_events_or_device_release_the_stick(device: Device) -> Non
     device.sends(EV_ABS, ABS_Y, 0)
     device.unplug()
     device.stick.read_events(1.0)
-    assert device.stick.lost
+    assert device.stick.is_lost
     assert device.stick.forward == 0.0
 
 

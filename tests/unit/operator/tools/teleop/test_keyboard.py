@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_operator.robot_commands.teleop.keyboard import MAX_AT_ONCE, MAX_UNREAD_S, KeyTiming
+from snakesim_operator.robot_commands.teleop.keyboard import MAX_KEYS_PER_READ, MAX_UNREAD_DURATION_S, KeyTiming
 
 PERIOD_S = 0.05  # of teleop
 
@@ -36,6 +36,6 @@ def test_keys_that_nobody_has_read_for_a_while_are_late() -> None:
     timing = KeyTiming()
     assert timing.are_late(1, 0.0), "typed before the first look"
     assert not timing.are_late(1, 0.05)
-    assert timing.are_late(1, 0.05 + MAX_UNREAD_S + 0.01), "a program that was stopped meanwhile"
-    assert not timing.are_late(MAX_AT_ONCE, 0.7)
-    assert timing.are_late(MAX_AT_ONCE + 1, 0.8)
+    assert timing.are_late(1, 0.05 + MAX_UNREAD_DURATION_S + 0.01), "a program that was stopped meanwhile"
+    assert not timing.are_late(MAX_KEYS_PER_READ, 0.7)
+    assert timing.are_late(MAX_KEYS_PER_READ + 1, 0.8)

@@ -6,30 +6,35 @@ import pytest
 
 from snakesim_operator.cli import main
 from snakesim_operator.robot_commands.teleop.keyboard import _split_keys  # pyright: ignore[reportPrivateUsage]
-from snakesim_operator.robot_commands.teleop.steering import LEAD_RAD, VALID_NS, Steering
+from snakesim_operator.robot_commands.teleop.steering import INTENT_VALIDITY_NS, MAX_HEADING_OFFSET_RAD, Steering
 
 
 def test_speed_goes_by_steps_and_never_beyond_the_fastest() -> None:
     steering = Steering("anna", 0.12)
     for _ in range(5):
         steering.change_speed(1, 0.0)
-    assert steering.intent(7).speed_m_s == 0.12
+    assert steering.make_intent(7).speed_m_s == 0.12
     for _ in range(9):
         steering.change_speed(-1, 0.0)
-    intent = steering.intent(8)
-    assert (intent.speed_m_s, intent.go, intent.timestamp_ns, intent.valid_for_ns) == (-0.12, True, 8, VALID_NS)
+    intent = steering.make_intent(8)
+    assert (intent.speed_m_s, intent.go, intent.timestamp_ns, intent.valid_for_ns) == (
+        -0.12,
+        True,
+        8,
+        INTENT_VALIDITY_NS,
+    )
     steering.stop(1.0)
-    assert not steering.intent(9).go
+    assert not steering.make_intent(9).go
 
 
 def test_the_direction_begins_at_the_bodys_and_stays_near_it() -> None:
     steering = Steering("anna", 0.3)
-    assert steering.intent(0).heading_w_rad is None, "the mission's own goal"
+    assert steering.make_intent(0).heading_w_rad is None, "the mission's own goal"
     steering.rotate_heading(0.2, 3.1, 0.0)
-    assert steering.intent(0).heading_w_rad == pytest.approx(3.3 - 2 * math.pi)
+    assert steering.make_intent(0).heading_w_rad == pytest.approx(3.3 - 2 * math.pi)
     for _ in range(50):
         steering.rotate_heading(0.2, 0.0, 0.0)
-    assert steering.heading_w_rad == pytest.approx(LEAD_RAD)
+    assert steering.heading_w_rad == pytest.approx(MAX_HEADING_OFFSET_RAD)
 
 
 def test_keys_arrive_whole_or_in_bunches() -> None:
