@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import sys
+import time
 from typing import Any
 
 import msgspec
@@ -26,6 +27,7 @@ CAMERA = {
     "look_at": (0.0, 0.0, 0.0),
     "up_direction": (0.0, 0.0, 1.0),
 }
+POLL_S = 0.02
 ASKED = "LocalStorageGetItemRequestMessage"
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
@@ -82,19 +84,33 @@ class Viewer:
 
     async def click(self, button: str) -> None:
         """Press a button."""
-        await self.say({"type": "GuiUpdateMessage", "uuid": self.named(button), "updates": {"value": True}})
+        await self.say(
+            {"type": "GuiUpdateMessage", "uuid": await self.wait_for_uuid(button), "updates": {"value": True}}
+        )
 
-    async def choose(self, label: str, value: str) -> None:
-        """Press one of a group of buttons, or choose from a list."""
-        await self.say({"type": "GuiUpdateMessage", "uuid": self.named(label), "updates": {"value": value}})
+    async def choose(self, label: str, value: str | bool | int) -> None:
+        """Set the value of an input: press a button, choose from a list, or enter a number."""
+        await self.say(
+            {"type": "GuiUpdateMessage", "uuid": await self.wait_for_uuid(label), "updates": {"value": value}}
+        )
 
     async def trigger(self, command: str) -> None:
         """Press the key of a command."""
-        await self.say({"type": "CommandTriggerMessage", "uuid": self.named(command)})
+        await self.say({"type": "CommandTriggerMessage", "uuid": await self.wait_for_uuid(command)})
 
-    def named(self, label: str) -> str:
-        """The id of what has a label."""
-        return next(uuid for uuid, props in self._of.items() if props.get("label") == label)
+    async def wait_for_uuid(self, label: str) -> str:
+        """Return the id of the button, input or command with a label, as soon as the page has received it.
+
+        The parts of a page arrive one after another, while `watch` runs. On a busy computer a label that belongs
+        together with another one may arrive later.
+        """
+        deadline = time.monotonic() + TIMEOUT_S
+        while time.monotonic() < deadline:
+            for uuid, props in self._of.items():
+                if props.get("label") == label:
+                    return uuid
+            await asyncio.sleep(POLL_S)
+        raise AssertionError(f"no {label!r} on the page within {TIMEOUT_S:g} s")
 
     async def say(self, message: dict[str, Any]) -> None:
         """Send any message."""

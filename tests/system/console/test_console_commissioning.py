@@ -111,7 +111,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
 async def armed(viewer: Viewer, home: Path) -> None:
     """Jog joint_2, which arms the robot."""
     await until(lambda: viewer.shows("<div>done") or viewer.shows("<div>ended"), "the end of the step before")
-    await viewer.say({"type": "GuiUpdateMessage", "uuid": viewer.named("Joint (0: all)"), "updates": {"value": 2}})
+    await viewer.choose("Joint (0: all)", 2)
     await viewer.click("Start step")
     await until(lambda: viewer.shows("<div>joint_2: from -0.2"), "a joint that may be moved")
     await until(lambda: read_setpoints(home)["lifecycle"] != "disarmed", "armed")
@@ -122,7 +122,7 @@ async def moved_and_stood(viewer: Viewer, relay: StallingRelay, home: Path) -> b
     await armed(viewer, home)
     await until(lambda: stopped(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0], "one joint with current")
     before = read_setpoints(home)["target"][1]
-    held = {"type": "GuiButtonHoldMessage", "uuid": viewer.named(FORWARDS), "frequency": HOLD_HZ}
+    held = {"type": "GuiButtonHoldMessage", "uuid": await viewer.wait_for_uuid(FORWARDS), "frequency": HOLD_HZ}
     while not stopped(home) and read_setpoints(home)["target"][1] < before + 0.04:
         await viewer.say(held)
         await asyncio.sleep(1 / HOLD_HZ)
