@@ -30,7 +30,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
     for name in ("angle_rad", "torque_nm", "target", "position_w_m", "contact_peak_n"):
         assert np.array_equal(getattr(ours.record, name), getattr(theirs, name), equal_nan=True), name
     # Not every tick's: on a busy computer a network drops some, and control reports that time is paused.
-    for name in ("control", "worlds"):
+    for name in ("control_states", "worlds"):
         mine, other = ({said.tick: said for said in getattr(record, name)} for record in (ours.record, theirs))
         shared = [t for t in mine.keys() & other.keys() if t and not _stands(other[t])]
         assert len(shared) > 0.8 * len(mine) - 3 and all(mine[t] == other[t] for t in shared), name
