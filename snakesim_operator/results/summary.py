@@ -121,13 +121,24 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     empty_push_points: Annotated[
         float | None, _make_quantity_meta("1", "share of those push-points that carried nothing")
     ]
-    energy_j: Annotated[float | None, _make_quantity_meta("J", "sum over joints of |torque x velocity| over time")]
+    energy_j: Annotated[
+        float | None,
+        _make_quantity_meta("J", "sum over joints of |torque x velocity| over time, from one sample a control period"),
+    ]
     torque_joints_j: Annotated[
-        float | None, _make_quantity_meta("J", "work of the joints in torque mode on the body, less what they took")
+        float | None,
+        _make_quantity_meta(
+            "J", "sum of torque x velocity over time of joints in torque mode, from one sample a control period"
+        ),
     ] = None
-    position_joints_j: Annotated[float | None, _make_quantity_meta("J", "the same of the joints in position mode")] = (
-        None
-    )
+    position_joints_j: Annotated[
+        float | None,
+        _make_quantity_meta(
+            "J",
+            "the same of joints in position mode: less than the work of their motors, and maybe negative, because the "
+            "samples miss the torque that each new target causes",
+        ),
+    ] = None
     goal_m: Annotated[
         float | None, _make_quantity_meta("m", "distance from the start to the mission's goal; null without one")
     ] = None

@@ -242,12 +242,24 @@ def compute_energy_j_per_m(record: RunRecord, progress: ForwardProgress) -> floa
 
 
 def compute_energy_j(record: RunRecord, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
-    """Integrate |torque x velocity| of all joints over the selected rows, in J. Unknown values count as 0."""
+    """Integrate |torque x velocity| of all joints over the selected rows, in J.
+
+    Each row stands for a control period. Unknown values count as 0.
+    """
     return float(np.nansum(np.abs(_compute_joint_power_w(record)[rows])) * _get_control_period_s(record))
 
 
 def compute_work_j(record: RunRecord, mode: Mode) -> float:
-    """Compute the net work of all joints while they are in a mode, in J: work of the body on them is negative."""
+    """Compute the sum of torque x velocity of all joints while they are in a mode, in J.
+
+    Each row stands for a control period. Torque is sampled at the end of a period. In position mode, its component
+    along the motion is lowest there, because the target has not stepped since the start of the period. So the sum is
+    less than the work of the motors, and may be negative although they drive the body. Unknown values count as 0.
+
+    Args:
+        record: The recorded run.
+        mode: Mode of the joints whose rows are added.
+    """
     return float(
         np.nansum(np.where(record.mode == mode, _compute_joint_power_w(record), 0.0)) * _get_control_period_s(record)
     )
