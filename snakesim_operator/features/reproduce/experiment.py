@@ -1,0 +1,159 @@
+"""What every experiment states, and what it finds: the published number, ours, and the reasons for a difference."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from snakesim_operator.features.reproduce.trials import Trials
+
+Basis = Literal["printed", "formula", "model"]
+"""What a published value is: a value that the source prints, a formula of the source that we evaluate, or equations of
+the source that we solve.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where a published value is from."""
+
+    authors: str
+    title: str
+    published_in: str
+    year: int | None  # None: the copy that we have prints no year
+    place: str  # figure, table, equation or section
+    seen: str  # what we have read of it
+
+    @property
+    def year_text(self) -> str:
+        """Return the year, or "no year"."""
+        return "no year" if self.year is None else str(self.year)
+
+    @property
+    def short_text(self) -> str:
+        """Return authors and title in one line."""
+        return f"{self.authors}: {self.title}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A published value and ours."""
+
+    quantity: str
+    unit: str  # "1" for a number without a unit, "" for a text
+    published: float | str
+    basis: Basis
+    ours: float | str
+    interval: tuple[float, float] | None = None  # 95 % of the mean over seeds; None: the result does not depend on it
+    runs: int
+
+    @property
+    def difference(self) -> float | None:
+        """Return ours minus the published value; None for texts."""
+        if isinstance(self.published, str) or isinstance(self.ours, str):
+            return None
+        return self.ours - self.published
+
+    @property
+    def agrees(self) -> bool | None:
+        """Return whether two texts are equal; None for numbers."""
+        if isinstance(self.published, str) or isinstance(self.ours, str):
+            return self.published == self.ours
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """A reason for a difference between the published value and ours."""
+
+    cause: str
+    effect: float | None = None  # on our value; None: known, but its size was not computed
+    unit: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """A curve of the picture of an experiment."""
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    is_ours: bool = False  # drawn as points
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """The picture of an experiment: curves over one quantity."""
+
+    x_label: str
+    y_label: str
+    curves: Sequence[Curve]
+    is_logarithmic: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What one experiment found."""
+
+    comparisons: Sequence[Comparison]
+    reasons: Sequence[Reason]
+    picture: Picture
+    notes: Sequence[str] = field(default=())
+
+
+class Experiment(ABC):
+    """A published experiment that our simulator repeats."""
+
+    name: ClassVar[str]
+    """What the command calls it."""
+
+    source: ClassVar[Source]
+    """Where the published value is from."""
+
+    claim: ClassVar[str]
+    """What is published, in one sentence."""
+
+    conditions: ClassVar[Sequence[str]]
+    """Conditions of the published experiment, as far as we have read them, and ours where they differ."""
+
+    method: ClassVar[str]
+    """How our value is measured."""
+
+    @abstractmethod
+    def run(self, trials: Trials) -> Findings:
+        """Repeat the experiment.
+
+        Args:
+            trials: Runs configurations in the simulator. If `trials.is_quick`, fewer and shorter runs are enough.
+        """
+
+
+def explain_by_steps(values: Sequence[tuple[str, float]], unit: str, rest: str) -> list[Reason]:
+    """Return the reasons of a difference from values that come closer to the simulator step by step.
+
+    Args:
+        values: The published value first, with an empty text. Each further one has the cause of its difference from the
+            one before. The last one is ours, and its cause is not known.
+        unit: Unit of the values.
+        rest: What may be the cause of the last difference.
+    """
+    reasons: list[Reason] = []
+    previous = values[0][1]
+    for cause, value in values[1:-1]:
+        reasons.append(Reason(cause=cause, effect=value - previous, unit=unit))
+        previous = value
+    last = values[-1][1] - previous
+    reasons.append(Reason(cause=f"not explained: {rest}", effect=last, unit=unit))
+    return reasons
+
+
+def fit_exponent(x: Sequence[float], y: Sequence[float]) -> float:
+    """Return the exponent p of y = c x^p, by least squares in logarithms."""
+    log_x = [math.log(value) for value in x]
+    log_y = [math.log(value) for value in y]
+    mean_x = sum(log_x) / len(log_x)
+    mean_y = sum(log_y) / len(log_y)
+    covariance = sum((a - mean_x) * (b - mean_y) for a, b in zip(log_x, log_y, strict=True))
+    variance = sum((a - mean_x) ** 2 for a in log_x)
+    return covariance / variance

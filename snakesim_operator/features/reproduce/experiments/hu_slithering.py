@@ -1,0 +1,98 @@
+"""Hu, Nirody, Scott and Shelley 2009: a snake on flat ground, with the friction measured on its scales."""
+
+from snakesim_operator.features.reproduce.experiment import (
+    Comparison,
+    Curve,
+    Experiment,
+    Findings,
+    Picture,
+    Source,
+    explain_by_steps,
+)
+from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_speed_m_s
+from snakesim_operator.features.reproduce.trials import NO_SEEDS, GaitRun, Trials, make_serpenoid_run, set_skin
+
+FORWARD = 0.11
+BACKWARD = 0.14
+SIDEWAYS = 0.19
+SIDEWAYS_SWEEP = (0.14, 0.165, 0.19, 0.28, 0.44)
+WINDING_ANGLE_RAD = 0.9
+WAVELENGTH = 0.5
+PERIOD_S = 2.0
+
+
+class HuSlithering(Experiment):
+    """Speed against the ratio of sideways to forward friction."""
+
+    name = "hu-slithering"
+    source = Source(
+        authors="D. L. Hu, J. Nirody, T. Scott and M. J. Shelley",
+        title="The mechanics of slithering locomotion",
+        published_in="PNAS 106",
+        year=2009,
+        place="equation 1 and the law of sliding friction; coefficients of milk snakes on cloth",
+        seen="abstract and model; not the table of speeds, so that no measured speed of a snake is quoted",
+    )
+    claim = (
+        "Each piece of the body is braked by its weight times 0.11 forward, 0.14 backward and 0.19 sideways, against its "
+        "direction of sliding. With the shape prescribed, Newton's law gives the motion of the body."
+    )
+    conditions = (
+        "published: a snake whose shape is prescribed, evenly distributed weight, these coefficients on cloth",
+        "ours: 31 links, two waves of a serpenoid curve with 0.9 rad and a period of 2 s; the curve of the paper was "
+        "not read, so the published equations are solved for our curve",
+    )
+    method = (
+        "Speed of the center of mass along the body over two periods, after two that do not count. The equations are "
+        f"solved without MuJoCo, in the plane. {NO_SEEDS}"
+    )
+
+    def run(self, trials: Trials) -> Findings:
+        """Measure the speed with several coefficients sideways; forward and backward ones stay."""
+        coefficients = (SIDEWAYS,) if trials.is_quick else SIDEWAYS_SWEEP
+        runs = [_make_run(sideways) for sideways in coefficients]
+        motions = trials.measure(runs)
+        ours = [motion.speed_m_s / motion.body_length_m for motion in motions]
+        solved = trials.call(solve_model, [(run,) for run in runs])
+        compared = coefficients.index(SIDEWAYS)
+        measured_waves = JointWaves(motions[compared].angle_harmonics, PERIOD_S)
+        robot = runs[compared].robot
+        with_measured = find_chain_speed_m_s(robot, measured_waves, runs[compared].friction) / robot.length_m
+        unit = "body lengths/s"
+        comparison = Comparison(
+            quantity="speed with 0.11 forward, 0.14 backward and 0.19 sideways",
+            unit=unit,
+            published=solved[compared],
+            basis="model",
+            ours=ours[compared],
+            runs=1,
+        )
+        ratios = [sideways / FORWARD for sideways in coefficients]
+        picture = Picture(
+            x_label="sideways over forward friction",
+            y_label="speed [body lengths/s]",
+            curves=(
+                Curve(label="equations of the paper", x=ratios, y=solved),
+                Curve(label="simulator", x=ratios, y=ours, is_ours=True),
+            ),
+        )
+        reasons = explain_by_steps(
+            [
+                ("", solved[compared]),
+                ("the servos do not follow exactly", with_measured),
+                ("", ours[compared]),
+            ],
+            unit=unit,
+            rest="contacts that stick before they slide, and loads that are not constant",
+        )
+        return Findings(comparisons=(comparison,), reasons=reasons, picture=picture)
+
+
+def _make_run(sideways: float) -> GaitRun:
+    return make_serpenoid_run(WINDING_ANGLE_RAD, WAVELENGTH, PERIOD_S, set_skin(FORWARD, BACKWARD, sideways))
+
+
+def solve_model(run: GaitRun) -> float:
+    """Return the speed by the equations of the paper, in body lengths per second. Runs in a worker."""
+    waves = JointWaves.from_serpenoid(run.robot, WINDING_ANGLE_RAD, WAVELENGTH, PERIOD_S)
+    return find_chain_speed_m_s(run.robot, waves, run.friction) / run.robot.length_m
