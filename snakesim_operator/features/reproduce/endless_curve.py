@@ -1,7 +1,7 @@
 """A body of endless length on a serpenoid curve, without inertia: forces are in balance at any time.
 
-The body moves along its curve at the speed V of the wave, while the curve as a whole slips backward at the speed w. With
-the angle theta between the tangent and the axis of the curve, a point of the body has the velocity
+The body moves along its curve at the speed V of the wave, while the curve as a whole slips backward at the speed w.
+With the angle theta between the tangent and the axis of the curve, a point of the body has the velocity
 
     V - w cos theta    along the body
     w sin theta        across it
@@ -13,6 +13,7 @@ friction along the axis. On average there is no force across the axis.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.reproduce.gait_motion import MIN_SLIP_M_S, GroundFriction, find_friction_per_load
@@ -54,7 +55,7 @@ def find_endless_motion(winding_angle_rad: float, friction: GroundFriction, wave
             high = slip
     slip = 0.5 * (low + high)
     speed = float(np.mean(np.cos(angles_rad))) - slip
-    velocities = wave_m_s * _find_slips(slip, angles_rad)
+    velocities = _find_slips(slip, angles_rad, wave_m_s)
     forces = find_friction_per_load(velocities, friction, MIN_SLIP_M_S)
     power = float(np.mean(-(forces * np.conj(velocities)).real))
     forward = friction.dry.forward
@@ -62,13 +63,15 @@ def find_endless_motion(winding_angle_rad: float, friction: GroundFriction, wave
     return EndlessMotion(speed, slip, cost)
 
 
-def _find_slips(slip: float, angles_rad: Floats) -> np.ndarray:
-    """Return the velocities of the body along itself, and as imaginary part across."""
-    return 1.0 - slip * np.cos(angles_rad) + 1j * slip * np.sin(angles_rad)
+def _find_slips(slip: float, angles_rad: Floats, wave_m_s: float) -> NDArray[np.complex128]:
+    """Return the velocities of the body along itself in m/s, and as imaginary part across."""
+    along = 1.0 - slip * np.cos(angles_rad)
+    across = slip * np.sin(angles_rad)
+    return (wave_m_s * (along + 1j * across)).astype(np.complex128)
 
 
 def _find_force(slip: float, angles_rad: Floats, friction: GroundFriction, wave_m_s: float) -> float:
     """Return the mean force of friction along the axis of the curve, divided by the load."""
-    forces = find_friction_per_load(wave_m_s * _find_slips(slip, angles_rad), friction, MIN_SLIP_M_S)
+    forces = find_friction_per_load(_find_slips(slip, angles_rad, wave_m_s), friction, MIN_SLIP_M_S)
     # The axis has the direction (cos theta, -sin theta) along the body and across it.
     return float(np.mean(forces.real * np.cos(angles_rad) - forces.imag * np.sin(angles_rad)))

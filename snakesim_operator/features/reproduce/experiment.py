@@ -21,14 +21,9 @@ class Source:
     authors: str
     title: str
     published_in: str
-    year: int | None  # None: the copy that we have prints no year
+    year: int
     place: str  # figure, table, equation or section
     seen: str  # what we have read of it
-
-    @property
-    def year_text(self) -> str:
-        """Return the year, or "no year"."""
-        return "no year" if self.year is None else str(self.year)
 
     @property
     def short_text(self) -> str:
@@ -114,8 +109,11 @@ class Experiment(ABC):
     claim: ClassVar[str]
     """What is published, in one sentence."""
 
-    conditions: ClassVar[Sequence[str]]
-    """Conditions of the published experiment, as far as we have read them, and ours where they differ."""
+    published_conditions: ClassVar[str]
+    """Conditions of the published experiment, as far as we have read them."""
+
+    our_conditions: ClassVar[str]
+    """Conditions of our runs."""
 
     method: ClassVar[str]
     """How our value is measured."""
@@ -144,7 +142,7 @@ def explain_by_steps(values: Sequence[tuple[str, float]], unit: str, rest: str) 
         reasons.append(Reason(cause=cause, effect=value - previous, unit=unit))
         previous = value
     last = values[-1][1] - previous
-    reasons.append(Reason(cause=f"not explained: {rest}", effect=last, unit=unit))
+    reasons.append(Reason(cause=f"Unknown, possibly {rest}.", effect=last, unit=unit))
     return reasons
 
 

@@ -93,7 +93,7 @@ def _find_harmonics(angles_rad: Floats, period_s: float, rate_hz: float) -> NDAr
     """Return the Fourier series of the joint angles, (HARMONICS, joints). Phase 0 is the first row."""
     phases = 2 * np.pi * np.arange(len(angles_rad)) / (period_s * rate_hz)
     waves = np.exp(-1j * np.outer(np.arange(HARMONICS), phases))
-    series = 2 * waves @ angles_rad / len(angles_rad)
+    series: NDArray[np.complex128] = (2 * waves @ angles_rad / len(angles_rad)).astype(np.complex128)
     series[0] /= 2
     return series
 

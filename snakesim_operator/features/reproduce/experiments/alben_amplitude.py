@@ -37,21 +37,22 @@ class AlbenAmplitude(Experiment):
         published_in="Proceedings of the Royal Society A 469",
         year=2013,
         place="abstract",
-        seen="abstract and introduction",
+        seen="Abstract and introduction.",
     )
     claim = (
         "For large transverse friction, the wave that travels with the least work is retrograde, and its optimal "
         "amplitude decays as the power -1/4 of the coefficient of transverse friction."
     )
-    conditions = (
-        "published: a continuous body without inertia, dry friction, any periodic shape; the limit of large coefficients",
-        "ours: 31 links, two waves of a serpenoid curve with a period of 3 s, a transverse coefficient of 1, and one of "
-        "1/10 to 1/80 along the body in both directions",
+    published_conditions = (
+        "A slender body whose curvature is prescribed, with dry friction in the plane, for large coefficients."
+    )
+    our_conditions = (
+        "31 links of planar13, and two waves of a serpenoid curve with a period of 3 s. The coefficient is 1 across "
+        "the body, and 1/10 to 1/80 along it in both directions."
     )
     method = (
-        "At each ratio of the coefficients, work against friction per distance at five amplitudes, and the minimum of a "
-        "cubic through them in logarithms. The exponent is that of the winding angles at the minima, by least squares. "
-        f"{NO_SEEDS}"
+        "Work against friction per distance at five amplitudes for each ratio, and the minimum of a cubic through "
+        f"them in logarithms. The exponent is that of the winding angles at the minima, by least squares. {NO_SEEDS}"
     )
 
     def run(self, trials: Trials) -> Findings:
@@ -77,12 +78,12 @@ class AlbenAmplitude(Experiment):
         )
         reasons = (
             Reason(
-                cause="the coefficients are not infinite, and the curve is a serpenoid: an endless body without inertia",
+                cause="The coefficients are not infinite, and the curve is a serpenoid.",
                 effect=endless_exponent + 0.25,
                 unit="1",
             ),
             Reason(
-                cause="not explained in parts: the body ends, has 31 straight links, mass and servos",
+                cause="The body ends, and has 31 straight links, mass and servos. Their parts are unknown.",
                 effect=exponent - endless_exponent,
                 unit="1",
             ),
@@ -103,8 +104,8 @@ class AlbenAmplitude(Experiment):
 def _expect_optimum_rad(ratio: float) -> float:
     """Return the winding angle of least work for a large ratio of the coefficients.
 
-    With the slip w and the winding angle alpha both small, the balance along the axis gives w = 2 / (ratio alpha^2). The
-    work per distance, over that of dragging the body, is 1 + alpha^2 / 4 + 2 / (ratio alpha^2). Its minimum is at
+    With the slip w and the winding angle alpha both small, the balance along the axis gives w = 2 / (ratio alpha^2).
+    The work per distance, over that of dragging the body, is 1 + alpha^2 / 4 + 2 / (ratio alpha^2). Its minimum is at
     alpha^2 = sqrt(8 / ratio).
     """
     return (8.0 / ratio) ** 0.25

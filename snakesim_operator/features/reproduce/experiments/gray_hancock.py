@@ -45,18 +45,18 @@ class GrayHancock(Experiment):
         published_in="Journal of Experimental Biology 32",
         year=1955,
         place="speed of a filament without a head, from normal and tangential drag",
-        seen="the formula, which follows from the balance of drag along the axis: see the docstring of the module "
-        "`endless_curve`",
+        seen=(
+            "The formula as other works quote it, not the paper. It follows from the balance of drag along the axis, "
+            "which a test confirms for small bends."
+        ),
     )
     claim = (
         "A filament that bends in a sine wave of amplitude b and wave number k travels at V = c b^2 k^2 (r - 1) / "
         "(2 + r b^2 k^2), with the speed c of the wave and the ratio r of normal to tangential drag."
     )
-    conditions = (
-        "published: an endless filament, small bends, no inertia, r = 2",
-        "ours: 31 links, three waves on the body, viscous ground with r = 2, and the weight of planar13",
-    )
-    method = "Speed of the center of mass along the body over two periods, after two that do not count. " + NO_SEEDS
+    published_conditions = "An endless filament, small bends, no inertia, and a ratio of 2."
+    our_conditions = "31 links of planar13, three waves on the body, and viscous ground with a ratio of 2."
+    method = f"Speed of the center of mass along the body over two periods, after two that do not count. {NO_SEEDS}"
 
     def run(self, trials: Trials) -> Findings:
         """Measure the speed at several amplitudes."""
@@ -64,9 +64,7 @@ class GrayHancock(Experiment):
         friction = set_viscous(ACROSS_S_PER_M / DRAG_RATIO, ACROSS_S_PER_M)
         runs = [make_serpenoid_run(angle_rad, WAVELENGTH, PERIOD_S, friction) for angle_rad in angles_rad]
         motions = trials.measure(runs)
-        ours = [
-            _find_speed_ratio(motion, angle_rad) for motion, angle_rad in zip(motions, angles_rad, strict=True)
-        ]
+        ours = [_find_speed_ratio(motion, angle_rad) for motion, angle_rad in zip(motions, angles_rad, strict=True)]
         compared = angles_rad.index(COMPARED_RAD)
         published = find_published_ratio(COMPARED_RAD, DRAG_RATIO)
         steps = _find_steps(runs[compared], motions[compared])
@@ -116,13 +114,13 @@ def _find_steps(run: GaitRun, motion: GaitMotion) -> list[tuple[str, float]]:
     commanded = JointWaves.from_serpenoid(robot, COMPARED_RAD, WAVELENGTH, PERIOD_S)
     measured = JointWaves(motion.angle_harmonics, PERIOD_S)
     return [
-        ("the bends are not small, and the curve is a serpenoid", endless),
+        ("The bends are not small, and the curve is a serpenoid.", endless),
         (
-            "the body ends, has 31 straight links, and has mass",
+            "The body ends, and has 31 straight links and mass.",
             find_chain_speed_m_s(robot, commanded, run.friction) / wave_m_s,
         ),
         (
-            "the servos do not follow exactly",
+            "The servos do not follow exactly.",
             find_chain_speed_m_s(robot, measured, run.friction) / wave_m_s,
         ),
     ]

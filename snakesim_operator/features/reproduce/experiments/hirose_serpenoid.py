@@ -35,19 +35,22 @@ class HiroseSerpenoid(Experiment):
         title="Biologically Inspired Robots: Snake-Like Locomotors and Manipulators",
         published_in="Oxford University Press",
         year=1993,
-        place="serpenoid curve; its length along the axis is J0(alpha) times its length",
-        seen="the curve, as many sources quote it; the ratio is the mean of cos(alpha cos phase), a Bessel function",
+        place="serpenoid curve, whose length along the axis is J0(alpha) times that of the body",
+        seen=(
+            "The curve as other works quote it, not the book. The ratio of the lengths is the mean of cos(alpha cos "
+            "phase), which is a Bessel function."
+        ),
     )
     claim = (
         "A snake whose wheels do not slip sideways moves along its own curve. So it travels one wave in each period: "
         "V = J0(alpha) lambda L / T, with the winding angle alpha and the length lambda L of a wave along the body."
     )
-    conditions = (
-        "published: a continuous body that does not slip",
-        "ours: 31 links, two waves on the body, wheels with a tire friction of 0.6 and bearings that brake with 1 % of "
-        "the weight",
+    published_conditions = "A continuous body that does not slip sideways."
+    our_conditions = (
+        "31 links of planar13, two waves on the body, wheels with a tire friction of 0.6, and bearings that brake "
+        "with 1 % of the weight."
     )
-    method = "Speed of the center of mass along the body over two periods, after two that do not count. " + NO_SEEDS
+    method = f"Speed of the center of mass along the body over two periods, after two that do not count. {NO_SEEDS}"
 
     def run(self, trials: Trials) -> Findings:
         """Measure the speed at several winding angles."""
@@ -104,10 +107,10 @@ def _find_steps(run: GaitRun, motion: GaitMotion, wave_m_s: float) -> list[tuple
     commanded = JointWaves.from_serpenoid(robot, COMPARED_RAD, WAVELENGTH, PERIOD_S)
     measured = JointWaves(motion.angle_harmonics, PERIOD_S)
     return [
-        ("the wheels brake, and slip sideways", wave_m_s * find_endless_motion(COMPARED_RAD, run.friction).speed),
+        ("The wheels brake, and slip sideways.", wave_m_s * find_endless_motion(COMPARED_RAD, run.friction).speed),
         (
-            "the body ends, has 31 straight links, and has mass",
+            "The body ends, and has 31 straight links and mass.",
             find_chain_speed_m_s(robot, commanded, run.friction),
         ),
-        ("the servos do not follow exactly", find_chain_speed_m_s(robot, measured, run.friction)),
+        ("The servos do not follow exactly.", find_chain_speed_m_s(robot, measured, run.friction)),
     ]

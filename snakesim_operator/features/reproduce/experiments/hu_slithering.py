@@ -30,21 +30,24 @@ class HuSlithering(Experiment):
         title="The mechanics of slithering locomotion",
         published_in="PNAS 106",
         year=2009,
-        place="equation 1 and the law of sliding friction; coefficients of milk snakes on cloth",
-        seen="abstract and model; not the table of speeds, so that no measured speed of a snake is quoted",
+        place="equation 1 and the law of sliding friction, with coefficients of milk snakes on cloth",
+        seen=(
+            "Abstract, equation 1 and the law of sliding friction, and the coefficients as this project cites them. "
+            "No table and no figure, so that no measured speed of a snake is quoted."
+        ),
     )
     claim = (
-        "Each piece of the body is braked by its weight times 0.11 forward, 0.14 backward and 0.19 sideways, against its "
-        "direction of sliding. With the shape prescribed, Newton's law gives the motion of the body."
+        "Each piece of the body is braked by its weight times 0.11 forward, 0.14 backward and 0.19 sideways, against "
+        "its direction of sliding. With the shape prescribed, Newton's law gives the motion of the body."
     )
-    conditions = (
-        "published: a snake whose shape is prescribed, evenly distributed weight, these coefficients on cloth",
-        "ours: 31 links, two waves of a serpenoid curve with 0.9 rad and a period of 2 s; the curve of the paper was "
-        "not read, so the published equations are solved for our curve",
+    published_conditions = "A snake of evenly distributed weight, whose shape is prescribed, on cloth."
+    our_conditions = (
+        "31 links of planar13, two waves of a serpenoid curve with a winding angle of 0.9 rad, and a period of 2 s. "
+        "We have not read the curve of the paper, so its equations are solved for our curve."
     )
     method = (
         "Speed of the center of mass along the body over two periods, after two that do not count. The equations are "
-        f"solved without MuJoCo, in the plane. {NO_SEEDS}"
+        f"solved in the plane, without MuJoCo. {NO_SEEDS}"
     )
 
     def run(self, trials: Trials) -> Findings:
@@ -79,7 +82,7 @@ class HuSlithering(Experiment):
         reasons = explain_by_steps(
             [
                 ("", solved[compared]),
-                ("the servos do not follow exactly", with_measured),
+                ("The servos do not follow exactly.", with_measured),
                 ("", ours[compared]),
             ],
             unit=unit,

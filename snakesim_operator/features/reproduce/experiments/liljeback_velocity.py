@@ -34,22 +34,26 @@ class LiljebackVelocity(Experiment):
     source = Source(
         authors="P. Liljebäck, K. Y. Pettersen, Ø. Stavdahl and J. T. Gravdahl",
         title="Experimental Investigation of Fundamental Properties of Snake Robot Locomotion",
-        published_in="Norwegian University of Science and Technology, and SINTEF",
-        year=None,
+        published_in="IEEE/RSJ International Conference on Intelligent Robots and Systems",
+        year=2011,
         place="abstract, properties 1 and 2",
-        seen="the abstract; not the friction of the robot or its measured speeds",
+        seen="The abstract, in a copy that prints no year. Not the friction of the robot and its measured speeds.",
     )
     claim = (
         "The average forward velocity is proportional to the squared amplitude of the sinusoidal joint motion, and to "
         "its angular frequency."
     )
-    conditions = (
-        "published: derived for a model, and supported by a robot that was measured; the abstract prints no friction",
-        "ours: 10 links, a phase of 40 degrees between joints, viscous ground with three times the friction across a "
-        "link; amplitudes of 5 to 20 degrees at a period of 4 s, and periods of 2 to 6 s at 10 degrees",
+    published_conditions = (
+        "The properties are derived from a model, and supported by measurements of a robot. The abstract prints no "
+        "friction."
+    )
+    our_conditions = (
+        "10 links, a phase of 40 degrees between joints, and viscous ground with three times as much friction across "
+        "a link as along it. Amplitudes of 5 to 20 degrees with a period of 4 s, and periods of 2 to 6 s with 10 "
+        "degrees."
     )
     method = (
-        "Least squares of the logarithms of the speed. The speed is that of the center of mass along the body over two "
+        "Exponents by least squares of logarithms. The speed is that of the center of mass along the body over two "
         f"periods, after two that do not count. {NO_SEEDS}"
     )
 
@@ -91,35 +95,33 @@ class LiljebackVelocity(Experiment):
         )
         reasons = (
             Reason(
-                cause="amplitude: the published model is for small angles; a wave of greater amplitude slips less, and "
-                "its speed approaches that of the wave",
+                cause="Amplitude: the property is for small angles. A body with greater ones slips less, and its speed "
+                "approaches that of the wave.",
                 effect=endless - 2.0,
                 unit="1",
             ),
             Reason(
-                cause="amplitude: the body ends, has 10 straight links, mass, and servos that do not follow exactly",
+                cause="Amplitude: the body ends, and has 10 straight links, mass and servos.",
                 effect=chain_amplitude - endless,
                 unit="1",
             ),
             Reason(
-                cause="amplitude: not explained: contacts, and loads that are not constant",
+                cause="Amplitude: unknown, possibly contacts, and loads that are not constant.",
                 effect=amplitude_exponent - chain_amplitude,
                 unit="1",
             ),
             Reason(
-                cause="frequency: the body has mass, and servos that do not follow exactly",
+                cause="Frequency: the body has mass, and servos.",
                 effect=chain_frequency - 1.0,
                 unit="1",
             ),
             Reason(
-                cause="frequency: not explained: contacts, and loads that are not constant",
+                cause="Frequency: unknown, possibly contacts, and loads that are not constant.",
                 effect=frequency_exponent - chain_frequency,
                 unit="1",
             ),
         )
-        return Findings(
-            comparisons=comparisons, reasons=reasons, picture=_make_picture(amplitudes_rad, by_amplitude)
-        )
+        return Findings(comparisons=comparisons, reasons=reasons, picture=_make_picture(amplitudes_rad, by_amplitude))
 
 
 def _make_run(amplitude_rad: float, period_s: float) -> GaitRun:
