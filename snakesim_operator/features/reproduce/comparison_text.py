@@ -34,6 +34,8 @@ def describe_lines(experiment: Experiment, findings: Findings) -> Iterator[str]:
     yield from _labeled("conditions", f"Published: {experiment.published_conditions}")
     yield from _labeled("", f"Ours: {experiment.our_conditions}")
     yield from _labeled("method", experiment.method)
+    if not experiment.depends_on_seed:
+        yield from _labeled("", "The gait has no feedback, so that every seed gives the same motion.")
     for comparison in findings.comparisons:
         yield ""
         yield f"{comparison.quantity}{format_unit(comparison.unit)}"
@@ -121,6 +123,7 @@ def make_record(experiment: Experiment, findings: Findings) -> dict[str, Any]:
         "published_conditions": experiment.published_conditions,
         "our_conditions": experiment.our_conditions,
         "method": experiment.method,
+        "depends_on_seed": experiment.depends_on_seed,
         "comparisons": comparisons,
         "reasons": list(findings.reasons),
         "notes": list(findings.notes),

@@ -118,6 +118,9 @@ class Experiment(ABC):
     method: ClassVar[str]
     """How our value is measured."""
 
+    depends_on_seed: ClassVar[bool] = False
+    """Whether noise of the sensors changes the motion. Gaits without feedback move alike with every seed."""
+
     @abstractmethod
     def run(self, trials: Trials) -> Findings:
         """Repeat the experiment.

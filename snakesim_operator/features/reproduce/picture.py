@@ -5,7 +5,7 @@ from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from snakesim_hal.model.textfiles import exported
 from snakesim_operator.features.reproduce.experiment import Picture
@@ -20,7 +20,7 @@ STYLE: Any = {
     "legend.frameon": False,
     "figure.constrained_layout.use": True,
 }
-COLORS = ("#2c6fbb", "#8452a3", "#3a923a")
+COLORS = ("#2c6fbb", "#8452a3", "#3a923a", "#d98c1f", "#2aa0a4", "#9c5a3c")
 OUR_COLORS = ("#c0392b", "#d98c1f", "#2aa0a4")
 OUR_MARKERS = ("o", "s", "^")
 
@@ -57,7 +57,7 @@ def write_picture(picture: Picture, title: str, path: Path) -> None:
             axes.set(xscale="log", yscale="log")
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                axis.set_major_formatter(ScalarFormatter())
+                axis.set_major_formatter(FormatStrFormatter("%g"))
                 axis.set_minor_formatter(NullFormatter())
         axes.set(xlabel=picture.x_label, ylabel=picture.y_label, title=title)
         axes.legend()

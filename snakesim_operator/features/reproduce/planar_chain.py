@@ -50,8 +50,16 @@ class JointWaves:
         return JointWaves(np.stack([np.zeros_like(angles), angles]), period_s)
 
 
-def find_chain_speed_m_s(robot: RobotFile, waves: JointWaves, friction: GroundFriction) -> float:
-    """Return the mean speed of the center of mass along the mean direction from tail to head.
+@dataclass(frozen=True)
+class ChainMotion:
+    """How a chain moves, as means over whole periods."""
+
+    speed_m_s: float  # of the center of mass, along the mean direction from tail to head
+    ground_power_w: float  # work against friction per time
+
+
+def find_chain_motion(robot: RobotFile, waves: JointWaves, friction: GroundFriction) -> ChainMotion:
+    """Return how a chain moves that starts at rest, over the periods after SKIPPED_PERIODS.
 
     Args:
         robot: Lengths and masses of the links.
@@ -75,6 +83,7 @@ def find_chain_speed_m_s(robot: RobotFile, waves: JointWaves, friction: GroundFr
     marks: list[complex] = []  # the center of mass at the end of each period
     axes: list[complex] = []  # the mean vector from tail to head in each period
     axis_sum = 0j
+    work_j = 0.0  # against friction, in the periods that count
     for step in range((SKIPPED_PERIODS + MEASURED_PERIODS) * steps_per_period + 1):
         turns = np.exp(1j * orders * turn_rate * step * STEP_S)
         angles_rad = (turns @ waves.harmonics).real
@@ -103,6 +112,8 @@ def find_chain_speed_m_s(robot: RobotFile, waves: JointWaves, friction: GroundFr
 
         tangents = find_foot_tangents(links)
         forces_n = loads_n * tangents * find_friction_per_load(velocities * np.conj(tangents), friction, SMOOTH_M_S)
+        if step >= SKIPPED_PERIODS * steps_per_period:
+            work_j -= STEP_S * float((forces_n * np.conj(velocities)).real.sum())
         momentum += STEP_S * forces_n.sum()
         spin_momentum += STEP_S * float((np.conj(feet - center) * forces_n).imag.sum())
         place += STEP_S * tail_velocity
@@ -113,4 +124,4 @@ def find_chain_speed_m_s(robot: RobotFile, waves: JointWaves, friction: GroundFr
         way = marks[k + 1] - marks[k]
         axis = axes[k + 1]
         speeds.append((way * axis.conjugate()).real / abs(axis) / waves.period_s)
-    return float(np.mean(speeds))
+    return ChainMotion(float(np.mean(speeds)), work_j / (MEASURED_PERIODS * waves.period_s))

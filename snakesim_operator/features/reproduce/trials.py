@@ -27,7 +27,6 @@ CHAIN = (
     "robot.sensors.pose.position_noise_m=0",
     "robot.sensors.pose.angle_noise_rad=0",
 )
-NO_SEEDS = "The gait has no feedback, and the sensors have no noise, so that every seed gives the same motion."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,6 +69,7 @@ class AriizumiGaits(Experiment):
         "Energy of all joints, the sum of |torque x speed|, over the distance of the center of mass in 8 s, as the "
         "mean over seeds of the sensors' noise. A gait that moves less than 0.1 m has no value."
     )
+    depends_on_seed = True
 
     def run(self, trials: Trials) -> Findings:
         """Run the gaits at several ratios of friction, and sinus-lifting with strong motors too."""

@@ -13,8 +13,8 @@ from snakesim_operator.features.reproduce.experiment import (
     explain_by_steps,
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
-from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_speed_m_s
-from snakesim_operator.features.reproduce.trials import NO_SEEDS, GaitRun, Trials, make_serpenoid_run, set_viscous
+from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
+from snakesim_operator.features.reproduce.trials import GaitRun, Trials, make_serpenoid_run, set_viscous
 
 WINDING_ANGLES_RAD = (0.15, 0.3, 0.45, 0.6)
 COMPARED_RAD = 0.3
@@ -56,7 +56,7 @@ class GrayHancock(Experiment):
     )
     published_conditions = "An endless filament, small bends, no inertia, and a ratio of 2."
     our_conditions = "31 links of planar13, three waves on the body, and viscous ground with a ratio of 2."
-    method = f"Speed of the center of mass along the body over two periods, after two that do not count. {NO_SEEDS}"
+    method = "Speed of the center of mass along the body over two periods, after two that do not count."
 
     def run(self, trials: Trials) -> Findings:
         """Measure the speed at several amplitudes."""
@@ -117,10 +117,10 @@ def _find_steps(run: GaitRun, motion: GaitMotion) -> list[tuple[str, float]]:
         ("The bends are not small, and the curve is a serpenoid.", endless),
         (
             "The body ends, and has 31 straight links and mass.",
-            find_chain_speed_m_s(robot, commanded, run.friction) / wave_m_s,
+            find_chain_motion(robot, commanded, run.friction).speed_m_s / wave_m_s,
         ),
         (
             "The servos do not follow exactly.",
-            find_chain_speed_m_s(robot, measured, run.friction) / wave_m_s,
+            find_chain_motion(robot, measured, run.friction).speed_m_s / wave_m_s,
         ),
     ]

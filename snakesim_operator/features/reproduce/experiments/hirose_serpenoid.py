@@ -11,8 +11,8 @@ from snakesim_operator.features.reproduce.experiment import (
     explain_by_steps,
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
-from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_speed_m_s
-from snakesim_operator.features.reproduce.trials import NO_SEEDS, GaitRun, Trials, make_serpenoid_run
+from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
+from snakesim_operator.features.reproduce.trials import GaitRun, Trials, make_serpenoid_run
 
 WINDING_ANGLES_RAD = (0.3, 0.6, 0.9, 1.2)
 COMPARED_RAD = 0.6
@@ -50,7 +50,7 @@ class HiroseSerpenoid(Experiment):
         "31 links of planar13, two waves on the body, wheels with a tire friction of 0.6, and bearings that brake "
         "with 1 % of the weight."
     )
-    method = f"Speed of the center of mass along the body over two periods, after two that do not count. {NO_SEEDS}"
+    method = "Speed of the center of mass along the body over two periods, after two that do not count."
 
     def run(self, trials: Trials) -> Findings:
         """Measure the speed at several winding angles."""
@@ -110,7 +110,7 @@ def _find_steps(run: GaitRun, motion: GaitMotion, wave_m_s: float) -> list[tuple
         ("The wheels brake, and slip sideways.", wave_m_s * find_endless_motion(COMPARED_RAD, run.friction).speed),
         (
             "The body ends, and has 31 straight links and mass.",
-            find_chain_speed_m_s(robot, commanded, run.friction),
+            find_chain_motion(robot, commanded, run.friction).speed_m_s,
         ),
-        ("The servos do not follow exactly.", find_chain_speed_m_s(robot, measured, run.friction)),
+        ("The servos do not follow exactly.", find_chain_motion(robot, measured, run.friction).speed_m_s),
     ]

@@ -9,8 +9,8 @@ from snakesim_operator.features.reproduce.experiment import (
     Source,
     explain_by_steps,
 )
-from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_speed_m_s
-from snakesim_operator.features.reproduce.trials import NO_SEEDS, GaitRun, Trials, make_serpenoid_run, set_skin
+from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
+from snakesim_operator.features.reproduce.trials import GaitRun, Trials, make_serpenoid_run, set_skin
 
 FORWARD = 0.11
 BACKWARD = 0.14
@@ -47,7 +47,7 @@ class HuSlithering(Experiment):
     )
     method = (
         "Speed of the center of mass along the body over two periods, after two that do not count. The equations are "
-        f"solved in the plane, without MuJoCo. {NO_SEEDS}"
+        "solved in the plane, without MuJoCo."
     )
 
     def run(self, trials: Trials) -> Findings:
@@ -60,7 +60,7 @@ class HuSlithering(Experiment):
         compared = coefficients.index(SIDEWAYS)
         measured_waves = JointWaves(motions[compared].angle_harmonics, PERIOD_S)
         robot = runs[compared].robot
-        with_measured = find_chain_speed_m_s(robot, measured_waves, runs[compared].friction) / robot.length_m
+        with_measured = find_chain_motion(robot, measured_waves, runs[compared].friction).speed_m_s / robot.length_m
         unit = "body lengths/s"
         comparison = Comparison(
             quantity="speed with 0.11 forward, 0.14 backward and 0.19 sideways",
@@ -98,4 +98,4 @@ def _make_run(sideways: float) -> GaitRun:
 def solve_model(run: GaitRun) -> float:
     """Return the speed by the equations of the paper, in body lengths per second. Runs in a worker."""
     waves = JointWaves.from_serpenoid(run.robot, WINDING_ANGLE_RAD, WAVELENGTH, PERIOD_S)
-    return find_chain_speed_m_s(run.robot, waves, run.friction) / run.robot.length_m
+    return find_chain_motion(run.robot, waves, run.friction).speed_m_s / run.robot.length_m

@@ -14,8 +14,8 @@ from snakesim_operator.features.reproduce.experiment import (
     fit_exponent,
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
-from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_speed_m_s
-from snakesim_operator.features.reproduce.trials import NO_SEEDS, GaitRun, Trials, set_viscous
+from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
+from snakesim_operator.features.reproduce.trials import GaitRun, Trials, set_viscous
 
 MODULES = 9  # joints
 LAG_RAD = math.radians(40)  # of a joint behind the one ahead of it
@@ -54,7 +54,7 @@ class LiljebackVelocity(Experiment):
     )
     method = (
         "Exponents by least squares of logarithms. The speed is that of the center of mass along the body over two "
-        f"periods, after two that do not count. {NO_SEEDS}"
+        "periods, after two that do not count."
     )
 
     def run(self, trials: Trials) -> Findings:
@@ -139,7 +139,7 @@ def _make_run(amplitude_rad: float, period_s: float) -> GaitRun:
 
 def find_chain_speed(run: GaitRun, motion: GaitMotion) -> float:
     """Return the speed by the momentum balance, for the measured angles of the joints. Runs in a worker."""
-    return find_chain_speed_m_s(run.robot, JointWaves(motion.angle_harmonics, run.period_s), run.friction)
+    return find_chain_motion(run.robot, JointWaves(motion.angle_harmonics, run.period_s), run.friction).speed_m_s
 
 
 def _find_saturating_speed(amplitude_rad: float) -> float:

@@ -60,6 +60,7 @@ class SanfilippoHandOver(Experiment):
         "Joints that control reports as propelling, over seeds of the sensors' noise. The order counts from joint 7 "
         "on. An order that differs in a seed is printed."
     )
+    depends_on_seed = True
 
     def run(self, trials: Trials) -> Findings:
         """Run the case study with several seeds."""
