@@ -1,0 +1,34 @@
+"""`snakesim reproduce` through the command line, with one experiment in its quick form."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from snakesim_testing.harness.command import snakesim
+
+pytestmark = pytest.mark.skipif(find_spec("matplotlib") is None, reason="needs the extra `report`")
+PNG = b"\x89PNG\r\n"
+
+
+def test_an_experiment_prints_both_numbers_and_reasons_that_add_up(tmp_path: Path) -> None:
+    options = ("--quick", "--json", "--workers", "1", "--out", "pictures")
+    ended = snakesim("reproduce", "gray-hancock", *options, cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    (record,) = json.loads(ended.out)
+    (comparison,) = record["comparisons"]
+    assert comparison["published"] == pytest.approx(0.0437, abs=0.0001)
+    assert comparison["ours"] == pytest.approx(comparison["published"], rel=0.2)
+    effects = [reason["effect"] for reason in record["reasons"]]
+    assert sum(effects) == pytest.approx(comparison["difference"])
+    assert abs(effects[-1]) < 0.01 * comparison["published"], "what is unknown is small"
+    assert (tmp_path / "pictures" / "gray-hancock.png").read_bytes().startswith(PNG)
+
+
+def test_the_list_is_printed_for_readers_and_for_scripts(tmp_path: Path) -> None:
+    listed = snakesim("reproduce", "--list", cwd=tmp_path)
+    assert listed.code == 0, listed.err
+    entries = json.loads(snakesim("reproduce", "--list", "--json", cwd=tmp_path).out)
+    assert [line.split()[0] for line in listed.out.splitlines()] == [entry["name"] for entry in entries]
+    assert "Alben" in listed.out

@@ -1,0 +1,131 @@
+"""What `snakesim reproduce` prints of an experiment and its findings, and which experiments there are."""
+
+import msgspec
+import pytest
+
+from snakesim_hal.base.errors import ConfigError
+from snakesim_operator.features.reproduce.command import select_experiments
+from snakesim_operator.features.reproduce.comparison_text import (
+    describe_difference,
+    describe_lines,
+    describe_ours,
+    list_lines,
+    make_record,
+)
+from snakesim_operator.features.reproduce.experiment import (
+    Comparison,
+    Curve,
+    Experiment,
+    Findings,
+    Picture,
+    Reason,
+    Source,
+)
+from snakesim_operator.features.reproduce.experiments import EXPERIMENTS
+from snakesim_operator.features.reproduce.trials import Trials
+from snakesim_testing.messages import raises_error
+
+
+class Sledge(Experiment):
+    """An experiment for the tests."""
+
+    name = "sledge"
+    source = Source(
+        authors="A. Author", title="On sledges", published_in="Journal 1", year=1999, place="table 2", seen="the table"
+    )
+    claim = "A sledge slides at 2 m/s."
+    published_conditions = "Snow."
+    our_conditions = "Ice."
+    method = "By a stopwatch."
+
+    def run(self, trials: Trials) -> Findings:
+        raise NotImplementedError
+
+
+SPEED = Comparison(
+    quantity="speed", unit="m/s", published=2.0, basis="printed", ours=1.5, interval=(1.25, 1.75), runs=3
+)
+ORDER = Comparison(quantity="order", unit="", published="a, b", basis="printed", ours="a, b", runs=1)
+FINDINGS = Findings(
+    comparisons=(SPEED, ORDER),
+    reasons=(Reason(cause="Ice is smooth.", effect=-0.00004, unit="m/s"), Reason(cause="The wind.")),
+    picture=Picture(x_label="x", y_label="y", curves=(Curve(label="ours", x=[1.0], y=[2.0], is_ours=True),)),
+    notes=("A note.",),
+)
+
+
+def test_a_text_has_the_source_the_numbers_and_the_reasons() -> None:
+    assert list(describe_lines(Sledge(), FINDINGS)) == [
+        "sledge",
+        "source        A. Author: On sledges. Journal 1, 1999: table 2",
+        "seen          the table",
+        "claim         A sledge slides at 2 m/s.",
+        "conditions    Published: Snow.",
+        "              Ours: Ice.",
+        "method        By a stopwatch.",
+        "              The gait has no feedback, so that every seed gives the same motion.",
+        "",
+        "speed [m/s]",
+        "  published     2 (printed in the source)",
+        "  ours          1.5, 95 % interval 1.25 to 1.75 (3 runs)",
+        "  difference    -0.5 (-25.0 %)",
+        "",
+        "order",
+        "  published     a, b (printed in the source)",
+        "  ours          a, b (1 run)",
+        "  difference    none: both are the same",
+        "",
+        "why they differ",
+        "  -0.00004 m/s  Ice is smooth.",
+        "  unknown       The wind.",
+        "",
+        "A note.",
+    ]
+
+
+def test_texts_that_differ_are_said_to_differ() -> None:
+    other = Comparison(quantity="order", unit="", published="a", basis="printed", ours="b", runs=2)
+    assert describe_difference(other) == "they are not the same"
+    assert describe_ours(other) == "b (2 runs)"
+
+
+def test_a_record_for_scripts_has_all_numbers() -> None:
+    record = msgspec.json.decode(msgspec.json.encode(make_record(Sledge(), FINDINGS)))
+    assert record["name"] == "sledge"
+    assert record["source"]["place"] == "table 2"
+    assert record["comparisons"][0]["interval"] == [1.25, 1.75]
+    assert record["comparisons"][0]["difference"] == -0.5
+    assert record["comparisons"][1]["agrees"] is True
+    assert record["reasons"][1] == {"cause": "The wind.", "effect": None, "unit": ""}
+
+
+def test_every_experiment_states_its_source_and_conditions() -> None:
+    assert len(EXPERIMENTS) >= 6
+    for name, experiment in EXPERIMENTS.items():
+        assert experiment.name == name
+        stated = [experiment.claim, experiment.published_conditions, experiment.our_conditions, experiment.method]
+        assert all(text.endswith(".") for text in [*stated, experiment.source.seen]), name
+        assert all((experiment.source.authors, experiment.source.title, experiment.source.place)), name
+        assert 1900 < experiment.source.year < 2100, name
+
+
+def test_the_list_has_a_line_with_name_and_year_for_each() -> None:
+    lines = list(list_lines(list(EXPERIMENTS.values())))
+    assert [line.split()[:2] for line in lines] == [
+        [experiment.name, str(experiment.source.year)] for experiment in EXPERIMENTS.values()
+    ]
+
+
+def test_experiments_are_selected_once_each_or_all() -> None:
+    names = list(EXPERIMENTS)
+    assert [experiment.name for experiment in select_experiments([names[2], names[0], names[2]])] == [
+        names[2],
+        names[0],
+    ]
+    assert [experiment.name for experiment in select_experiments(["all"])] == names
+
+
+@pytest.mark.parametrize("names", [[], ["hu-slithring"]])
+def test_no_name_and_an_unknown_one_are_refused(names: list[str]) -> None:
+    with raises_error(ConfigError, code="command/invalid-option", field="reproduce"):
+        select_experiments(names)
