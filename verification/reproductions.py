@@ -18,7 +18,7 @@ from snakesim_operator.features.reproduce.comparison_text import (
     format_unit,
     format_value,
 )
-from snakesim_operator.features.reproduce.experiment import Comparison, Experiment, Findings
+from snakesim_operator.features.reproduce.experiment import Comparison, Experiment, Findings, Picture
 from snakesim_operator.features.reproduce.experiments import EXPERIMENTS
 from snakesim_operator.features.reproduce.picture import write_picture
 
@@ -40,26 +40,31 @@ snakesim reproduce hu-slithering --out runs/reproduced
 The command prints the source and its conditions, the published value, ours, and why they differ. `all` runs every
 experiment. `--out` writes a picture of each. `--json` is for scripts.
 
-The published value is one of three kinds. A value is *printed* in the source, or it is a *formula* of the source that
-we evaluate, or the source has *equations* that we solve for our gait. Each section says what we have read of its source.
-No number is quoted that we have not read.
+The published value is of one of three kinds:
 
-Every result below has a date: {day}. `python -m verification.reproductions --write` measured them, with {seeds} seeds
-where the result depends on the sensors' noise.
+- **printed**: the source prints it, and we have read it there
+- **formula**: we evaluate a formula of the source, which we have derived again
+- **model**: we solve equations of the source for our gait
+
+Each section lists what we have read of its source. Numbers that we have not read are not quoted. So speeds of real
+snakes and robots are missing.
+
+`python -m verification.reproductions --write` measured the results on {day}, with {seeds} seeds where the result
+depends on the sensors' noise. Gaits without feedback move alike with every seed, so they have one run and no interval.
 
 {table}
 
 ## How reasons are computed
 
-Four values lie between a published formula and our simulator. Each adds one thing, and the difference is its effect:
+From a published formula to the simulator, each step adds one thing. The difference from the step before is its effect.
 
-1. a body of endless length, without inertia, with the whole angles and the friction of the simulated ground
-2. a chain of links in the plane with their masses, whose joints follow the commanded angles exactly. A momentum balance
-   gives its motion, without MuJoCo
-3. the same chain with the joint angles that the simulator measured
-4. the simulator
+1. A body of endless length without inertia, with whole angles and the friction of the simulated ground.
+2. A chain of links in the plane with their masses, whose joints follow the commanded angles exactly. A momentum balance
+   gives its motion, without MuJoCo.
+3. The same chain with the joint angles that the simulator measured.
+4. The simulator.
 
-What is left between the last two is marked as unknown.
+What is left in the last step is marked as unknown.
 {sections}"""
 
 
@@ -132,21 +137,29 @@ def _make_section(experiment: Experiment, findings: Findings) -> str:
         "",
         f"{source.authors}, *{source.title}*, {source.published_in}, {source.year}: {source.place}.",
         "",
-        f"- **Read by us.** {source.seen}",
-        f"- **Published.** {experiment.claim} The value is {BASIS_TEXTS[findings.comparisons[0].basis]}.",
+        f"- **Read.** {source.seen}",
+        f"- **Published.** {experiment.claim} Value: {BASIS_TEXTS[findings.comparisons[0].basis]}.",
         f"- **Conditions there.** {experiment.published_conditions}",
         f"- **Conditions here.** {experiment.our_conditions}",
         f"- **Measured.** {experiment.method}",
         *(f"- {note}" for note in findings.notes),
         "",
-        "| Effect on ours | Reason |",
+        "| Effect on ours | Reason for a difference |",
         "|---|---|",
-        *(f"| {format_effect(reason)} | {reason.cause.replace('|', '&#124;')} |" for reason in findings.reasons),
+        *(f"| {format_effect(reason)} | {reason.cause} |" for reason in findings.reasons),
         "",
-        f"![{findings.picture.y_label} over {findings.picture.x_label}](../pictures/reproduce-{experiment.name}.png)",
+        f"![{_describe_picture(findings.picture)}](../pictures/reproduce-{experiment.name}.png)",
         "",
     ]
     return "\n".join(lines)
+
+
+def _describe_picture(picture: Picture) -> str:
+    """Return the text of a picture: its curves, without units."""
+    y_text, _, _ = picture.y_label.partition(" [")
+    x_text, _, _ = picture.x_label.partition(" [")
+    labels = ", ".join(curve.label for curve in picture.curves)
+    return f"{y_text.capitalize()} by {x_text}: {labels}"
 
 
 if __name__ == "__main__":

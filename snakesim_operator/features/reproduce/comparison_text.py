@@ -12,8 +12,8 @@ WIDTH = 100
 LABEL_WIDTH = 12
 BASIS_TEXTS = {
     "printed": "printed in the source",
-    "formula": "formula of the source, evaluated here",
-    "model": "equations of the source, solved here",
+    "formula": "by a formula of the source, evaluated here",
+    "model": "by equations of the source, solved here",
 }
 
 

@@ -39,7 +39,7 @@ class AlbenAmplitude(Experiment):
         title="Optimizing snake locomotion in the plane",
         published_in="Proceedings of the Royal Society A 469",
         year=2013,
-        place="abstract, and that of the preprint arXiv:1304.4479, which says deflection",
+        place="abstract, and that of the preprint arXiv:1304.4479, which has deflection",
         seen="Abstract and introduction of both.",
     )
     claim = (
