@@ -4,6 +4,7 @@
 """
 
 import argparse
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
@@ -108,7 +109,7 @@ def _conclude(comparisons: Sequence[Comparison]) -> str:
     largest = max(abs(comparison.difference or 0.0) / abs(float(comparison.published)) for comparison in numbers)
     same = sum(comparison.agrees is True for comparison in texts)
     sentence = (
-        f"All {len(numbers)} numbers agree within {100 * largest:.0f} %, and {same} of {len(texts)} results without a "
+        f"All {len(numbers)} numbers agree within {math.ceil(100 * largest)} %, and {same} of {len(texts)} results without a "
         "number are the same."
     )
     different = [comparison.quantity for comparison in texts if not comparison.agrees]

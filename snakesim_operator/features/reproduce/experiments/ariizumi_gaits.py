@@ -176,5 +176,6 @@ def _find_reasons(
             cause="The paper studies the trade-off between speed and energy. Our gaits have one set of parameters "
             "each, and different speeds."
         ),
+        Reason(cause="The abstract does not print how large the anisotropy has to be. Ten is our choice."),
         Reason(cause="We have not read the masses, lengths and motors of the paper's robot."),
     )

@@ -51,8 +51,8 @@ class GrayHancock(Experiment):
         ),
     )
     claim = (
-        "A filament that bends in a sine wave of amplitude b and wave number k travels at V = c b^2 k^2 (r - 1) / "
-        "(2 + r b^2 k^2), with the speed c of the wave and the ratio r of normal to tangential drag."
+        "A filament that bends in a sine wave travels at V = c b^2 k^2 (r - 1) / (2 + r b^2 k^2). Here b is the "
+        "amplitude, k the wave number, c the speed of the wave, and r the ratio of normal to tangential drag."
     )
     published_conditions = "An endless filament, small bends, no inertia, and a ratio of 2."
     our_conditions = "31 links of planar13, three waves on the body, and viscous ground with a ratio of 2."
