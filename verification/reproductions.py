@@ -109,8 +109,8 @@ def _conclude(comparisons: Sequence[Comparison]) -> str:
     largest = max(abs(comparison.difference or 0.0) / abs(float(comparison.published)) for comparison in numbers)
     same = sum(comparison.agrees is True for comparison in texts)
     sentence = (
-        f"All {len(numbers)} numbers agree within {math.ceil(100 * largest)} %, and {same} of {len(texts)} results without a "
-        "number are the same."
+        f"All {len(numbers)} numbers agree within {math.ceil(100 * largest)} %, and {same} of {len(texts)} results "
+        "without a number are the same."
     )
     different = [comparison.quantity for comparison in texts if not comparison.agrees]
     if different:
