@@ -2,7 +2,7 @@
 
 import argparse
 
-from snakesim_hal.programs.arguments import add_json, add_out, number_type
+from snakesim_hal.programs.arguments import add_json, add_out, make_number_parser
 from snakesim_hal.programs.commands import Command, Commands
 
 
@@ -17,13 +17,16 @@ def _add_reproduce(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "folder for a picture of each experiment, NAME.png (default: no pictures)")
     parser.add_argument(
         "--seeds",
-        type=number_type(1, 1000),
+        type=make_number_parser(1, 1000),
         default=5,
         metavar="N",
         help="seeds of experiments whose result depends on the sensors' noise (default: 5)",
     )
     parser.add_argument(
-        "--workers", type=number_type(1, 1000), metavar="N", help="processes on this computer (default: one a core)"
+        "--workers",
+        type=make_number_parser(1, 1000),
+        metavar="N",
+        help="processes on this computer (default: one a core)",
     )
     parser.add_argument(
         "--quick", action="store_true", help="make fewer runs, to try the command; the results are rougher"
@@ -36,7 +39,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     from snakesim_operator.base import extras
 
     if not arguments.list:
-        extras.require("report", "`snakesim reproduce`")
+        extras.require_extra("report", "`snakesim reproduce`")
     from snakesim_operator.features.reproduce.command import list_experiments, reproduce
 
     if arguments.list:

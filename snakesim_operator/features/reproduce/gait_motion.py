@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.friction import DirectionalFriction, Viscous, surface_friction
-from snakesim_hal.model.kinematics import NodeFinder
+from snakesim_hal.model.friction import DirectionalFriction, Viscous, compute_surface_friction
+from snakesim_hal.model.kinematics import ForwardKinematics
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.solids import GRAVITY_M_S2
-from snakesim_operator.results.metrics.advance import body_center_w
-from snakesim_operator.results.metrics.effort import body_length_m, weight_n
+from snakesim_operator.results.metrics.advance import compute_center_of_mass_w
+from snakesim_operator.results.metrics.effort import get_body_length_m, get_weight_n
 from snakesim_operator.results.run_log import RunRecord
 
 HARMONICS = 6  # of the joint angles that are kept
@@ -32,7 +32,7 @@ class GroundFriction:
         """Return the friction between the ground and the underside of the robot."""
         ground = config.scene.ground
         robot = config.robot
-        dry = surface_friction(ground.friction, ground, robot.skin, robot.wheels)
+        dry = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels)
         viscous = ground.viscous or Viscous(along_s_per_m=0.0, across_s_per_m=0.0)
         return GroundFriction(dry, viscous.along_s_per_m, viscous.across_s_per_m)
 
@@ -61,17 +61,19 @@ def measure_gait(record: RunRecord, period_s: float, skipped_periods: int) -> Ga
     """
     rows = _select_whole_periods(record, period_s, skipped_periods)
     time_s = (len(rows) - 1) / record.config.rate_hz
-    finder = NodeFinder(record.description)
-    nodes_w = finder.find(record.position_w_m[rows], record.orientation_wxyz[rows], record.angle_rad[rows])[..., :2]
-    center_w = body_center_w(record.description, nodes_w)
+    finder = ForwardKinematics(record.description)
+    nodes_w = finder.compute_body_points_w(
+        record.position_w_m[rows], record.orientation_wxyz[rows], record.angle_rad[rows]
+    )[..., :2]
+    center_w = compute_center_of_mass_w(record.description, nodes_w)
     axis_w = (nodes_w[:-1, -1] - nodes_w[:-1, 0]).mean(axis=0)
     way_w = center_w[-1] - center_w[0]
     return GaitMotion(
         speed_m_s=float(way_w @ axis_w / np.linalg.norm(axis_w)) / time_s,
         ground_power_w=_measure_ground_power_w(record, nodes_w),
         angle_harmonics=_find_harmonics(record.angle_rad[rows[:-1]], period_s, record.config.rate_hz),
-        body_length_m=body_length_m(record),
-        weight_n=weight_n(record),
+        body_length_m=get_body_length_m(record),
+        weight_n=get_weight_n(record),
     )
 
 

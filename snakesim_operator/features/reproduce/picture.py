@@ -7,7 +7,7 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from snakesim_hal.model.textfiles import exported
+from snakesim_hal.model.textfiles import export_atomically
 from snakesim_operator.features.reproduce.experiment import Picture
 
 SIZE_IN = (5.0, 3.2)
@@ -61,5 +61,5 @@ def write_picture(picture: Picture, title: str, path: Path) -> None:
                 axis.set_minor_formatter(NullFormatter())
         axes.set(xlabel=picture.x_label, ylabel=picture.y_label, title=title)
         axes.legend()
-        with exported(path) as partial:
+        with export_atomically(path) as partial:
             figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_operator.base.worker_pool import WorkerPool
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion, GroundFriction, measure_gait
-from snakesim_operator.results.metrics.intervals import mean_interval
+from snakesim_operator.results.metrics.intervals import compute_mean_interval
 from snakesim_operator.run.in_process import simulate
 
 SCENARIO = "scales"  # flat ground without obstacles
@@ -98,7 +98,7 @@ def set_skin(forward: float, backward: float, sideways: float) -> tuple[str, ...
 
 def make_config(scenario: str, settings: Sequence[str]) -> RunConfig:
     """Return the configuration of a shipped scenario with settings, as of `--set`."""
-    return load(scenario, [parse_set(text) for text in settings]).config
+    return load_scenario(scenario, [parse_set_option(text) for text in settings]).config
 
 
 def measure_gait_run(run: GaitRun) -> GaitMotion:
@@ -127,11 +127,11 @@ class Trials:
 
     def call(self, function: Callable[..., Any], calls: Sequence[Sequence[Any]]) -> list[Any]:
         """Call a function of a module in workers, once for each tuple of arguments, and return the values in order."""
-        return self._pool.map(function, calls)
+        return self._pool.run_and_collect(function, calls)
 
 
 def find_interval(values: Sequence[float]) -> tuple[float, float] | None:
     """Return the 95 % interval of the mean over seeds; None for a single seed."""
     if len(values) < 2:
         return None
-    return mean_interval(values)
+    return compute_mean_interval(values)

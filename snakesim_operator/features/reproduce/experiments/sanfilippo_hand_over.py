@@ -14,7 +14,7 @@ from snakesim_operator.features.reproduce.experiment import (
 )
 from snakesim_operator.features.reproduce.trials import Trials, make_config
 from snakesim_operator.results.metrics.propulsion import find_propulsion_periods
-from snakesim_operator.results.time_axis import zero_s
+from snakesim_operator.results.time_axis import get_time_origin_s
 from snakesim_operator.run.in_process import simulate
 
 DURATION_S = 10
@@ -109,12 +109,12 @@ def run_trial(seed: int) -> HandOverTrial:
     names = [joint.name for joint in record.description.joints]
     end_s = periods[-1].end_s
     tail_m = float("nan")
-    for state in record.control:
-        time_s = state.timestamp_ns * 1e-9 - zero_s(record)
+    for state in record.control_states:
+        time_s = state.timestamp_ns * 1e-9 - get_time_origin_s(record)
         if state.push_points and time_s <= end_s:
             tail_m = min(point.body_s_m for point in state.push_points)
     return HandOverTrial(
-        joints=[names[period.joint] for period in periods],
+        joints=[names[period.joint_index] for period in periods],
         starts_s=[period.start_s for period in periods],
         end_s=end_s,
         tail_m=tail_m,
