@@ -73,7 +73,7 @@ class Drives(ABC):
     def read(self) -> None:
         """Request motion and torque of every drive, and put the answers into the readings.
 
-        Do not wait for drives that were silent before: `DriveReadings.is_incomplete` returns whether waiting is useful.
+        Do not wait for drives that were silent before: the readings of the drives contain whether waiting is useful.
         Request also the state of the drives in `DriveReadings.drives_to_check`, and call `mark_checked` for each that
         reports it: these may have stopped by themselves.
 

@@ -3,7 +3,7 @@
 A message has reached its readers when `put` returns, in the order of sending, and nothing is lost.
 
 Threads: one thread makes every call, so callbacks run in the thread that publishes. A query therefore first runs the
-part of the process that answers it (`LocalNetwork.answer`). Only `LocalQuery.reply` may be called from another thread.
+part of the process that answers it. Only `LocalQuery.reply` may be called from another thread.
 """
 
 import time

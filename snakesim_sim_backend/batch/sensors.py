@@ -154,7 +154,7 @@ class SensorArrays:
     def sample(
         self, ticks: Ticks, active: Mask, simulations: Simulations, winding_c: Floats, *, is_reset: bool = False
     ) -> None:
-        """Read the sensors of the active robots at their current ticks, in the order of `Sensors.published`.
+        """Read the sensors of the active robots at their current ticks, in the order of `Sensors.iterate_published`.
 
         The order decides which random numbers each sensor uses, so that a robot has the same noise as in a single run.
 

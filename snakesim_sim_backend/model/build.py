@@ -94,7 +94,7 @@ def build_sim_model(
         laws: Version of the laws that computes ground and friction. None for the C version if it can be loaded.
         stores_contacts_in_state: Whether the C version writes the forces between links and obstacles into
             MuJoCo's state, for programs that see only the state.
-        measures_force: Whether the simulation has a contact sensor, which `Physics.measure_force` is for.
+        measures_force: Whether the simulation has a contact sensor, which `Physics` reads.
 
     Returns:
         The model, with the indices by which other modules find links, feet and obstacles in it.
