@@ -6,8 +6,8 @@ and friction come from the URDF. What URDF cannot express comes from the <snakes
 export` writes, or else from another robot file.
 
 No value of the file is dropped and none is taken from elsewhere without a line in the report. That holds by
-construction: elements and attributes that no function has read are reported (`Element.iterate_unused`), and so is every default
-that stands in for something absent (`Element.note_absent`).
+construction: elements and attributes that no function has read are reported (`Element.iterate_unused`), and so is every
+default that stands in for something absent (`Element.note_absent`).
 """
 
 import json
