@@ -5,13 +5,16 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_operator.features.reproduce.gait_motion import GroundFriction, find_friction_per_load
+from snakesim_operator.features.reproduce.planar_chain import PlanarChain
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build_sim_model
 from snakesim_sim_backend.physics import Physics
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_testing.sim.simulator_rig import G, make_config
+from snakesim_testing.sim.simulator_rig import make_config
 
 SERVO_NM_PER_RAD = 300.0
 SERVO_NM_S_PER_RAD = 10.0
@@ -128,11 +131,9 @@ def integrate_momentum_balance(
     in_the_middle: bool = False,
     separate_limits: bool = False,
 ) -> BodyTrack:
-    """Compute the motion of a snake without MuJoCo, by a momentum balance in the plane with prescribed joint angles.
+    """Compute the motion of `planar13` without MuJoCo, by a momentum balance in the plane with prescribed joint angles.
 
-    Vectors in the plane are complex numbers, angles are about +z, and links are numbered from the tail. The ground
-    contacts are at the joints and the ends of the body: each has half of the weight of its links, and their mean
-    direction. Friction is smoothed below SMOOTHING_SPEED_M_S.
+    Friction is smoothed below SMOOTHING_SPEED_M_S.
 
     Args:
         wave: Joint angles as a function of time.
@@ -145,91 +146,25 @@ def integrate_momentum_balance(
     Returns:
         The motion of the body over PERIODS periods of the wave.
     """
+    friction = GroundFriction(coefficients, viscous_s_per_m.real, viscous_s_per_m.imag)
+
+    def find_friction(slips: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        if separate_limits:
+            along = find_friction_per_load(slips.real.astype(np.complex128), friction, SMOOTHING_SPEED_M_S)
+            across = find_friction_per_load((1j * slips.imag).astype(np.complex128), friction, SMOOTHING_SPEED_M_S)
+            return along + across
+        return find_friction_per_load(slips, friction, SMOOTHING_SPEED_M_S)
+
     robot = make_config().robot
-    lengths, masses = np.array(robot.link_lengths_m), np.array(robot.link_masses_kg)
-    capsule_lengths = lengths + 2 * robot.module.radius_m
-    link_inertias_kg_m2 = (
-        masses * (3 * robot.module.radius_m**2 + capsule_lengths**2) / 12
-    )  # as of a cylinder, about its middle
-    loads_n = 0.5 * G * (np.append(masses, 0.0) + np.append(0.0, masses))
-    joint_count = len(lengths) - 1
-    pose, momentum = np.zeros(3), np.zeros(3)
+    joint_count = len(robot.link_lengths_m) - 1
+    chain = PlanarChain(robot, has_middle_contacts=in_the_middle)
     step_count = int(PERIODS * wave.period_s / step_s) + 1
     center, axis = np.empty((step_count, 2)), np.empty((step_count, 2))
     for k in range(step_count):
         time_s = k * step_s
-        headings = pose[2] + np.append(0.0, np.cumsum(wave.at(time_s, joint_count)))
-        link_rates = np.append(0.0, np.cumsum(wave.rates_at(time_s, joint_count)))
-        directions = np.exp(1j * headings)
-        link_vectors = directions * lengths
-        link_end_velocities = 1j * link_rates * link_vectors
-        joint_positions = complex(pose[0], pose[1]) + np.append(0.0, np.cumsum(link_vectors))
-        joint_velocities_in_base = np.append(0.0, np.cumsum(link_end_velocities))  # in a base that stands still
-        link_centers, center_velocities_in_base = (
-            joint_positions[:-1] + 0.5 * link_vectors,
-            joint_velocities_in_base[:-1] + 0.5 * link_end_velocities,
-        )
-        center_of_mass = complex(np.sum(masses * link_centers) / masses.sum())
-        lever_arms = link_centers - center_of_mass
-        base_position = complex(pose[0], pose[1])
-        internal_momentum = np.sum(masses * center_velocities_in_base)
-        internal_angular_momentum = np.sum(masses * (np.conj(lever_arms) * center_velocities_in_base).imag) + np.sum(
-            link_inertias_kg_m2 * link_rates
-        )
-        yaw_rate = (momentum[2] - internal_angular_momentum) / np.sum(
-            masses * np.abs(lever_arms) ** 2 + link_inertias_kg_m2
-        )
-        base_velocity = (complex(momentum[0], momentum[1]) - internal_momentum) / masses.sum() - 1j * yaw_rate * (
-            center_of_mass - base_position
-        )
-        velocities = base_velocity + 1j * yaw_rate * (joint_positions - base_position) + joint_velocities_in_base
-        tangents = np.append(directions, 0.0) + np.append(0.0, directions)
-        tangents /= np.abs(tangents)
-        contact_points = joint_positions
-        if in_the_middle:
-            velocities = base_velocity + 1j * yaw_rate * (link_centers - base_position) + center_velocities_in_base
-            tangents = directions
-            contact_points = link_centers
-        weights_n = G * masses if in_the_middle else loads_n
-        friction_n = (
-            weights_n
-            * tangents
-            * compute_friction_ratio(
-                velocities * np.conj(tangents), coefficients, viscous_s_per_m, separate_limits=separate_limits
-            )
-        )
-        momentum += step_s * np.array(
-            [
-                friction_n.sum().real,
-                friction_n.sum().imag,
-                np.sum((np.conj(contact_points - center_of_mass) * friction_n).imag),
-            ]
-        )
-        pose += step_s * np.array([base_velocity.real, base_velocity.imag, yaw_rate])
-        center[k] = center_of_mass.real, center_of_mass.imag
-        axis[k] = (joint_positions[-1] - joint_positions[0]).real, (joint_positions[-1] - joint_positions[0]).imag
+        angles_rad = wave.at(time_s, joint_count)
+        rates_rad_s = wave.rates_at(time_s, joint_count)
+        instant = chain.advance(angles_rad, rates_rad_s, find_friction, step_s)
+        center[k] = instant.center.real, instant.center.imag
+        axis[k] = instant.axis.real, instant.axis.imag
     return BodyTrack(center, axis, step_s, wave.period_s)
-
-
-def compute_friction_ratio(
-    velocities_m_s: Any, coefficients: DirectionalFriction, viscous_s_per_m: complex, *, separate_limits: bool = False
-) -> Any:
-    """Return the friction force divided by the normal force, complex: along the link, and across it.
-
-    Args:
-        velocities_m_s: Sliding velocities: along the link, and as imaginary part across it.
-        coefficients: Coefficients of dry friction.
-        viscous_s_per_m: Viscous friction over the normal force: along the link, and as imaginary part across it.
-        separate_limits: Whether friction along the link and across it do not limit each other.
-    """
-    along, across = velocities_m_s.real, velocities_m_s.imag
-    longitudinal_coefficient = np.where(along > 0, coefficients.forward, coefficients.backward)
-    dry_friction = (longitudinal_coefficient * along + 1j * coefficients.sideways * across) / np.sqrt(
-        np.abs(velocities_m_s) ** 2 + SMOOTHING_SPEED_M_S**2
-    )
-    if separate_limits:
-        dry_longitudinal = longitudinal_coefficient * along / np.sqrt(along**2 + SMOOTHING_SPEED_M_S**2)
-        dry_friction = dry_longitudinal + 1j * coefficients.sideways * across / np.sqrt(
-            across**2 + SMOOTHING_SPEED_M_S**2
-        )
-    return -dry_friction - viscous_s_per_m.real * along - 1j * viscous_s_per_m.imag * across
