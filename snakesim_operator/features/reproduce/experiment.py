@@ -1,10 +1,11 @@
 """What every experiment states, and what it finds: the published number, ours, and the reasons for a difference."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
+
+import numpy as np
 
 from snakesim_operator.features.reproduce.trials import Trials
 
@@ -151,10 +152,5 @@ def explain_by_steps(values: Sequence[tuple[str, float]], unit: str, rest: str) 
 
 def fit_exponent(x: Sequence[float], y: Sequence[float]) -> float:
     """Return the exponent p of y = c x^p, by least squares in logarithms."""
-    log_x = [math.log(value) for value in x]
-    log_y = [math.log(value) for value in y]
-    mean_x = sum(log_x) / len(log_x)
-    mean_y = sum(log_y) / len(log_y)
-    covariance = sum((a - mean_x) * (b - mean_y) for a, b in zip(log_x, log_y, strict=True))
-    variance = sum((a - mean_x) ** 2 for a in log_x)
-    return covariance / variance
+    exponent, _ = np.polyfit(np.log(x), np.log(y), 1)
+    return float(exponent)

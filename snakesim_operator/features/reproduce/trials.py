@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from snakesim_hal.model.robot import RobotFile
@@ -36,7 +37,7 @@ class GaitRun:
     settings: tuple[str, ...]  # as of `--set`
     period_s: float
 
-    @property
+    @cached_property
     def config(self) -> RunConfig:
         """Return the configuration."""
         duration_s = (SKIPPED_PERIODS + MEASURED_PERIODS) * self.period_s + 0.1
