@@ -41,10 +41,10 @@ class Feed(Generic[MessageT]):
             newest_only: Whether to store only the newest sample, in place of all earlier ones.
         """
         if newest_only:
-            get_newest = self._reader.pop_newest(self._is_acceptable)
-            if get_newest is not None:
+            newest = self._reader.pop_newest(self._is_acceptable)
+            if newest is not None:
                 self._samples_by_tick.clear()
-                self._store(get_newest)
+                self._store(newest)
             return
         for message in self._reader.drain():
             if self._is_acceptable(message):
