@@ -136,20 +136,20 @@ def test_arrays_have_the_bits_of_a_robot_behind_the_limiter_of_the_hal(
         assert_equal(one, other, f"{number}")
 
 
-@pytest.mark.parametrize(
-    ("name", "mode"),
-    [
-        ("angles that jump", AutoresetMode.SAME_STEP),
-        ("positions among obstacles", AutoresetMode.SAME_STEP),
-        ("hot motors that are isolated", AutoresetMode.NEXT_STEP),
-        ("delayed sensors", AutoresetMode.NEXT_STEP),
-    ]
-    + [
-        pytest.param(name, mode, marks=pytest.mark.slow)
-        for name in CASES
-        for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
-    ],
+QUICK_RESETS = (
+    ("angles that jump", AutoresetMode.SAME_STEP),
+    ("positions among obstacles", AutoresetMode.SAME_STEP),
+    ("hot motors that are isolated", AutoresetMode.NEXT_STEP),
+    ("delayed sensors", AutoresetMode.NEXT_STEP),
 )
+EVERY_RESET = [
+    pytest.param(name, mode, id=f"{name}-{mode.name}", marks=() if (name, mode) in QUICK_RESETS else pytest.mark.slow)
+    for name in CASES
+    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+]
+
+
+@pytest.mark.parametrize(("name", "mode"), EVERY_RESET)
 def test_rows_have_the_bits_of_single_environments(name: str, mode: AutoresetMode) -> None:
     """Gymnasium steps single environments one after the other, and merges their infos."""
     case = CASES[name]
