@@ -9,15 +9,16 @@ from snakesim_hal.model.scenario import Override, RunConfig, load_scenario
 from snakesim_hal.programs.preflight import validate_and_complete_config
 
 
-def make_overrides(values: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
+def make_overrides(values: Mapping[str, Any] | None, **keyword_overrides: Any) -> list[Override]:
     """Convert the arguments of a Python call to overrides of a scenario.
 
     Args:
-        values: Argument `set` of the call: values by their dotted keys. None if there are none.
-        **arguments: Other arguments of the call, by the key that they set. An argument that is None is left out.
+        values: Value of the caller's `set=` argument: a mapping of dotted keys to values. None if there are none.
+        **keyword_overrides: Other arguments of the call, by the key that they set. None leaves the value of the
+            scenario.
 
     Returns:
-        The overrides: first those of `arguments`, then those of `values`.
+        The overrides: first those of `keyword_overrides`, then those of `values`.
 
     Raises:
         ConfigError: `values` is not a mapping with text keys.
@@ -30,13 +31,14 @@ def make_overrides(values: Mapping[str, Any] | None, **arguments: Any) -> list[O
             code="python/invalid-argument",
         )
     overrides: list[Override] = []
-    for key, value in arguments.items():
+    for key, value in keyword_overrides.items():
         if value is not None:
-            flag = f"{key.removesuffix('_s')}={value!r:.60}"
-            overrides.append(Override(key, _convert_to_plain_value(value), flag))
+            # The argument of the call has the name of the key without the unit, as `duration` for `duration_s`.
+            source_text = f"{key.removesuffix('_s')}={value!r:.60}"
+            overrides.append(Override(key, _convert_to_plain_value(value), source_text))
     for key, value in values.items():
-        flag = f"set={{{key!r}: {value!r:.60}}}"
-        overrides.append(Override(key, _convert_to_plain_value(value), flag))
+        source_text = f"set={{{key!r}: {value!r:.60}}}"
+        overrides.append(Override(key, _convert_to_plain_value(value), source_text))
     return overrides
 
 

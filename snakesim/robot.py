@@ -42,7 +42,7 @@ from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import find_robots
 from snakesim_operator.recording.recorder_process import record_to_file
-from snakesim_operator.robot_commands.command import request_while_driving
+from snakesim_operator.robot_commands.command import request_while_commanding
 from snakesim_operator.robot_commands.parameters import (
     Parameter,
     change_parameters,
@@ -388,7 +388,7 @@ class Robot:
 
     def _request_and_wait(self, request: LifecycleRequest, done: str) -> None:
         """Send a lifecycle request and wait until the robot confirms it. The lease is renewed meanwhile."""
-        request_while_driving(self._session, request, done, self._link, self._tick_or_sleep)
+        request_while_commanding(self._session, request, done, self._link, self._tick_or_sleep)
 
     def _tick_or_sleep(self) -> None:
         """Run one tick if this connection commands the robot, so that its lease stays valid; otherwise sleep."""

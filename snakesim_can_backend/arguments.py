@@ -6,13 +6,13 @@ from pathlib import Path
 from snakesim_can_backend.protocol.definitions import LAST_NODE
 from snakesim_drivers.kit.commands import add_channel, add_channels, add_pose
 from snakesim_hal.programs.arguments import (
-    add_duration,
-    add_json,
-    add_out,
-    add_parent,
-    add_scenario_name,
-    add_seed,
-    add_set,
+    add_duration_argument,
+    add_json_argument,
+    add_output_argument,
+    add_parent_argument,
+    add_scenario_name_argument,
+    add_seed_argument,
+    add_set_argument,
     make_number_parser,
 )
 
@@ -28,7 +28,9 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a scan of a CAN bus."""
     add_channels(parser, CHANNEL_ABOUT)
     _add_bit_rate(parser)
-    add_duration(parser, "seconds to listen on each bus (default: 1)", make_number_parser(0.001, 3600, "s"), 1.0)
+    add_duration_argument(
+        parser, "seconds to listen on each bus (default: 1)", make_number_parser(0.001, 3600, "s"), 1.0
+    )
     parser.add_argument("--anyway", action="store_true", help="send requests also where others use the bus")
 
 
@@ -50,8 +52,8 @@ def _add_bit_rate(parser: argparse.ArgumentParser) -> None:
 
 def add_module_load(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim drive load can`, which computes the bus load of joint modules."""
-    add_scenario_name(parser)
-    add_set(parser)
+    add_scenario_name_argument(parser)
+    add_set_argument(parser)
     parser.add_argument(
         "--joints",
         type=make_number_parser(1, LAST_NODE, "joints"),
@@ -66,15 +68,15 @@ def add_module_load(parser: argparse.ArgumentParser) -> None:
         metavar="HZ",
         help="print a table: for these control rates",
     )
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def add_load(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the bus load of drives."""
-    add_scenario_name(parser)
+    add_scenario_name_argument(parser)
     add_channel(parser, f"bus of the drives (default: {DEFAULT_CHANNEL})")
-    add_set(parser)
-    add_json(parser)
+    add_set_argument(parser)
+    add_json_argument(parser)
 
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
@@ -90,17 +92,17 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 
 def add_dbc(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that write the DBC file."""
-    add_out(parser, f"the DBC file (default: {EXPANDED_DBC_FILENAME})")
+    add_output_argument(parser, f"the DBC file (default: {EXPANDED_DBC_FILENAME})")
 
 
 def add_module_emulation(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim drive emulate can`, which emulates joint modules on a bus."""
-    add_scenario_name(parser)
+    add_scenario_name_argument(parser)
     add_channel(parser, f"interface, or INTERFACE:CHANNEL of python-can, tail to head (default: {DEFAULT_CHANNEL})")
     parser.add_argument(
         "--physics-model", metavar="NAME", help="body that the motors move: mujoco, inertia, or ./file.py:Class"
     )
-    add_set(parser)
+    add_set_argument(parser)
     parser.add_argument(
         "--fault",
         action="append",
@@ -115,8 +117,8 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
         "--stepped", action="store_true", help="advance time only from Sync to Sync, for a host in lockstep"
     )
     add_pose(parser, f"or none, default: {DEFAULT_POSE}", DEFAULT_POSE)
-    add_duration(parser, "end after this many seconds")
-    add_seed(parser, "of noise and serial numbers, default: the scenario's")
+    add_duration_argument(parser, "end after this many seconds")
+    add_seed_argument(parser, "of noise and serial numbers, default: the scenario's")
     parser.add_argument("--stats", action="store_true", help="print the load of every bus once a second")
     parser.add_argument("--on-real-bus", action="store_true", help="allow interfaces that are not called vcan...")
-    add_parent(parser)
+    add_parent_argument(parser)

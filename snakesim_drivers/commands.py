@@ -3,13 +3,13 @@
 import argparse
 
 from snakesim_drivers.kit.commands import DRIVE_NOUNS
-from snakesim_hal.programs.arguments import add_out
+from snakesim_hal.programs.arguments import add_output_argument
 from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_new(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", help="name of the driver type, such as acme_servo")
-    add_out(parser, "folder to write, which must not exist (default: ./NAME)")
+    add_output_argument(parser, "folder to write, which must not exist (default: ./NAME)")
 
 
 def _write_new(arguments: argparse.Namespace) -> int:

@@ -38,28 +38,43 @@ def load_shared_library(library: NativeLibrary) -> LoadedLibrary:
 
     A library that uses MuJoCo can be loaded only after MuJoCo has been imported.
     """
-    return _load_once(library, os.environ.get(SWITCH_VARIABLE, ""))
+    return _load_cached(library, os.environ.get(SWITCH_VARIABLE, ""))
 
 
 @functools.cache
-def _load_once(library: NativeLibrary, switch: str) -> LoadedLibrary:
-    """Load a library as `load_shared_library` does; `switch` is the value of the environment variable."""
-    if switch == SWITCH_OFF:
-        return LoadedLibrary(None, None, f"the environment variable {SWITCH_VARIABLE} is `{SWITCH_OFF}`")
+def _load_cached(library: NativeLibrary, setting: str) -> LoadedLibrary:
+    """Load a library as `load_shared_library` does, once for each value of the environment variable.
+
+    Args:
+        library: The library.
+        setting: Value of the environment variable: `off` for the Python versions, the path of a folder with compiled
+            libraries, or empty to use or compile a library of the current sources.
+
+    Returns:
+        The library, or the reason why there is none.
+
+    Raises:
+        OSError: The library of the named folder cannot be loaded.
+        AttributeError: The library of the named folder has no build key.
+    """
+    if setting == SWITCH_OFF:
+        return LoadedLibrary(
+            library=None, path=None, problem=f"the environment variable {SWITCH_VARIABLE} is `{SWITCH_OFF}`"
+        )
     mujoco = find_mujoco()
     if library.uses_mujoco and mujoco is None:
-        return LoadedLibrary(None, None, "MuJoCo is not installed (install the extra [sim])")
+        return LoadedLibrary(library=None, path=None, problem="MuJoCo is not installed (install the extra [sim])")
     key = compute_build_key(library, mujoco.version if mujoco else "")
     try:
-        path = Path(switch, make_file_name(library, key)) if switch else _find_compiled_file(library, key)
+        path = Path(setting, make_file_name(library, key)) if setting else _find_compiled_file(library, key)
         if path is None:
             path = _compile_to_writable_folder(library)
         handle = ctypes.CDLL(str(path))
         _check_build_key(handle, path, key)
     except (CannotCompileError, OSError, AttributeError) as error:
-        if switch:
-            raise  # a user who names a folder wants no other version
-        return LoadedLibrary(None, None, str(error))
+        if setting:
+            raise  # an explicitly named library must not fall back silently to the Python version
+        return LoadedLibrary(library=None, path=None, problem=str(error))
     return LoadedLibrary(handle, path, "")
 
 

@@ -3,7 +3,7 @@
 import argparse
 
 from snakesim_drivers.kit.commands import DRIVE_NOUNS, add_channels, add_emulation
-from snakesim_hal.programs.arguments import add_json
+from snakesim_hal.programs.arguments import add_json_argument
 from snakesim_hal.programs.commands import Command, Commands
 from snakesim_serial_backend.dynamixel.registers import RATE
 from snakesim_serial_backend.feetech.registers import RATE as FEETECH_RATE
@@ -82,7 +82,7 @@ COMMANDS: Commands = (
     Command(
         name="drive load dynamixel",
         help="Print bytes, time and rate of a cycle with Dynamixel servos for every baud rate.",
-        add=add_json,
+        add=add_json_argument,
         run=_load,
         examples=("drive load dynamixel", "drive load dynamixel --json"),
     ),
@@ -104,7 +104,7 @@ COMMANDS: Commands = (
     Command(
         name="drive load feetech",
         help="Print bytes, time and rate of a cycle with Feetech servos for every baud rate.",
-        add=add_json,
+        add=add_json_argument,
         run=_load_feetech,
         examples=("drive load feetech", "drive load feetech --json"),
     ),

@@ -35,7 +35,7 @@ PERIOD_S = 0.01
 START_LIMIT_S = 30.0
 IMAGES_FIRST_S = 6.0  # so long before the raw loop begins, and about as long after it
 CAMERA = (str(LOOP), "--set", "robot=planar13_camera")
-IMAGES = "planar13_camera/sensor/depth/*"
+IMAGE_MESSAGE_TYPES = "planar13_camera/sensor/depth/*"
 RATE_MBIT = 6.0
 AIM, AIM_SATURATED = 1.5, 1.3
 EXPLAINED = (
@@ -217,7 +217,7 @@ def watched(way: Way, seconds: float, folder: Path) -> tuple[Percentiles, float]
     """The loop while a client reads the images, and how much of them comes through, in Mbit/s."""
     seen = folder / "seen.json"
     with ExitStack() as stack:
-        reading = ("--key", IMAGES, "--out", str(seen))
+        reading = ("--key", IMAGE_MESSAGE_TYPES, "--out", str(seen))
         viewer = way.workstation.start_module(_RAW, "read", str(way.workstation_file), *reading, log=Path("/dev/null"))
         stack.callback(_end, viewer)
         busy = ours(way, seconds, folder, CAMERA)

@@ -30,7 +30,7 @@ class Commands:
     high: Sequence[float]
 
     @staticmethod
-    def make_for_robot(robot: Description, kind: str, residual_rad: float) -> "Commands":
+    def for_robot(robot: Description, kind: str, residual_rad: float) -> "Commands":
         """Return what actions of a kind command on a robot, with the bounds of every joint.
 
         Args:

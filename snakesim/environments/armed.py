@@ -84,7 +84,7 @@ class ArmedRobots:
             threads: Number of threads that step the physics.
         """
         joints = config.robot.chain.modules
-        self.simulated = SimulatedRobots(robots, config, threads=threads)
+        self.simulation = SimulatedRobots(robots, config, threads=threads)
         self._period_ns = config.period_ns
         self._safe = safe
         self._joint_count = joints
@@ -97,7 +97,7 @@ class ArmedRobots:
         self.is_limited: Masks = np.zeros((robots, joints), dtype=np.bool_)
         self._active_limits: NDArray[np.int64] = np.zeros((robots, joints), dtype=np.int64)
         self._last_decision: _LimiterDecision | None = None
-        self._digests = CommandDigests(robots, joints)
+        self._command_digests = CommandDigests(robots, joints)
 
         # Limits.
         self._limits = LimitArrays.allocate(robots, joints, config.period_ns * 1e-9)
@@ -122,18 +122,18 @@ class ArmedRobots:
         self._commands: deque[Floats] = deque(maxlen=max(schedule.latency_ticks, 1) + schedule.decimation)
 
         # Each robot is limited either as a row of arrays, or by a client with a limiter of its own.
-        self._clients: dict[int, LimiterClient] = {}
-        self._is_array_limited: Mask = np.zeros(robots, dtype=np.bool_)
+        self._limiter_client_by_robot: dict[int, LimiterClient] = {}
+        self._is_vectorized: Mask = np.zeros(robots, dtype=np.bool_)
         self._is_excluded: Mask = np.zeros(robots, dtype=np.bool_)  # from the array limiter, until the next `start`
         self._descriptions = [description] * robots
-        self._all_robots = self.simulated.all_robots
+        self._all_robots = self.simulation.all_robots
 
         # Robots that take part in the current ticks. The masks are updated only when the arguments of `step` change.
         self._active: Mask = np.zeros(robots, dtype=np.bool_)
         self._active_at_last_call = self._active
         self._active_indices: list[int] = []
-        self._active_array_limited: Mask = np.zeros(robots, dtype=np.bool_)  # active ones
-        self._array_limited_at_last_call = self._is_array_limited
+        self._active_vectorized: Mask = np.zeros(robots, dtype=np.bool_)  # active ones
+        self._vectorized_at_last_call = self._is_vectorized
 
     def can_start(self, config: RunConfig) -> bool:
         """Return whether a robot of this configuration can be stepped together with the other robots."""
@@ -142,7 +142,7 @@ class ArmedRobots:
             self._schedule.latency_ticks,
             self._schedule.decimation,
         )
-        return can_arm(config) and has_equal_schedule and self.simulated.can_simulate(config)
+        return can_arm(config) and has_equal_schedule and self.simulation.can_simulate(config)
 
     def start(self, robot: int, config: RunConfig, description: Description) -> bool:
         """Start an episode of a robot: place it in its scene, and arm it.
@@ -160,12 +160,12 @@ class ArmedRobots:
             RefusedError: The robot cannot be armed.
         """
         self.stop(robot)
-        if not self.simulated.load_robot(robot, config):
+        if not self.simulation.load_robot(robot, config):
             return False
         self._descriptions[robot] = description
         self._load_limits(robot)
         self.ticks = _copy_with_row(self.ticks, robot, 0)
-        self.joints = _copy_with_row(self.joints, robot, self.simulated.sensors.joints[robot])
+        self.joints = _copy_with_row(self.joints, robot, self.simulation.sensors.joints[robot])
         self._modes = _copy_with_row(self._modes, robot, int(Mode.PASSIVE))
         self._target = _copy_with_row(self._target, robot, 0.0)
         self._torque_limit_nm = _copy_with_row(self._torque_limit_nm, robot, self._limits.torque_nm[robot])
@@ -177,8 +177,8 @@ class ArmedRobots:
         # In the first ticks, a robot always has a limiter of its own. `_observe` moves it to the array limiter later.
         client = LimiterClient(description, safe=self._safe)
         self._pass_samples_to_client(client, robot)
-        client.arm(self.simulated.make_joint_state(robot, 0, self.joints[robot]))
-        self._clients[robot] = client
+        client.arm(self.simulation.make_joint_state(robot, 0, self.joints[robot]))
+        self._limiter_client_by_robot[robot] = client
         self._is_excluded[robot] = False
         self.is_armed = _copy_with_row(self.is_armed, robot, True)
         self.reasons[robot] = client.reason
@@ -187,55 +187,56 @@ class ArmedRobots:
     def stop(self, robot: int) -> None:
         """End the episode of a robot, which takes part in no tick until the next `start`."""
         self._update_active_limits()
-        self._digests.restart(robot)
-        self._clients.pop(robot, None)
+        self._command_digests.restart(robot)
+        self._limiter_client_by_robot.pop(robot, None)
         self.is_armed = _copy_with_row(self.is_armed, robot, False)
-        self._is_array_limited = _copy_with_row(self._is_array_limited, robot, False)
+        self._is_vectorized = _copy_with_row(self._is_vectorized, robot, False)
 
     def step(self, mode: Mode, target: Floats, active: Mask) -> None:
         """Run one tick: limit the commands, step the physics, and read the sensors.
 
-        The commands answer the current samples, as in a host in lockstep.
+        Commands are computed from the latest samples, without delay, as in lockstep.
 
         Args:
             mode: Control mode of all joints.
             target: Targets of all joints, (robots, joints), in rad, rad/s or N·m depending on the mode. The array must
                 not change afterwards.
-            active: Which robots take part, (robots,). They must be armed.
+            active: Which robots take part, (robots,). They must be armed. The array must not change afterwards, either.
         """
-        if active is not self._active_at_last_call or self._is_array_limited is not self._array_limited_at_last_call:
+        # The masks are cached: all arrays are replaced, not changed, so that their identity tells whether they are new.
+        if active is not self._active_at_last_call or self._is_vectorized is not self._vectorized_at_last_call:
             self._update_active_masks(active)
-        active = self._active
-        array_limited = self._active_array_limited
-        self._commands.append(target)
-        self._limit_with_arrays(mode, array_limited)
-        for robot in self._select_clients(active):
-            self._limit_with_client(robot, mode, target[robot].tolist())
-        self._digests.add(active, self.ticks, self._modes, self._target, self._torque_limit_nm)
-        self.simulated.enact(mode, self._target, self._torque_limit_nm, array_limited)
-        moved = self._advance(active)
-        self._observe(mode, moved)
+        active_robots = self._active
+        vectorized = self._active_vectorized
+        self._commands.append(target)  # not a copy: a limiter with latency reads it some ticks later
+        self._limit_vectorized(mode, vectorized)
+        for robot in self._select_individually_limited(active_robots):
+            self._limit_individually(robot, mode, target[robot].tolist())
+        self._command_digests.add(active_robots, self.ticks, self._modes, self._target, self._torque_limit_nm)
+        self.simulation.enact(mode, self._target, self._torque_limit_nm, vectorized)
+        stepped_robots = self._advance(active_robots)
+        self._observe(mode, stepped_robots)
 
     def _update_active_masks(self, active: Mask) -> None:
         """Update the masks of the robots that are active, and of those among them that the array limiter limits."""
         self._active_at_last_call = active
-        self._array_limited_at_last_call = self._is_array_limited
+        self._vectorized_at_last_call = self._is_vectorized
         self._active = self._all_robots if active.all() else active
         self._active_indices = np.flatnonzero(active).tolist()
-        array_limited = active & self._is_array_limited
-        if not np.array_equal(array_limited, self._active_array_limited):
+        vectorized = active & self._is_vectorized
+        if not np.array_equal(vectorized, self._active_vectorized):
             self._update_active_limits()
-        self._active_array_limited = self._all_robots if array_limited.all() else array_limited
+        self._active_vectorized = self._all_robots if vectorized.all() else vectorized
 
-    def _select_clients(self, robots: Mask) -> list[int]:
+    def _select_individually_limited(self, robots: Mask) -> list[int]:
         """Return the indices of the robots of a mask that have a limiter of their own."""
-        if not self._clients:
+        if not self._limiter_client_by_robot:
             return []
-        return [robot for robot in self._clients if robots[robot]]
+        return [robot for robot in self._limiter_client_by_robot if robots[robot]]
 
     def read_digest(self, robot: int) -> str:
         """Return the digest of all setpoints, as the `command_digest` of a run."""
-        return self._digests.read(robot)
+        return self._command_digests.read(robot)
 
     def read_active_limits(self) -> NDArray[np.int64]:
         """Return the limit that changed each target in the last tick, (robots, joints), as index in LIMIT_NAMES."""
@@ -244,7 +245,7 @@ class ArmedRobots:
 
     # --- decisions ---------------------------------------------------------------------------------------------
 
-    def _limit_with_arrays(self, mode: Mode, robots: Mask) -> None:
+    def _limit_vectorized(self, mode: Mode, robots: Mask) -> None:
         """Limit the commands of some robots with the array limiter, and store their setpoints.
 
         The setpoints of all other robots stay as they are.
@@ -303,7 +304,7 @@ class ArmedRobots:
         self._has_full_torque = np.array_equal(torque_limit_nm, full_nm)
         return torque_limit_nm
 
-    def _limit_with_client(self, robot: int, mode: Mode, target: list[float]) -> None:
+    def _limit_individually(self, robot: int, mode: Mode, target: list[float]) -> None:
         """Limit the command of one robot with its own limiter, and pass the setpoints to its motors.
 
         Args:
@@ -311,14 +312,14 @@ class ArmedRobots:
             mode: Control mode of all joints.
             target: A target for each joint, tail to head.
         """
-        client = self._clients[robot]
+        client = self._limiter_client_by_robot[robot]
         tick = int(self.ticks[robot])
         now_ns = tick * self._period_ns
         client.command(tick, now_ns, [mode] * len(target), target)
         client.core.latch_faults_and_expire_lease(now_ns, tick)
         decision = client.core.compute_setpoints(self._schedule.used_output_tick(tick + 1))
         setpoints = decision.setpoints
-        self.simulated.enact_one(robot, setpoints)
+        self.simulation.enact_one(robot, setpoints)
         self._modes[robot] = [int(mode) for mode in setpoints.mode]
         self._target[robot] = setpoints.target
         self._torque_limit_nm[robot] = setpoints.torque_limit_nm
@@ -335,23 +336,23 @@ class ArmedRobots:
     def _advance(self, active: Mask) -> Mask:
         """Step the physics, sample the sensors, and return the robots whose simulations have not diverged."""
         next_ticks = self.ticks + active
-        diverged = self.simulated.advance(self._active_indices, next_ticks.tolist())
+        diverged = self.simulation.advance(self._active_indices, next_ticks.tolist())
         if not diverged:
             self.ticks = next_ticks
-            self.simulated.sample(next_ticks, active)
+            self.simulation.sample(next_ticks, active)
             return active
         moved = active
         for robot, cause in diverged.items():
             moved = _copy_with_row(moved, robot, False)
             self._stop_diverged(robot, cause)
         self.ticks = self.ticks + moved
-        self.simulated.sample(self.ticks, moved)
+        self.simulation.sample(self.ticks, moved)
         return moved
 
     def _stop_diverged(self, robot: int, cause: str) -> None:
         """Disarm a robot whose simulation has diverged, as a host does when its backend has failed."""
         cause = cause[:MAX_REASON_LENGTH]
-        client = self._clients.get(robot)
+        client = self._limiter_client_by_robot.get(robot)
         if client is None:
             self.reasons[robot] = cause
         else:
@@ -371,20 +372,22 @@ class ArmedRobots:
             moved: Which robots have moved in this tick, (robots,).
         """
         joints_before = self.joints
-        self.joints = self.simulated.sensors.joints
+        self.joints = self.simulation.sensors.joints
         if not self._safe:
-            for robot in self._select_clients(moved):
+            for robot in self._select_individually_limited(moved):
                 self._move_to_array_limiter(robot)
             return
         self._update_torque_fractions()
         is_plausible, is_ordinary = self._find_ordinary_changes(joints_before)
-        for robot in self._select_clients(moved):
-            self._pass_samples_to_client(self._clients[robot], robot)
-            self._is_excluded[robot] |= not is_plausible[robot] or self._clients[robot].has_isolated_joints
+        for robot in self._select_individually_limited(moved):
+            self._pass_samples_to_client(self._limiter_client_by_robot[robot], robot)
+            self._is_excluded[robot] |= (
+                not is_plausible[robot] or self._limiter_client_by_robot[robot].has_isolated_joints
+            )
             if is_ordinary[robot] and not self._is_excluded[robot] and self._follows_mode(robot, mode):
                 self._move_to_array_limiter(robot)
         if is_ordinary is not self._all_robots:
-            unusual = self._active_array_limited & moved & ~is_ordinary
+            unusual = self._active_vectorized & moved & ~is_ordinary
             for robot in np.flatnonzero(unusual).tolist():
                 self._move_to_own_client(robot, joints_before[robot], mode)
 
@@ -403,7 +406,7 @@ class ArmedRobots:
         change = np.abs(self.joints - joints_before)
         is_joint_plausible = change <= self._max_plausible_change
         has_velocity_changed = change[:, joint_count : 2 * joint_count] != 0.0
-        windings = self.simulated.sensors.windings
+        windings = self.simulation.sensors.windings
         has_new_temperatures = windings is not None and windings.is_new is not windings.no_robots
         # The usual case: all velocities have changed, so no joint has repeated its state. This saves the reductions.
         are_all_plausible = np.count_nonzero(is_joint_plausible) == is_joint_plausible.size
@@ -420,10 +423,10 @@ class ArmedRobots:
 
     def _update_torque_fractions(self) -> None:
         """Derate the torque limits of robots whose winding temperatures have just been measured."""
-        windings = self.simulated.sensors.windings
+        windings = self.simulation.sensors.windings
         if windings is None or windings.is_new is windings.no_robots:
             return
-        fractions = np.where(self._is_temperature_measured, self.simulated.remaining_fractions(), 1.0)
+        fractions = np.where(self._is_temperature_measured, self.simulation.remaining_fractions(), 1.0)
         self._torque_fraction = np.where(windings.is_new[:, None], fractions, self._torque_fraction)
         self._is_derated = bool((self._torque_fraction < 1.0).any())
 
@@ -433,10 +436,10 @@ class ArmedRobots:
         """Pass the newest samples of one robot to its limiter."""
         tick = int(self.ticks[robot])
         now_ns = tick * self._period_ns
-        client.core.observe_joints(self.simulated.make_joint_state(robot, tick, self.joints[robot]), now_ns)
-        windings = self.simulated.sensors.windings
+        client.core.observe_joints(self.simulation.make_joint_state(robot, tick, self.joints[robot]), now_ns)
+        windings = self.simulation.sensors.windings
         if windings is not None and windings.is_new[robot]:
-            power = self.simulated.make_power(robot, tick)
+            power = self.simulation.make_power(robot, tick)
             assert power is not None, "a sample has just been delivered"
             client.core.observe_power(power, now_ns)
 
@@ -448,8 +451,8 @@ class ArmedRobots:
     def _move_to_array_limiter(self, robot: int) -> None:
         """Move a robot from its own limiter to the array limiter, if it is armed."""
         if self.is_armed[robot]:
-            del self._clients[robot]
-            self._is_array_limited = _copy_with_row(self._is_array_limited, robot, True)
+            del self._limiter_client_by_robot[robot]
+            self._is_vectorized = _copy_with_row(self._is_vectorized, robot, True)
 
     def _move_to_own_client(self, robot: int, joints_before: Floats, mode: Mode) -> None:
         """Move a robot from the array limiter to a limiter of its own, and pass the newest samples to that limiter.
@@ -463,16 +466,16 @@ class ArmedRobots:
         """
         tick = int(self.ticks[robot])
         client = LimiterClient(self._descriptions[robot], safe=True)
-        self._clients[robot] = client
-        self._is_array_limited = _copy_with_row(self._is_array_limited, robot, False)
+        self._limiter_client_by_robot[robot] = client
+        self._is_vectorized = _copy_with_row(self._is_vectorized, robot, False)
         newest_first = list(self._commands)[::-1][:tick]  # only those of this episode
         commands = [(tick - 1 - age, target[robot].tolist()) for age, target in enumerate(newest_first)]
-        windings = self.simulated.sensors.windings
+        windings = self.simulation.sensors.windings
         power = None
         if windings is not None and not windings.is_new[robot]:
-            power = self.simulated.make_power(robot, tick - 1)
+            power = self.simulation.make_power(robot, tick - 1)
         client.resume(
-            self.simulated.make_joint_state(robot, tick - 1, joints_before),
+            self.simulation.make_joint_state(robot, tick - 1, joints_before),
             power,
             applied=(
                 _read_setpoints(self._previous_setpoints, robot),

@@ -34,33 +34,35 @@ class Robots:
     """
 
     def __init__(self, robots: int, joints: int, *, assisted: bool, safe: bool, threads: int) -> None:
-        """Allocate the arrays for a number of robots. `start` adds each robot.
+        """Allocate the arrays for a number of robots. `start` puts a robot into a row at the start of its episode.
 
         Args:
             robots: Number of robots.
             joints: Number of joints of each robot.
-            assisted: Whether actions correct the targets of the scenario's controller.
+            assisted: Whether actions are residuals, which are added to the targets of the scenario's controller.
             safe: If True, targets pass the limiter. If False, the motors get the targets unchanged.
             threads: Number of threads that step the physics.
         """
         self._threads = threads
-        self._count = robots
+        self._robot_count = robots
         self._joint_count = joints
-        self._is_assisted = assisted
-        self._is_safe = safe
+        self._has_residual_actions = assisted
+        self._uses_limiter = safe
+        # Robots that are stepped together; None until the first of them starts. All others are stepped on their own.
         self._batch: ArmedRobots | None = None
         self._single_robot_by_row: dict[int, SteppedRobot | AssistedRobot] = {}
-        self.joints: Floats = np.zeros((robots, 3 * joints))
+        self.joints: Floats = np.zeros((robots, 3 * joints))  # angles, velocities, torques
         self.is_armed: Mask = np.zeros(robots, dtype=np.bool_)
         self.is_limited: Masks = np.zeros((robots, joints), dtype=np.bool_)
 
-    def start(self, robot: int, config: RunConfig, description: Description) -> None:
-        """Start an episode: release the robot of a row, and put a new, armed robot there.
+    def start(self, row: int, config: RunConfig, description: Description) -> None:
+        """Start an episode: stop the robot in a row of the arrays, and replace it by a new robot that obeys commands.
 
-        The robot is stepped together with the other robots if it fits to them, otherwise single_robot.
+        The robot is stepped together with the others if it has the same joints, sensors, rates and model; otherwise it
+        is stepped on its own.
 
         Args:
-            robot: Row of the robot.
+            row: Row of the robot in all arrays.
             config: Configuration of the episode.
             description: Description of the robot of that configuration.
 
@@ -68,20 +70,20 @@ class Robots:
             ConfigError: The settings do not match the robot or the scene.
             RefusedError: The robot cannot be armed.
         """
-        self.stop(robot)
-        if self._is_assisted:
-            self._single_robot_by_row[robot] = AssistedRobot(config)
-        elif not self._start_in_batch(robot, config, description):
-            self._single_robot_by_row[robot] = SteppedRobot(config, safe=self._is_safe)
+        self.stop(row)
+        if self._has_residual_actions:
+            self._single_robot_by_row[row] = AssistedRobot(config)
+        elif not self._start_in_batch(row, config, description):
+            self._single_robot_by_row[row] = SteppedRobot(config, safe=self._uses_limiter)
         self._update_arrays()
 
-    def stop(self, robot: int) -> None:
-        """Release the robot of a row."""
-        single_robot = self._single_robot_by_row.pop(robot, None)
+    def stop(self, row: int) -> None:
+        """Stop the robot of a row, which takes part in no tick until the next `start`."""
+        single_robot = self._single_robot_by_row.pop(row, None)
         if single_robot is not None:
             single_robot.close()
         if self._batch is not None:
-            self._batch.stop(robot)
+            self._batch.stop(row)
 
     def step(self, mode: Mode, target: Floats, active: Mask) -> None:
         """Run one tick of some robots, and update the arrays.
@@ -127,7 +129,7 @@ class Robots:
 
     def read_limit_names(self) -> NDArray[Any]:
         """Return which limit changed each target in the last tick, (robots, joints) of names; None: none did."""
-        names = np.full((self._count, self._joint_count), None, dtype=object)
+        names = np.full((self._robot_count, self._joint_count), None, dtype=object)
         if self._batch is not None and np.count_nonzero(self.is_limited):
             names = NAMES_OR_NONE[self._batch.read_active_limits()]
         for robot, single_robot in self._single_robot_by_row.items():
@@ -139,10 +141,10 @@ class Robots:
     def read_poses(self) -> tuple[Mask, Floats]:
         """Return which robots have a pose, and the positions and quaternions, (robots, 7)."""
         if self._batch is None:
-            is_known = np.zeros(self._count, dtype=np.bool_)
-            poses = np.zeros((self._count, NUMBERS_OF_POSE))
+            is_known = np.zeros(self._robot_count, dtype=np.bool_)
+            poses = np.zeros((self._robot_count, NUMBERS_OF_POSE))
         else:
-            sensors = self._batch.simulated.sensors
+            sensors = self._batch.simulation.sensors
             is_known = sensors.has_poses
             poses = sensors.read_poses()
         if self._single_robot_by_row:
@@ -156,9 +158,9 @@ class Robots:
 
     def read_velocities(self) -> Floats:
         """Return linear and angular velocities in the world, (robots, 6); zeros for robots without a pose."""
-        velocities = np.zeros((self._count, NUMBERS_OF_VELOCITY))
+        velocities = np.zeros((self._robot_count, NUMBERS_OF_VELOCITY))
         if self._batch is not None:
-            sensors = self._batch.simulated.sensors
+            sensors = self._batch.simulation.sensors
             velocities = np.where(sensors.has_poses[:, None], sensors.read_velocities(), 0.0)
         for robot, single_robot in self._single_robot_by_row.items():
             pose = single_robot.newest_samples.get(keys.POSE)
@@ -170,9 +172,9 @@ class Robots:
     def read_contact_forces(self) -> Floats:
         """Return the sum of the sizes of all contact forces on every link, (robots, links) in N."""
         if self._batch is None:
-            forces_n = np.zeros((self._count, self._joint_count + 1))
+            forces_n = np.zeros((self._robot_count, self._joint_count + 1))
         else:
-            forces_n = self._batch.simulated.sensors.read_contact_forces()
+            forces_n = self._batch.simulation.sensors.read_contact_forces()
         for robot, single_robot in self._single_robot_by_row.items():
             sample = single_robot.newest_samples.get(keys.CONTACTS)
             contacts = sample if isinstance(sample, Contacts) else None
@@ -186,7 +188,9 @@ class Robots:
         if not can_arm(config):
             return False
         if self._batch is None:
-            self._batch = ArmedRobots(self._count, config, description, safe=self._is_safe, threads=self._threads)
+            self._batch = ArmedRobots(
+                self._robot_count, config, description, safe=self._uses_limiter, threads=self._threads
+            )
         return self._batch.can_start(config) and self._batch.start(robot, config, description)
 
     def _update_arrays(self) -> None:

@@ -86,7 +86,7 @@ class EnvironmentSetup:
         self.picture_size = (width, height)
 
         self.description = describe_run_robot(self.config)
-        self.commands = Commands.make_for_robot(self.description, action, residual_rad)
+        self.commands = Commands.for_robot(self.description, action, residual_rad)
         self._declare_spaces(observe, flat)
 
     def _declare_spaces(self, observe: Sequence[str] | None, flat: bool) -> None:

@@ -4,15 +4,15 @@ import argparse
 import dataclasses
 
 from snakesim_hal.programs.arguments import (
-    add_duration,
-    add_fields,
-    add_json,
-    add_out,
-    add_resume,
-    add_scenario_name,
-    add_seed,
-    add_set,
-    add_workers,
+    add_duration_argument,
+    add_fields_argument,
+    add_json_argument,
+    add_output_argument,
+    add_resume_argument,
+    add_scenario_name_argument,
+    add_seed_argument,
+    add_set_argument,
+    add_workers_argument,
     make_number_parser,
 )
 from snakesim_hal.programs.commands import Command, Commands, Noun
@@ -20,15 +20,15 @@ from snakesim_hal.programs.commands import Command, Commands, Noun
 
 def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim policy train`."""
-    add_scenario_name(parser)
+    add_scenario_name_argument(parser)
     parser.add_argument(
         "--form", choices=("feeling", "wave"), default="feeling", help="what is learned (default: feeling)"
     )
     _add_count_option(parser, "--generations", 1, 20, "generations of the search")
     _add_count_option(parser, "--population", 4, 12, "policies in a generation")
-    add_fields(parser, "for each policy, anew in each generation (default: 4)", 4)
+    add_fields_argument(parser, "for each policy, anew in each generation (default: 4)", 4)
     _add_count_option(parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked")
-    add_seed(parser, "of the search (default: 1)", 1)
+    add_seed_argument(parser, "of the search (default: 1)", 1)
     parser.add_argument(
         "--init", dest="begin", metavar="POLICY", help="begin at its numbers: a shipped policy, or policy.onnx"
     )
@@ -39,11 +39,13 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help="times how far the first generation looks (default: 1)",
     )
-    add_duration(parser, "seconds of an episode (default: the scenario's)", make_number_parser(0.1, 3600.0, "s"))
+    add_duration_argument(
+        parser, "seconds of an episode (default: the scenario's)", make_number_parser(0.1, 3600.0, "s")
+    )
     parser.add_argument(
         "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002 (may be repeated)"
     )
-    add_set(parser)
+    add_set_argument(parser)
     parser.add_argument(
         "--randomize",
         action="append",
@@ -51,9 +53,9 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=LOW:HIGH",
         help="a number for each field (may be repeated)",
     )
-    add_workers(parser)
-    add_out(parser, "folder of what comes of it", required=True)
-    add_resume(parser)
+    add_workers_argument(parser)
+    add_output_argument(parser, "folder of what comes of it", required=True)
+    add_resume_argument(parser)
 
 
 def _add_count_option(parser: argparse.ArgumentParser, option: str, minimum: int, default: int, about: str) -> None:
@@ -69,7 +71,7 @@ def _add_count_option(parser: argparse.ArgumentParser, option: str, minimum: int
 def _add_info_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim policy info`."""
     parser.add_argument("policy", metavar="POLICY", help="path of an ONNX file, or name of a shipped policy")
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _run_info(arguments: argparse.Namespace) -> int:

@@ -78,20 +78,20 @@ class CanDrives(Drives):
         self._emulator = context.emulator
         # The bus and its drives.
         self.wire = context.wire
-        self.nodes = [joint.id for joint in context.joints]
-        self._index_of_node = {node: i for i, node in enumerate(self.nodes)}
+        self.node_ids = [joint.id for joint in context.joints]
+        self._index_by_node_id = {node: i for i, node in enumerate(self.node_ids)}
         self._is_brought_up = False  # whether every drive was found and no other program uses the bus
         # What drives report.
         self.readings = context.readings
         labels = [f"{joint.name} (node {joint.id} on {context.wire.channel})" for joint in context.joints]
         self.states = DriveStates(labels, context.report_period_ns, context.clock_ns)
-        self.firmware: list[tuple[int, ...]] = [()] * len(self.nodes)  # (): not reported yet
+        self.firmware: list[tuple[int, ...]] = [()] * len(self.node_ids)  # (): not reported yet
         # Serial numbers that respond with the id of each joint. Two of them are two drives with one id.
-        self._serials: list[list[str]] = [[] for _ in self.nodes]
-        self._health_drive_index = 0  # index of the drive whose health was requested last
+        self._serials: list[list[str]] = [[] for _ in self.node_ids]
+        self._last_health_request_index = 0  # index of the drive whose health was requested last
         # Other nodes on the bus.
         self._frame_count_by_unknown_node: Counter[int] = Counter()  # frames, by node
-        self._was_second_host_seen = False  # whether another program commands drives
+        self._other_controller_seen = False  # whether another program has commanded drives
 
     # --- the protocol of a driver type: frames that arrive ----------------------------------------------------
 
@@ -123,8 +123,8 @@ class CanDrives(Drives):
 
     def forget_identities(self) -> None:
         """Forget what drives have reported, at the start of a bring-up."""
-        self.firmware = [()] * len(self.nodes)
-        self._serials = [[] for _ in self.nodes]
+        self.firmware = [()] * len(self.node_ids)
+        self._serials = [[] for _ in self.node_ids]
 
     @abstractmethod
     def validate_drive(self, i: int) -> str:
@@ -198,14 +198,14 @@ class CanDrives(Drives):
         Raises:
             BackendError: A drive is missing or unsuitable, or another program commands drives on this bus.
         """
-        drives = range(len(self.nodes))
+        drives = range(len(self.node_ids))
         self.forget_identities()
         self._request_until_done(self.is_identified, self.request_identity)
         self._wait_for_duplicates()
         problems = [
             f"  {self.states.drives[i].label} {problem}" for i in drives for problem in self._find_identity_problems(i)
         ]
-        if self._was_second_host_seen:
+        if self._other_controller_seen:
             raise BackendError(
                 "another program commands drives on this bus; end it first. Nothing was sent", code="bus/second-host"
             )
@@ -248,7 +248,7 @@ class CanDrives(Drives):
     def close(self) -> None:
         """Switch all drives off, as far as the bus still works, and close the bus."""
         if self._is_brought_up:
-            for i in range(len(self.nodes)):
+            for i in range(len(self.node_ids)):
                 try:
                     self.send_command(i, "idle")
                     self.restore_settings(i)
@@ -264,11 +264,11 @@ class CanDrives(Drives):
     def read(self) -> None:
         """Request motion and torque of all drives and the health of one, and wait for drives that responded lately."""
         self._receive()
-        for i in range(len(self.nodes)):
+        for i in range(len(self.node_ids)):
             if not self.request_motion(i):
                 self.readings.skip_request(i)
-        self._health_drive_index = (self._health_drive_index + 1) % len(self.nodes)
-        self.request_health(self._health_drive_index)
+        self._last_health_request_index = (self._last_health_request_index + 1) % len(self.node_ids)
+        self.request_health(self._last_health_request_index)
         deadline_s = time.monotonic() + self._context.response_timeout_s
         while self.readings.is_awaiting_responses() or self.is_awaiting_responses():
             remaining_s = deadline_s - time.monotonic()
@@ -314,14 +314,14 @@ class CanDrives(Drives):
         sender = self.find_sender(frame)
         if sender is None:
             return
-        i = self._index_of_node.get(sender)
+        i = self._index_by_node_id.get(sender)
         if i is not None:
             try:
                 self.handle_response(i, frame)
             except (ValueError, LookupError, struct.error):
                 return
         elif sender == HOST:
-            self._was_second_host_seen = True
+            self._other_controller_seen = True
         else:
             self._frame_count_by_unknown_node[sender] += 1
 
@@ -338,9 +338,9 @@ class CanDrives(Drives):
     def _find_unauthorized_nodes(self) -> list[Finding]:
         """Return findings for another host and for unknown nodes."""
         findings: list[Finding] = []
-        if self._was_second_host_seen:
+        if self._other_controller_seen:
             findings.append(Finding("second_host", "another program commands drives on this bus; end one of the two"))
-            self._was_second_host_seen = False
+            self._other_controller_seen = False
         for node, frame_count in self._frame_count_by_unknown_node.items():
             if frame_count >= MIN_UNKNOWN_NODE_FRAMES:
                 findings.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
@@ -404,7 +404,7 @@ class CanDrives(Drives):
             is_done: Function that returns whether a drive, by its index, needs no more requests.
             request: Function that sends the request to a drive, by its index.
         """
-        drives = range(len(self.nodes))
+        drives = range(len(self.node_ids))
         deadline_s = time.monotonic() + self._context.bring_up_timeout_s
         next_request_s = 0.0
         while True:

@@ -41,9 +41,9 @@ class CanEmulator(DriveEmulator[Wire]):
         body = context.body
         self.wires = list(context.wires)
         self.watchdog_us = context.settings.watchdog_s * 1e6
-        self._index_of_node: dict[tuple[int, int], int] = {}  # by id() of the wire, and node
+        self._index_by_node_id: dict[tuple[int, int], int] = {}  # by id() of the wire, and node
         for i, (wire, joint) in enumerate(zip(self.wires, body.joints, strict=True)):
-            self._index_of_node[id(wire), joint.id] = i
+            self._index_by_node_id[id(wire), joint.id] = i
         super().__init__(body, self.wires, context.clock_ns)
 
     @abstractmethod
@@ -95,5 +95,5 @@ class CanEmulator(DriveEmulator[Wire]):
         node = self.find_destination_node(frame)
         if node == self.broadcast_id:
             return [i for i, drive_wire in enumerate(self.wires) if drive_wire is wire]
-        i = self._index_of_node.get((id(wire), node))
+        i = self._index_by_node_id.get((id(wire), node))
         return [] if i is None else [i]

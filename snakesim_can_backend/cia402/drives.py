@@ -239,10 +239,10 @@ class Cia402Drives(CanDrives):
         return Servo(queue)
 
     def _send_sdo(self, i: int, data: bytes) -> None:
-        self.wire.send(Frame(Function.SDO_REQUEST | self.nodes[i], data))
+        self.wire.send(Frame(Function.SDO_REQUEST | self.node_ids[i], data))
 
     def _send_nmt(self, i: int, command: NmtCommand) -> None:
-        self.wire.send(encode_nmt(command, self.nodes[i]))
+        self.wire.send(encode_nmt(command, self.node_ids[i]))
         if command != NmtCommand.START:
             return
         servo = self.servos[i]
@@ -318,7 +318,7 @@ class Cia402Drives(CanDrives):
     def forget_identities(self) -> None:
         """Forget everything that drives have reported."""
         super().forget_identities()
-        self.servos = [self._make_servo(i) for i in range(len(self.nodes))]
+        self.servos = [self._make_servo(i) for i in range(len(self.node_ids))]
 
     def validate_drive(self, i: int) -> str:
         """Check EDS, identity, modes, units and limits of a drive, and store its scaling.
@@ -404,7 +404,7 @@ class Cia402Drives(CanDrives):
         self._enter_phase(servo, "configuring")
         servo.queue.clear()
         servo.queue.add(list_fault_reset_steps() if servo.should_reset_fault else list_switch_off_steps())
-        servo.queue.add(list_configuration_steps(self.nodes[i], self._settings, self._period_s))
+        servo.queue.add(list_configuration_steps(self.node_ids[i], self._settings, self._period_s))
         servo.should_reset_fault = False
 
     def _enter_phase(self, servo: Servo, phase: Phase) -> None:
@@ -524,4 +524,4 @@ class Cia402Drives(CanDrives):
             self._send_pdo(i, TORQUE_PDO, control, 0, servo.values[MAX_TORQUE])
 
     def _send_pdo(self, i: int, pdo: Pdo, *values: int) -> None:
-        self.wire.send(Frame(pdo.base | self.nodes[i], pdo.layout.pack(*values)))
+        self.wire.send(Frame(pdo.base | self.node_ids[i], pdo.layout.pack(*values)))

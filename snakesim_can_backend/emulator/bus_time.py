@@ -13,7 +13,7 @@ from math import inf
 from snakesim_can_backend.bus.load import BIT_RATE, compute_max_frame_bits
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 
-OPCODES = 32  # an opcode has five bits
+OPCODE_COUNT = 32  # an opcode has five bits
 ID_BITS = 11
 MAX_DATA_BYTES = 8  # on classic CAN
 MAX_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could carry
@@ -43,20 +43,24 @@ class BusTime:
     """The timing of one bus. Times are microseconds, and must not go backward."""
 
     def __init__(self, bit_rate: int = BIT_RATE) -> None:
-        """Create an idle bus, on which frames wait for arbitration and occupy the bus for their worst-case time.
+        """Create a simulated CAN bus that is idle.
+
+        Frames wait for arbitration, and occupy the bus for their worst-case time.
 
         Args:
             bit_rate: Bit rate of the bus in bit/s.
         """
-        self.frame_us = [compute_max_frame_bits(length) * 1e6 / bit_rate for length in range(MAX_DATA_BYTES + 1)]
+        self.frame_duration_us_by_length = [
+            compute_max_frame_bits(length) * 1e6 / bit_rate for length in range(MAX_DATA_BYTES + 1)
+        ]
 
-        # Frames that wait: sender -> mailbox -> frame, and since when it waits.
-        self._waiting_frames: dict[int, dict[int, tuple[Frame, float]]] = {}
-        self._arbitration_heap: list[
-            tuple[int, int, int]
-        ] = []  # heap: id, sender and mailbox of every sender's first frame
-        self._response_count = 0  # frames IN_ORDER so far
-        self._babble_frame_by_sender: dict[int, Frame] = {}  # sender -> the frame that it repeats without a pause
+        # Frames that wait, each with the time since which it waits.
+        self._waiting_frame_by_mailbox_by_sender: dict[int, dict[int, tuple[Frame, float]]] = {}
+        # Heap of (id, sender, mailbox) of the first frame of every sender: the lowest id wins the arbitration.
+        self._arbitration_heap: list[tuple[int, int, int]] = []
+        self._response_count = 0  # frames of UNREPLACEABLE_OPCODES so far; each gets a mailbox of its own
+        # The frame that a defective sender (a "babbling idiot") repeats without a pause.
+        self._babble_frame_by_sender: dict[int, Frame] = {}
 
         # The bus.
         self._bus_free_us = 0.0  # when the bus will be free
@@ -64,22 +68,22 @@ class BusTime:
         self._sent_frames: list[Frame] = []
 
         # Statistics.
-        self._frames = [0] * OPCODES
-        self._busy_us = [0.0] * OPCODES
+        self._frame_count_by_opcode = [0] * OPCODE_COUNT
+        self._busy_us_by_opcode = [0.0] * OPCODE_COUNT
         self._replaced_count = 0
         self._max_wait_us = 0.0
 
     def record_host_frame(self, frame: Frame, now_us: float) -> None:
         """Account for a frame of the host that has arrived."""
         self._advance_arbitration(now_us)
-        duration_us = self.frame_us[len(frame.data)]
+        duration_us = self.frame_duration_us_by_length[len(frame.data)]
         self._bus_free_us = min(max(self._bus_free_us, now_us) + duration_us, now_us + MAX_AHEAD_US)
         self.count_frame(frame)
 
     def enqueue(self, sender: int, frame: Frame, now_us: float) -> None:
         """Add a frame that a module wants to send; it replaces one with the same id that still waits."""
         self._advance_arbitration(now_us)
-        mailboxes = self._waiting_frames.setdefault(sender, {})
+        mailboxes = self._waiting_frame_by_mailbox_by_sender.setdefault(sender, {})
         mailbox = self._choose_mailbox(frame)
         if mailbox in mailboxes:
             _, since_us = mailboxes[mailbox]
@@ -113,14 +117,14 @@ class BusTime:
         if not self._arbitration_heap:
             return inf
         _, sender, mailbox = self._arbitration_heap[0]
-        frame, since_us = self._waiting_frames[sender][mailbox]
-        return max(self._bus_free_us, since_us) + self.frame_us[len(frame.data)]
+        frame, since_us = self._waiting_frame_by_mailbox_by_sender[sender][mailbox]
+        return max(self._bus_free_us, since_us) + self.frame_duration_us_by_length[len(frame.data)]
 
     def count_frame(self, frame: Frame) -> None:
         """Add a frame and its time to the traffic."""
         opcode = frame.id >> NODE_BITS
-        self._frames[opcode] += 1
-        self._busy_us[opcode] += self.frame_us[len(frame.data)]
+        self._frame_count_by_opcode[opcode] += 1
+        self._busy_us_by_opcode[opcode] += self.frame_duration_us_by_length[len(frame.data)]
 
     def set_babbling(self, sender: int, frame: Frame | None, now_us: float) -> None:
         """Let a module repeat a frame as often as the bus allows, from now on; None ends that."""
@@ -133,7 +137,13 @@ class BusTime:
 
     def traffic(self, now_us: float) -> Traffic:
         """Return the traffic of the bus until now."""
-        return Traffic(now_us, tuple(self._frames), tuple(self._busy_us), self._replaced_count, self._max_wait_us)
+        return Traffic(
+            now_us,
+            tuple(self._frame_count_by_opcode),
+            tuple(self._busy_us_by_opcode),
+            self._replaced_count,
+            self._max_wait_us,
+        )
 
     def _advance_arbitration(self, now_us: float) -> None:
         """Send waiting frames in the order of arbitration, up to the current time.
@@ -153,7 +163,7 @@ class BusTime:
             if not self._arbitration_heap:
                 return
             _, sender, mailbox = self._arbitration_heap[0]
-            _, waiting_since_us = self._waiting_frames[sender][mailbox]
+            _, waiting_since_us = self._waiting_frame_by_mailbox_by_sender[sender][mailbox]
             start_us = max(self._bus_free_us, waiting_since_us)
             if start_us >= now_us:
                 return
@@ -162,9 +172,9 @@ class BusTime:
 
     def _start_transmission(self, sender: int, mailbox: int, start_us: float) -> None:
         """Put the frame in a mailbox on the bus, and let the sender's next frame take part in arbitration."""
-        mailboxes = self._waiting_frames[sender]
+        mailboxes = self._waiting_frame_by_mailbox_by_sender[sender]
         frame, since_us = mailboxes.pop(mailbox)
-        end_us = start_us + self.frame_us[len(frame.data)]
+        end_us = start_us + self.frame_duration_us_by_length[len(frame.data)]
         repeated = self._babble_frame_by_sender.get(sender)
         if repeated is not None and repeated.id == mailbox:
             mailboxes[mailbox] = (repeated, end_us)

@@ -32,7 +32,7 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.mounted import build_true_config, build_true_joints
+from snakesim_drivers.emulation.mounted import build_actual_config, build_actual_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_drivers.mounting import Mounting, to_joint_target
 from snakesim_hal.model.fault_kinds import FaultTransition, Injection, InjectionPlan
@@ -90,13 +90,13 @@ class ModuleChain:
         self.slots: list[ModuleSlot] = []  # tail to head; then injected duplicates
         self._node_ids = assign_node_ids(robot, settings)
         self._configured_joints = robot.joint_table  # as the robot file describes them
-        self._joints = build_true_joints(robot, settings.mounted)  # as they are really built
+        self._joints = build_actual_joints(robot, settings.mounted)  # as they are really built
         unconnected = {name for name, mount in settings.mounted.items() if not mount.connected}
         self._unconnected_joints = {i for i, joint in enumerate(self._joints) if joint.name in unconnected}
 
         # The body.
         self.physics_model = physics_model
-        self.motors = Motors(build_true_config(config, settings.mounted).robot, physics_model.step_s)
+        self.motors = Motors(build_actual_config(config, settings.mounted).robot, physics_model.step_s)
         self.thermal = Thermal(self._joints)
 
         # Time.
@@ -234,7 +234,7 @@ class ModuleChain:
     def _send_babble(self, now_us: float) -> None:
         """In stepped time, send as many heartbeats of babbling modules as the bus could have carried."""
         for slot, since_us in self._babble_start_us_by_slot.items():
-            frame_us = self.buses[slot.channel].frame_us[HEARTBEAT_BYTES]
+            frame_us = self.buses[slot.channel].frame_duration_us_by_length[HEARTBEAT_BYTES]
             frames = int((now_us - since_us) / frame_us)
             self._outgoing[slot.channel].extend([slot.module.heartbeat(now_us)] * frames)
             self._babble_start_us_by_slot[slot] = since_us + frames * frame_us

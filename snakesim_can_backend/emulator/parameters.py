@@ -23,7 +23,7 @@ FACTORY_CONTACT_EVERY = 1.0  # Syncs
 RANGE_TOLERANCE = 1e-6  # of a range's largest bound; bounds have single precision on the bus
 FLOAT_BYTES = 4
 FLOAT_MASK = 0xFFFFFFFF
-SINGLE_FLOAT = Struct("<f")
+FLOAT32_STRUCT = Struct("<f")
 
 
 def make_factory_defaults(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[ModuleParameter, float]:
@@ -53,28 +53,31 @@ class ParameterStore:
         """Load the saved values."""
         self.values = dict(self._flash)
 
-    def handle_request(self, node: int, data: bytes, armed: bool) -> Frame:
+    def handle_request(self, node: int, data: bytes, is_armed: bool) -> Frame:
         """Read, write or save a parameter as a ParameterRequest demands, and return the response.
 
         Args:
             node: Node id of the module.
             data: Data bytes of the request.
-            armed: Whether the module drives its motor; if so, no parameter can be changed.
+            is_armed: Whether the module drives its motor; if so, no parameter can be changed.
 
         Returns:
-            The ParameterAnswer frame, with the value of the parameter afterwards.
+            The response frame (`PARAMETER_ANSWER`), with the value of the parameter afterwards.
         """
-        index, operation, raw = _read_request(data)
+        index, operation, raw_value = _decode_request(data)
         result = ParameterResult.UNKNOWN_INDEX
         value = 0.0
         if index in PARAMETERS:
             parameter = ModuleParameter(index)
-            result = self._execute_operation(parameter, operation, raw, armed)
+            result = self._execute_operation(parameter, operation, raw_value, is_armed)
             value = self.values[parameter]
-        value_raw = int.from_bytes(SINGLE_FLOAT.pack(value), "little")
-        return _write_answer(node, (index, operation, result, value_raw))
+        # On the bus, a value is the bits of a float32 as an unsigned integer.
+        current_raw_value = int.from_bytes(FLOAT32_STRUCT.pack(value), "little")
+        return _encode_response(node, (index, operation, result, current_raw_value))
 
-    def _execute_operation(self, parameter: ModuleParameter, operation: int, raw: int, armed: bool) -> ParameterResult:
+    def _execute_operation(
+        self, parameter: ModuleParameter, operation: int, raw_value: int, is_armed: bool
+    ) -> ParameterResult:
         match operation:
             case ParameterOperation.READ:
                 return ParameterResult.DONE
@@ -84,16 +87,16 @@ class ParameterStore:
                 return ParameterResult.UNKNOWN_OPERATION
         if not PARAMETERS[parameter].writable:
             return ParameterResult.READ_ONLY
-        if armed:
+        if is_armed:
             return ParameterResult.NOT_WHILE_ARMED
         if operation == ParameterOperation.SAVE:
             self._flash[parameter] = self.values[parameter]
             return ParameterResult.DONE
-        return self._write_value(parameter, raw)
+        return self._write_value(parameter, raw_value)
 
-    def _write_value(self, parameter: ModuleParameter, raw: int) -> ParameterResult:
+    def _write_value(self, parameter: ModuleParameter, raw_value: int) -> ParameterResult:
         """Set the current value of a parameter to the float with these bits, if it is allowed."""
-        (requested,) = SINGLE_FLOAT.unpack((raw & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
+        (requested,) = FLOAT32_STRUCT.unpack((raw_value & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
         value = clamp_to_range(PARAMETERS[parameter], requested)
         if value is None:
             return ParameterResult.OUT_OF_RANGE
@@ -117,5 +120,5 @@ def clamp_to_range(allowed: ParameterRange, value: float) -> float | None:
     return min(max(value, allowed.low), allowed.high)
 
 
-_read_request = load_layouts()[Opcode.PARAMETER_REQUEST].make_reader("index", "operation", "value")
-_write_answer = load_layouts()[Opcode.PARAMETER_ANSWER].make_writer("index", "operation", "result", "value")
+_decode_request = load_layouts()[Opcode.PARAMETER_REQUEST].make_reader("index", "operation", "value")
+_encode_response = load_layouts()[Opcode.PARAMETER_ANSWER].make_writer("index", "operation", "result", "value")

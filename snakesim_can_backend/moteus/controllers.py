@@ -244,7 +244,7 @@ class Controllers(CanDrives):
         self._send(i, encode_subframe(WRITE, INT8, Register.MODE, MoteusMode.STOPPED))
 
     def _send(self, i: int, *subframes: bytes, reply: bool = False) -> bool:
-        return self.wire.send(make_frame(HOST_ID, self.nodes[i], *subframes, reply=reply))
+        return self.wire.send(make_frame(HOST_ID, self.node_ids[i], *subframes, reply=reply))
 
 
 def describe_fault(mode: int, fault: int) -> str:

@@ -247,7 +247,7 @@ class Axes(CanDrives):
         endpoints = self._find_endpoints(i)
         missing = self._list_missing_settings(i)
         if endpoints is not None and missing:
-            self.wire.send(encode_setting_request(self.nodes[i], endpoints.ids[missing[0]]))
+            self.wire.send(encode_setting_request(self.node_ids[i], endpoints.ids[missing[0]]))
 
     def _store_setting(self, i: int, data: bytes) -> None:
         endpoints = self._find_endpoints(i)
@@ -344,11 +344,11 @@ class Axes(CanDrives):
             axis.mode = mode
 
     def _send(self, i: int, message_id: MessageId, *values: float) -> bool:
-        return self.wire.send(encode_message(self.nodes[i], message_id, *values))
+        return self.wire.send(encode_message(self.node_ids[i], message_id, *values))
 
     def _request(self, i: int, *messages: MessageId) -> bool:
         """Send a request for each of these messages. Returns whether the bus accepted all of them."""
-        accepted = [self.wire.send(encode_request(self.nodes[i], message_id)) for message_id in messages]
+        accepted = [self.wire.send(encode_request(self.node_ids[i], message_id)) for message_id in messages]
         return all(accepted)
 
 

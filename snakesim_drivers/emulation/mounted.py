@@ -64,7 +64,7 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     """Whole backlash of the gear, between the encoder on the motor and the link. None: no backlash."""
 
 
-def build_true_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
+def build_actual_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
     """Return every joint with the drive and motor that are really mounted, from tail to head.
 
     Args:
@@ -81,7 +81,7 @@ def build_true_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[
     return joints
 
 
-def build_true_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
+def build_actual_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
     """Return the configuration for the physics model that the drives move, with the motors that are really mounted.
 
     Args:

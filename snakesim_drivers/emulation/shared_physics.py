@@ -6,11 +6,11 @@ from typing import Any, Protocol
 
 import msgspec
 
-from snakesim_drivers.emulation.mounted import Mounted, build_true_config, build_true_joints
+from snakesim_drivers.emulation.mounted import Mounted, build_actual_config, build_actual_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_hal.model.plugins import PHYSICS_MODELS, decode_plugin_settings, load_plugin, require_base_class
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.backlash import BacklashModel, move_rotors_behind_gears
+from snakesim_hal.physics.backlash import BacklashModel, move_rotor_inertia_to_motor_side
 from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.physics.thermal import Thermal
@@ -41,7 +41,9 @@ class PhysicsSettings(Protocol):
 
 
 def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: str) -> PhysicsModel:
-    """Create the physics model that emulated drives move, with the drives mounted as the settings say.
+    """Create the physics model of the robot that emulated drives move, as the robot is really built.
+
+    The settings `mounted` name errors of assembly, such as a wrong sign or backlash, that the controller does not know.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
@@ -59,13 +61,14 @@ def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: st
     require_base_class(model_type, PhysicsModel, label)
     section = f"backends.{backend}.physics_model_settings"
     model_settings = decode_plugin_settings(model_type, settings.physics_model_settings, label, section)
-    true_config = build_true_config(config, settings.mounted)
+    # As really built, unlike what the controller assumes.
+    actual_config = build_actual_config(config, settings.mounted)
     backlash_rad = {name: mounted.backlash_rad for name, mounted in settings.mounted.items() if mounted.backlash_rad}
     if not backlash_rad:
-        return model_type(true_config, model_settings)
-    joints = build_true_joints(config.robot, settings.mounted)
-    links = model_type(move_rotors_behind_gears(true_config, joints, backlash_rad), model_settings)
-    return BacklashModel(links, joints, backlash_rad, config.seed)
+        return model_type(actual_config, model_settings)
+    joints = build_actual_joints(config.robot, settings.mounted)
+    rigid_gear_model = model_type(move_rotor_inertia_to_motor_side(actual_config, joints, backlash_rad), model_settings)
+    return BacklashModel(rigid_gear_model, joints, backlash_rad, config.seed)
 
 
 class SharedPhysics:
@@ -89,8 +92,8 @@ class SharedPhysics:
         """
         # Physics.
         self.physics_model = physics_model
-        self.joints = build_true_joints(config.robot, mounted)
-        self.motors = Motors(build_true_config(config, mounted).robot, physics_model.step_s)
+        self.joints = build_actual_joints(config.robot, mounted)
+        self.motors = Motors(build_actual_config(config, mounted).robot, physics_model.step_s)
         self.thermal = Thermal(self.joints)
 
         # Time.

@@ -2,7 +2,12 @@
 
 import argparse
 
-from snakesim_hal.programs.arguments import add_json, add_parent, add_scenario_name, add_set
+from snakesim_hal.programs.arguments import (
+    add_json_argument,
+    add_parent_argument,
+    add_scenario_name_argument,
+    add_set_argument,
+)
 from snakesim_hal.programs.commands import Commands, Noun
 
 DRIVE_NOUNS: Commands = (
@@ -22,7 +27,7 @@ def add_channel(parser: argparse.ArgumentParser, about: str) -> None:
 def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
     """Add the arguments of a scan: the buses, with `about` as their help text, and `--json`."""
     parser.add_argument("channel", nargs="+", metavar="CHANNEL", help=about)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = None) -> None:
@@ -32,8 +37,8 @@ def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = 
 
 def add_emulation(parser: argparse.ArgumentParser, channel_about: str) -> None:
     """Add all arguments of a command that emulates drives; `channel_about` is the help text of `--channel`."""
-    add_scenario_name(parser)
+    add_scenario_name_argument(parser)
     add_channel(parser, channel_about)
-    add_set(parser)
+    add_set_argument(parser)
     add_pose(parser, "default: nowhere")
-    add_parent(parser)
+    add_parent_argument(parser)

@@ -54,13 +54,16 @@ class DriveSettings(BodySettings, frozen=True, kw_only=True):
 def make_emulated_body(
     config: RunConfig, settings: BodySettings, backend: str, pose_address: str | None
 ) -> EmulatedBody:
-    """Create the physics body that the emulated drives of a whole robot move.
+    """Create the emulated body of a whole robot, through which all of its emulated drives share one physics model.
 
     Args:
         config: Configuration of the run, with the robot and the settings of its backend.
         settings: Settings of the backend.
         backend: Name of the backend.
         pose_address: HOST:PORT to which emulated motion capture sends poses; None if it does not send.
+
+    Returns:
+        The body, with all joints of the robot.
 
     Raises:
         ConfigError: The physics model is unknown, or the address is malformed.

@@ -46,37 +46,40 @@ class HoldingBrakes:
         self._hold_angles_rad = [0.0] * count
         self._hold_torque_limits_nm = [0.0] * count
 
-    def update_brakes(self, command: BusCommand, drives_on: Collection[int], angle_rad: Floats) -> BrakePlan:
-        """Start to open or close brakes for a command, and let drives hold their position until that is done.
+    def update_brakes(self, command: BusCommand, enabled_drives: Collection[int], angles_rad: Floats) -> BrakePlan:
+        """Start to release or engage brakes for a command, and let drives hold their position until that is done.
 
-        An enabled drive holds its position until its brake is open. A drive that is switched off stays enabled, and
-        holds its position, until its brake is closed; not after an emergency stop. Call it once in every cycle.
+        Call this once in every cycle. The rules are:
+
+        * A drive that the command enables holds its position until its brake is released.
+        * A drive that the command switches off stays enabled, and holds its position, until its brake is engaged.
+        * After an emergency stop, a drive is switched off at once.
 
         Args:
-            command: Command for drives without brakes.
-            drives_on: Indices of the drives that report that they are on.
-            angle_rad: Measured angles of the shafts, (n_drives,).
+            command: The command as if there were no brakes.
+            enabled_drives: Indices of the drives that report that they are enabled.
+            angles_rad: Measured angles of the shafts, (n_drives,).
 
         Returns:
-            The command to send, and the drives whose brake is to be open.
+            The command to send, and the drives whose brake is to be released, or is being released.
         """
         now_ns = self._clock_ns()
         holding_drives: set[int] = set()
-        for i, angle in enumerate(angle_rad.tolist()):
+        for i, angle in enumerate(angles_rad.tolist()):
             if i in command.enabled_drives:
                 self._start_brake_release(
-                    i, now_ns, is_enabled=i in drives_on, angle_rad=angle, limit_nm=float(command.limits_nm[i])
+                    i, now_ns, is_enabled=i in enabled_drives, angle_rad=angle, limit_nm=float(command.limits_nm[i])
                 )
                 if self._is_brake_releasing(i, now_ns):
                     holding_drives.add(i)
             else:
                 self._start_brake_engagement(i, now_ns, angle_rad=angle)
-                if self._is_brake_engaging(i, now_ns) and i in drives_on and not command.emergency:
+                if self._is_brake_engaging(i, now_ns) and i in enabled_drives and not command.emergency:
                     holding_drives.add(i)
-        released = frozenset(
+        drives_to_release = frozenset(
             i for i, release_start_ns in enumerate(self._release_start_ns) if release_start_ns is not None
         )
-        return BrakePlan(self._replace_with_hold_setpoints(command, holding_drives), released)
+        return BrakePlan(self._replace_with_hold_setpoints(command, holding_drives), drives_to_release)
 
     def _start_brake_release(self, i: int, now_ns: int, *, is_enabled: bool, angle_rad: float, limit_nm: float) -> None:
         self._engage_start_ns[i] = None

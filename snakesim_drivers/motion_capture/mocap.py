@@ -99,11 +99,11 @@ class MocapReceiver:
             ConfigError: The address cannot be used.
         """
         self._socket = _open_socket(address, setting)
-        self._clock = clock
+        self._to_driver_time_ns = clock
         self._setting = setting
-        self._delay_ns = round(delay_s * 1e9)
+        self._min_latency_ns = round(delay_s * 1e9)
         self._decoder = msgspec.json.Decoder(MocapSample)
-        self._times = CaptureTimes()
+        self._capture_times = CaptureTimes()
         self._logged_jump_count = 0  # of the other clock, as far as they were logged
         self._last_sample: MocapSample | None = None
         self._last_timestamp_ns = -1  # of the newest pose that was returned, in robot time
@@ -120,28 +120,31 @@ class MocapReceiver:
 
         Args:
             tick: Number of the control cycle, which is stored in the pose.
-            timestamp_ns: Current robot time.
+            timestamp_ns: Current robot time, the time of the control cycle, which starts at 0.
 
         Returns:
-            The pose; None if no valid pose has arrived, its velocity is unknown, or it was captured before the robot's
-            time began.
+            The pose; None if no valid pose has arrived, its velocity is unknown, or it was captured before
+            robot time 0.
 
         Raises:
             BackendError: The socket has failed.
         """
-        now_ns = self._clock(timestamp_ns)
+        # `now_ns` is of the driver's clock, `sample.timestamp_ns` of the clock of the motion-capture system.
+        now_ns = self._to_driver_time_ns(timestamp_ns)
         sample = self._find_newest_sample(now_ns)
         if sample is None:
             return None
+        # Stored first: a sample without a velocity is the reference for the velocity of the next one.
         previous = self._last_sample
         self._last_sample = sample
-        velocities = self._find_or_derive_velocities(previous, sample)
+        velocities = self._get_or_derive_velocities(previous, sample)
         if velocities is None:
             return None
-        age_ns = self._times.compute_lateness_ns(sample.timestamp_ns, now_ns) + self._delay_ns
-        if age_ns > timestamp_ns:  # captured before the robot's time began
+        age_ns = self._capture_times.compute_lateness_ns(sample.timestamp_ns, now_ns) + self._min_latency_ns
+        if age_ns > timestamp_ns:  # captured before robot time 0
             return None
-        # A late control cycle makes poses that arrived meanwhile seem older. Each was captured after the one before.
+        # A late control cycle makes poses that arrived meanwhile seem older. But each pose was captured after the one
+        # before, so timestamps must increase.
         self._last_timestamp_ns = max(timestamp_ns - age_ns, self._last_timestamp_ns + 1)
         velocity_w, angular_velocity_w = velocities
         return Pose(
@@ -157,7 +160,9 @@ class MocapReceiver:
         """Stop listening, and log the rejected datagrams."""
         if self.rejected_count_by_reason:
             counts = ", ".join(f"{count} {reason}" for reason, count in self.rejected_count_by_reason.most_common())
-            _log.warning("pose: datagrams rejected: %s; its clock jumped %d times", counts, self._times.jump_count)
+            _log.warning(
+                "pose: datagrams rejected: %s; its clock jumped %d times", counts, self._capture_times.jump_count
+            )
         self._socket.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
@@ -170,14 +175,14 @@ class MocapReceiver:
         """
         samples = self._read_samples()
         newest: MocapSample | None = None
-        rejections = self._times.check_timestamps([sample.timestamp_ns for sample in samples], now_ns)
+        rejections = self._capture_times.check_timestamps([sample.timestamp_ns for sample in samples], now_ns)
         for sample, rejection in zip(samples, rejections, strict=True):
             if rejection is None:
                 newest = sample
             else:
                 self._count_rejection(rejection, f"timestamp_ns = {sample.timestamp_ns}")
-        if self._times.jump_count != self._logged_jump_count:
-            self._logged_jump_count = self._times.jump_count
+        if self._capture_times.jump_count != self._logged_jump_count:
+            self._logged_jump_count = self._capture_times.jump_count
             self._last_sample = None
             _log.warning("pose: the clock of the motion-capture system has jumped; its new time is accepted")
         return newest
@@ -218,7 +223,7 @@ class MocapReceiver:
         if self.rejected_count_by_reason[reason] == 1:
             _log.warning("pose: first %s datagram: %s; more are only counted", reason, detail)
 
-    def _find_or_derive_velocities(
+    def _get_or_derive_velocities(
         self, previous: MocapSample | None, sample: MocapSample
     ) -> tuple[q.Vector, q.Vector] | None:
         """Return linear and angular velocity in the world, as sent or as derived from two poses; None if impossible."""

@@ -150,7 +150,7 @@ class BodyLocator:
         """Read the links of a robot."""
         self._nodes = ForwardKinematics(robot)
         masses_kg = np.array([link.mass_kg for link in robot.links])
-        self._mass_ratios = masses_kg / masses_kg.sum()  # (n_links,), of the whole
+        self._mass_fractions = masses_kg / masses_kg.sum()  # (n_links,), of the whole
 
     def compute_body_positions(self, poses: Floats, angles_rad: Floats) -> tuple[Floats, Floats]:
         """Compute the body points and the centers of mass of n robots.
@@ -166,5 +166,5 @@ class BodyLocator:
         # The mass of every link is at its middle. The last link reaches from its origin to the head.
         origins_w = body_points_w[:, :-1, :2]
         middles_w = 0.5 * (origins_w[:, 1:] + origins_w[:, :-1])
-        last_moments_w = self._mass_ratios[-1] * 0.5 * (origins_w[:, -1] + body_points_w[:, -1, :2])
-        return body_points_w, self._mass_ratios[:-1] @ middles_w + last_moments_w
+        last_moments_w = self._mass_fractions[-1] * 0.5 * (origins_w[:, -1] + body_points_w[:, -1, :2])
+        return body_points_w, self._mass_fractions[:-1] @ middles_w + last_moments_w

@@ -57,7 +57,7 @@ class JointCheck(Controller[JointCheckParameters]):
 
         # The joint under test.
         self._joint_index = 0
-        self._remaining_sides: list[int] = []  # the sides to which it still has to move: +1, -1
+        self._remaining_directions: list[int] = []  # directions in which it still has to move: +1, -1
         self._angle_before_motion_rad = 0.0  # measured before the motion; a drive without current may have let it sink
 
         # Its current motion.
@@ -68,8 +68,8 @@ class JointCheck(Controller[JointCheckParameters]):
     def update(self, observation: Observation) -> ControllerCommand:
         """Return position targets that move the joint under test, while all others hold their start angles.
 
-        Each joint in turn rests, moves out until its encoder shows the motion, and moves back; then the same to the
-        other side. After the last joint, all joints hold.
+        Each joint in turn rests, moves out until its encoder shows the motion, and moves back; then in the other
+        direction. After the last joint, all joints hold.
 
         Args:
             observation: The inputs of this tick; the first one sets the start angles.
@@ -79,7 +79,7 @@ class JointCheck(Controller[JointCheckParameters]):
         """
         if not self._start_angles_rad:
             self._start_angles_rad = list(observation.joints.angle_rad)
-            self._remaining_sides = self._plan_sides(self._joint_index)
+            self._remaining_directions = self._plan_directions(self._joint_index)
         if self._joint_index == len(self.robot.joints):
             return self._hold_pose("every joint was moved")
         name = self.robot.joints[self._joint_index].name
@@ -91,9 +91,10 @@ class JointCheck(Controller[JointCheckParameters]):
                 self._move_out(observation)
             case _MotionPhase.MOVE_BACK:
                 self._move_back(observation)
+        # The call above may have ended the motion in the last direction of this joint; then the joint holds.
         targets_rad = list(self._start_angles_rad)
-        if self._joint_index < len(targets_rad) and self._remaining_sides:
-            targets_rad[self._joint_index] += self._remaining_sides[0] * self._target_offset_rad
+        if self._joint_index < len(targets_rad) and self._remaining_directions:
+            targets_rad[self._joint_index] += self._remaining_directions[0] * self._target_offset_rad
         return ControllerCommand(
             make_position_setpoints(self.robot, targets_rad),
             Telemetry(reason=f"moving {name}", reference_rad=targets_rad),
@@ -109,7 +110,7 @@ class JointCheck(Controller[JointCheckParameters]):
         if self._rest_elapsed_s < self.parameters.rest_s:
             return
         self._rest_elapsed_s = 0.0
-        if not self._remaining_sides:
+        if not self._remaining_directions:
             self._start_joint(self._joint_index + 1)
             if self._joint_index == len(self.robot.joints):
                 return
@@ -120,54 +121,55 @@ class JointCheck(Controller[JointCheckParameters]):
         """Select the joint to test next. An index equal to the number of joints means that all have been tested."""
         self._joint_index = joint_index
         if joint_index < len(self.robot.joints):
-            self._remaining_sides = self._plan_sides(joint_index)
+            self._remaining_directions = self._plan_directions(joint_index)
 
     def _move_out(self, observation: Observation) -> None:
         """Move the target away from the start angle, and decide whether the joint has moved far enough or is stuck.
 
         A joint that has moved by `move_rad` moves back next. A joint whose target has reached the maximum offset
-        without that counts as stuck: its target moves back, and it is not moved to the other side.
+        without that counts as stuck: its target moves back, and it is not moved in the other direction.
         """
         parameters = self.parameters
         self._target_offset_rad += parameters.speed_rad_s * observation.period_s
         moved_rad = abs(observation.joints.angle_rad[self._joint_index] - self._angle_before_motion_rad)
         max_offset_rad = min(
-            parameters.give_up_rad, self._compute_free_range_rad(self._joint_index, self._remaining_sides[0])
+            parameters.give_up_rad, self._compute_free_range_rad(self._joint_index, self._remaining_directions[0])
         )
         if moved_rad >= parameters.move_rad:
             self._phase = _MotionPhase.MOVE_BACK
         elif self._target_offset_rad >= max_offset_rad:
-            # A joint that does not follow is not moved to the other side.
-            del self._remaining_sides[1:]
+            # A joint that does not follow is not moved in the other direction.
+            del self._remaining_directions[1:]
             self._phase = _MotionPhase.MOVE_BACK
 
     def _move_back(self, observation: Observation) -> None:
-        """Move the target back towards the start angle; there, the motion to this side is complete."""
+        """Move the target back towards the start angle; there, the motion in this direction is complete."""
         self._target_offset_rad -= self.parameters.speed_rad_s * observation.period_s
         if self._target_offset_rad <= 0:
             self._target_offset_rad = 0.0
-            del self._remaining_sides[0]
+            del self._remaining_directions[0]
             self._phase = _MotionPhase.REST
 
-    def _plan_sides(self, joint_index: int) -> list[int]:
-        """Return the sides to which a joint is moved in order, +1 or -1: first away from its nearer limit.
+    def _plan_directions(self, joint_index: int) -> list[int]:
+        """Return the directions in which a joint is moved in order, +1 or -1: first away from its nearer limit.
 
-        The other side is left out if the joint has too little range there.
+        The other direction is left out if the joint has too little range in it.
         """
         limits = self.robot.joints[joint_index]
         is_nearer_to_minimum = 2 * self._start_angles_rad[joint_index] <= limits.angle_min_rad + limits.angle_max_rad
-        away_side = 1 if is_nearer_to_minimum else -1
+        away_direction = 1 if is_nearer_to_minimum else -1
         has_room = (
-            self._compute_free_range_rad(joint_index, -away_side) > self.parameters.move_rad + JOINT_LIMIT_MARGIN_RAD
+            self._compute_free_range_rad(joint_index, -away_direction)
+            > self.parameters.move_rad + JOINT_LIMIT_MARGIN_RAD
         )
         if has_room:
-            return [away_side, -away_side]
-        return [away_side]
+            return [away_direction, -away_direction]
+        return [away_direction]
 
-    def _compute_free_range_rad(self, joint_index: int, side: int) -> float:
-        """Return the angle in rad by which a joint's target may move from its start angle to a side, +1 or -1."""
+    def _compute_free_range_rad(self, joint_index: int, direction: int) -> float:
+        """Return the angle in rad by which a joint's target may move from its start angle in a direction, +1 or -1."""
         limits = self.robot.joints[joint_index]
         start_rad = self._start_angles_rad[joint_index]
-        if side > 0:
+        if direction > 0:
             return limits.angle_max_rad - start_rad - JOINT_LIMIT_MARGIN_RAD
         return start_rad - limits.angle_min_rad - JOINT_LIMIT_MARGIN_RAD

@@ -84,7 +84,7 @@ class ObstacleAnchors:
             point_index = int(nearest_points[obstacle])
             gap_m = float(gaps_m[point_index, obstacle])
             is_sunk = gap_m < 0.0
-            is_pushed = self._sum_pushing_forces_n(body, contacts, point_index, normal_w) > MIN_FORCE_N
+            is_pushed = self._sum_pushing_contact_forces(body, contacts, point_index, normal_w) > MIN_FORCE_N
             if not is_sunk and not is_pushed:
                 continue
             measured_gaps_m.append(gap_m)
@@ -101,26 +101,26 @@ class ObstacleAnchors:
         points_w = body.origins_w[:, None, :2] + self._point_fractions[:, None] * links[:, None]
         return points_w.reshape(-1, 2)
 
-    def _sum_pushing_forces_n(
+    def _sum_pushing_contact_forces(
         self, body: BodyFrames, contacts: Sequence[Contact], point_index: int, normal_w: Floats
     ) -> float:
         """Sum the contact forces near a point of the body that push the body away from an obstacle.
 
         Args:
             body: Frames of the links.
-            contacts: Contacts of the links, in the frames of the links.
+            contacts: Contacts of the links. `position_l`, `normal_l` and `force_l` are in the frame of the link.
             point_index: Index of the point among those of `_sample_axis_w`.
-            normal_w: (2,) unit vector from the obstacle to the body.
+            normal_w: (2,) unit vector in the world frame from the obstacle to the body.
 
         Returns:
             Sum of the magnitudes of these forces in N.
         """
-        point_position_links = (point_index + 0.5) / POINTS_PER_LINK  # along the body, in link lengths
+        point_position_in_links = (point_index + 0.5) / POINTS_PER_LINK  # distance from the tail end, in link lengths
         forces_n: list[float] = []
         for contact in contacts:
-            contact_position_links = contact.link + contact.position_l[0] / self._lengths_m[contact.link]
+            contact_position_in_links = contact.link + contact.position_l[0] / self._lengths_m[contact.link]
             contact_normal_w = (body.rotations[contact.link] @ np.array(contact.normal_l))[:2]
-            is_near = abs(contact_position_links - point_position_links) < MAX_CONTACT_DISTANCE_LINKS
+            is_near = abs(contact_position_in_links - point_position_in_links) < MAX_CONTACT_DISTANCE_LINKS
             if is_near and float(contact_normal_w @ normal_w) > 0.0:
                 forces_n.append(math.hypot(*contact.force_l))
         return math.fsum(forces_n)

@@ -222,11 +222,11 @@ def _complete_boxes(points: _RotatedPoints, weights: Floats, yaw_rad: Floats, fa
     the axes of the box; the center is then rotated into the world.
 
     Args:
-        points: Points of b obstacles, in the axes of the one fitted box of each (h = 1).
-        weights: (b, p) information of the points in 1 / m²; 0 for padding.
+        points: Points of b obstacles, in the axes of the fitted box of each obstacle, for h = 1 candidate yaw angle.
+        weights: (b, p) inverse variances of the points in 1 / m²; 0 for padding.
         yaw_rad: (b,) fitted yaw angles.
         faces: Positions of the four faces, (b, 1) each in m.
-        fit_cost: (b,) sum of the weighted squared distances of the points from the faces.
+        fit_cost: (b,) sum of the weighted squared distances of the points from the faces, which is stored in the boxes.
 
     Returns:
         The b boxes, with their centers in the world and the standard deviations of their sizes.
@@ -237,25 +237,26 @@ def _complete_boxes(points: _RotatedPoints, weights: Floats, yaw_rad: Floats, fa
     longest_m = np.maximum(extent_x_m, extent_y_m)
     is_wall = longest_m > MIN_WALL_LENGTH_M
     assumed_depth_m = np.where(is_wall, WALL_THICKNESS_M, ASSUMED_DEPTH_M)  # of a box of which one face was seen
-    center_m = np.empty((len(yaw_rad), 2))  # along the yaw direction and across it
-    half_m = np.empty((len(yaw_rad), 2))
-    sd_m = np.empty((len(yaw_rad), 2))
+    center_box_m = np.empty((len(yaw_rad), 2))  # along the yaw direction and across it
+    half_m = np.empty((len(yaw_rad), 2))  # half of the size
+    end_sd_m = np.empty((len(yaw_rad), 2))
     for axis in (0, 1):
-        low_end_m, high_end_m, sd_m[:, axis] = _find_box_ends(axis, extents, faces, assumed_depth_m)
-        center_m[:, axis] = 0.5 * (low_end_m + high_end_m)
+        low_end_m, high_end_m, end_sd_m[:, axis] = _find_box_ends(axis, extents, faces, assumed_depth_m)
+        center_box_m[:, axis] = 0.5 * (low_end_m + high_end_m)
         half_m[:, axis] = np.maximum(0.5 * (high_end_m - low_end_m), MIN_HALF_SIZE_M)
 
     # Rotate the centers from the axes of the boxes into the world.
     cosine = np.cos(yaw_rad)
     sine = np.sin(yaw_rad)
-    center_x = cosine * center_m[:, 0] - sine * center_m[:, 1]
-    center_y = sine * center_m[:, 0] + cosine * center_m[:, 1]
+    center_x = cosine * center_box_m[:, 0] - sine * center_box_m[:, 1]
+    center_y = sine * center_box_m[:, 0] + cosine * center_box_m[:, 1]
     return Boxes(
         center_w=np.stack([center_x, center_y], axis=1),
         yaw_rad=yaw_rad,
         half_m=half_m,
-        center_sd_m=sd_m,
-        half_size_sd_m=sd_m.copy(),
+        # Center and half size are half the sum and half the difference of the two ends: same standard deviation.
+        center_sd_m=end_sd_m,
+        half_size_sd_m=end_sd_m.copy(),
         fit_cost=fit_cost,
         seen_face_count=np.sum(extents.is_seen, axis=0),
     )

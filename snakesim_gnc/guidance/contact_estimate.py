@@ -123,33 +123,46 @@ def estimate_pushes(
     return _merge_pushes(chain, candidate_pushes, forces_n[1:], force_covariance[1:, 1:])
 
 
+class _CandidatePosition(NamedTuple):
+    """A position on the skin at which an obstacle may push."""
+
+    link: int
+    side: int  # LEFT_SIDE, RIGHT_SIDE or HEAD_TIP
+    end_fraction: float  # 0.0 at the rear end of the link, 1.0 at its front end
+
+
 def _list_candidate_pushes(chain: ChainDynamics) -> list[_CandidatePush]:
     """Return a push of 1 N at every candidate position, with its generalized force in the equations of motion.
 
-    The places are on both sides of both ends of each link, and on the tip of the head.
+    Candidate positions are on both sides of both ends of each link, and on the tip of the head. Suffix `_l` is the
+    frame of the link, suffix `_b` the frame of the base.
 
     Args:
-        chain: Lengths, radii and frames of the links.
+        chain: Lengths, radii, positions and rotations of the links, and the Jacobians of points on them.
+
+    Returns:
+        The pushes, from the tail to the head.
     """
     last_link = len(chain.rear_b) - 1
-    candidates: list[tuple[int, int, float]] = []  # link, side, and end: 0.0 rear, 1.0 front
+    candidates: list[_CandidatePosition] = []
     for link in range(last_link + 1):
         for side in (LEFT_SIDE, RIGHT_SIDE):
-            candidates += [(link, side, 0.0), (link, side, 1.0)]
-    candidates.append((last_link, HEAD_TIP, 1.0))
+            candidates += [_CandidatePosition(link, side, 0.0), _CandidatePosition(link, side, 1.0)]
+    candidates.append(_CandidatePosition(last_link, HEAD_TIP, 1.0))
 
-    links = np.array([link for link, _, _ in candidates])
-    end_fractions = np.array([end for _, _, end in candidates])
-    outward_l = np.array([_get_outward_normal_l(side) for _, side, _ in candidates])
+    links = np.array([candidate.link for candidate in candidates])
+    end_fractions = np.array([candidate.end_fraction for candidate in candidates])
+    outward_l = np.array([_get_outward_normal_l(candidate.side) for candidate in candidates])
     distances_from_rear_m = end_fractions * chain.lengths_m[links]
-    skin_l = distances_from_rear_m[:, None] * [1.0, 0.0, 0.0] + chain.radii_m[links, None] * outward_l
+    surface_points_l = distances_from_rear_m[:, None] * [1.0, 0.0, 0.0] + chain.radii_m[links, None] * outward_l
     base_from_link = chain.frames[links]
-    points_b = chain.rear_b[links] + np.einsum("kij,kj->ki", base_from_link, skin_l)
+    # Rotate the vector of each candidate from the frame of its link to that of the base.
+    points_b = chain.rear_b[links] + np.einsum("kij,kj->ki", base_from_link, surface_points_l)
     forces_b = -np.einsum("kij,kj->ki", base_from_link, outward_l)
     generalized_forces = chain.compute_generalized_forces(links, points_b, forces_b)
     return [
-        _CandidatePush(link, side, distance_m, generalized_force)
-        for (link, side, _), distance_m, generalized_force in zip(
+        _CandidatePush(candidate.link, candidate.side, distance_m, generalized_force)
+        for candidate, distance_m, generalized_force in zip(
             candidates, distances_from_rear_m.tolist(), generalized_forces.T, strict=True
         )
     ]

@@ -41,7 +41,7 @@ class SurveyedWorld:
         self._half_lengths_m = 0.5 * np.array(self._lengths_m)
         self._link_rear_s_m = np.concatenate(([0.0], np.cumsum(self._lengths_m)))[:-1]
         masses_kg = np.array([link.mass_kg for link in robot.links])
-        self._mass_ratios = masses_kg / masses_kg.sum()
+        self._mass_fractions = masses_kg / masses_kg.sum()
         # The map.
         self._known_obstacles = list(known_obstacles)
         self._outlines = Outlines.from_obstacles(known_obstacles)
@@ -53,15 +53,18 @@ class SurveyedWorld:
         Args:
             tick: Tick of the clock.
             now_ns: Robot time of the clock. The confidence decreases with the age of the pose.
-            joints: The newest joint state; the world model gets its timestamp.
+            joints: The newest joint state; the world model gets the timestamp of this sample.
             contacts: Contacts in the frames of the links; None if there is no contact sensor.
             pose: Pose of the base from its sensor.
+
+        Returns:
+            The world model.
         """
         rotation = rotation_from_quaternion(pose.orientation_wxyz)
-        origins_w, rotations = compute_link_frames(
+        link_origins_w, rotations = compute_link_frames(
             pose.position_w, rotation, joints.angle_rad, self._axes, self._lengths_m
         )
-        middles_w = origins_w + self._half_lengths_m[:, None] * rotations[:, :, 0]
+        link_centers_w = link_origins_w + self._half_lengths_m[:, None] * rotations[:, :, 0]
         pose_age_s = max(now_ns - pose.timestamp_ns, 0) * 1e-9
         return World(
             tick=tick,
@@ -69,13 +72,13 @@ class SurveyedWorld:
             base_position_w=pose.position_w,
             base_orientation_wxyz=pose.orientation_wxyz,
             base_confidence=math.exp(-pose_age_s / POSE_CONFIDENCE_DECAY_TIME_S),
-            contacts=self._transform_contacts(contacts, origins_w, rotations),
-            obstacles=self._find_obstacles_near_body(origins_w),
+            contacts=self._transform_contacts(contacts, link_origins_w, rotations),
+            obstacles=self._find_obstacles_near_body(link_origins_w),
             pose_timestamp_ns=pose.timestamp_ns,
             pose_from="sensor",
             contacts_timestamp_ns=None if contacts is None else contacts.timestamp_ns,
             contacts_from=None if contacts is None else "sensor",
-            center_w=tuple((self._mass_ratios @ middles_w).tolist()),
+            center_w=tuple((self._mass_fractions @ link_centers_w).tolist()),
         )
 
     def _transform_contacts(
@@ -118,7 +121,7 @@ class SurveyedWorld:
     def _find_obstacles_near_body(self, origins_w: Floats) -> list[Obstacle]:
         """Return the known obstacles within the map radius of the links' origins (n, 3)."""
         x, y = (self._outlines.center_w[:, None] - origins_w[:, :2]).transpose(2, 0, 1)
-        gaps_m = np.hypot(x, y).min(axis=1) - self._outlines.reach_m
+        gaps_m = np.hypot(x, y).min(axis=1) - self._outlines.bounding_radius_m
         return [self._known_obstacles[index] for index in np.flatnonzero(gaps_m < self._map_radius_m)]
 
 

@@ -324,7 +324,7 @@ class ObstacleMap:
         pairs: list[tuple[Track, Track]] = []
         for track in seen_tracks:
             offset = outlines.center_w - track.center_w
-            apart_m = np.hypot(offset[:, 0], offset[:, 1]) - outlines.reach_m
+            apart_m = np.hypot(offset[:, 0], offset[:, 1]) - outlines.bounding_radius_m
             size_m = max(track.radius_m, float(track.half_size_m.max()))
             for index in np.flatnonzero(apart_m < size_m + BASE_GATE_M):
                 other = self.tracks[index]

@@ -57,7 +57,7 @@ class PerceivedWorld:
         lengths_m = np.array([link.length_m for link in robot.links])
         masses_kg = np.array([link.mass_kg for link in robot.links])
         self._half_lengths_m = 0.5 * lengths_m
-        self._mass_ratios = masses_kg / masses_kg.sum()
+        self._mass_fractions = masses_kg / masses_kg.sum()
         self._link_rear_s_m = np.concatenate(([0.0], np.cumsum(lengths_m)))[:-1]
         self._radius_m = max(link.radius_m for link in robot.links)
 
@@ -179,7 +179,7 @@ class PerceivedWorld:
             obstacles=self.map.list_obstacles(now_ns, base.z_m - self._radius_m),
             pose_timestamp_ns=localizer.pose_timestamp_ns,
             contacts_timestamp_ns=contacts_timestamp_ns,
-            center_w=tuple((self._mass_ratios @ middles_w).tolist()),
+            center_w=tuple((self._mass_fractions @ middles_w).tolist()),
             base_position_sd_m=min(localizer.position_sd_m, MAX_POSITION_SD_M),
             base_yaw_sd_rad=min(localizer.yaw_sd_rad, MAX_YAW_SD_RAD),
             depth_timestamp_ns=self.depth_timestamp_ns,

@@ -115,34 +115,41 @@ def estimate_angular_velocities(chain: ChainDynamics, velocities_rad_s: Sequence
 def estimate_accelerations(chain: ChainDynamics, angular_velocities_rad_s: Floats, imu: Imu) -> tuple[Floats, Floats]:
     """Estimate the acceleration of the tail end (x, y) and the angular acceleration of each of the n + 1 links.
 
-    Linear least squares over all accelerometers, with a prior: the motion of the links is coupled by the joints, so
-    that accelerometers correct one another. Without an IMU the result is the prior.
+    n is the number of joints. Linear least squares over all accelerometers, with a prior: the motion of the links is
+    coupled by the joints, so that accelerometers correct one another. Without an IMU the result is the prior.
 
     Args:
         chain: Lengths and frames of the links.
         angular_velocities_rad_s: (n + 1,) angular velocities of the links.
-        imu: Specific forces of some links, or of none.
+        imu: Specific forces of some links, or of none. Its field `link` is the list of the indices of these links.
 
     Returns:
-        The motion (n + 3,), and a matrix root (n + 3, n + 3) of its covariance.
+        The accelerations (n + 3,), those of the tail end first, and the lower Cholesky factor (n + 3, n + 3) of their
+        covariance.
     """
     unknown_count = len(angular_velocities_rad_s) + 2
-    model = _make_acceleration_model(chain, angular_velocities_rad_s)[:, imu.link].reshape(
+    jacobian_and_bias = _make_acceleration_model(chain, angular_velocities_rad_s)[:, imu.link].reshape(
         2 * len(imu.link), unknown_count + 1
     )
-    jacobian = model[:, :-1]
-    measured_l = np.reshape(imu.acceleration_m_s2, (-1, 3))
-    measured = np.einsum("kij,kj->ki", chain.frames[imu.link], measured_l)[:, :2].T.ravel()
-    tail_sd_m_s2 = TAIL_ACCELERATION_PRIOR_SD_WITHOUT_IMU_M_S2
-    angular_sd_rad_s2 = ANGULAR_ACCELERATION_PRIOR_SD_WITHOUT_IMU_RAD_S2
-    if imu.link:
+    jacobian = jacobian_and_bias[:, :-1]
+    bias_m_s2 = jacobian_and_bias[
+        :, -1
+    ]  # centripetal accelerations of the sensors, without any of the unknown accelerations
+    # Rows are ordered as in the Jacobian: x of all sensors, then y of all sensors.
+    specific_forces_l = np.reshape(imu.acceleration_m_s2, (-1, 3))
+    planar_specific_forces = np.einsum("kij,kj->ki", chain.frames[imu.link], specific_forces_l)[:, :2].T.ravel()
+    has_imu = len(imu.link) > 0
+    if has_imu:
         tail_sd_m_s2 = TAIL_ACCELERATION_PRIOR_SD_M_S2
         angular_sd_rad_s2 = ANGULAR_ACCELERATION_PRIOR_SD_RAD_S2
+    else:
+        tail_sd_m_s2 = TAIL_ACCELERATION_PRIOR_SD_WITHOUT_IMU_M_S2
+        angular_sd_rad_s2 = ANGULAR_ACCELERATION_PRIOR_SD_WITHOUT_IMU_RAD_S2
     prior_sd = np.append(np.full(2, tail_sd_m_s2), np.full(len(angular_velocities_rad_s), angular_sd_rad_s2))
     precision = jacobian.T @ jacobian / ACCELERATION_SD_M_S2**2 + np.diag(prior_sd**-2.0)
     covariance = np.linalg.inv(precision)
-    motion = covariance @ jacobian.T @ (measured - model[:, -1]) / ACCELERATION_SD_M_S2**2
-    return motion, np.asarray(np.linalg.cholesky(covariance), np.float64)
+    accelerations = covariance @ jacobian.T @ (planar_specific_forces - bias_m_s2) / ACCELERATION_SD_M_S2**2
+    return accelerations, np.asarray(np.linalg.cholesky(covariance), np.float64)
 
 
 def _make_acceleration_model(chain: ChainDynamics, angular_velocities_rad_s: Floats) -> Floats:

@@ -45,7 +45,7 @@ class ObstacleGrid:
     """
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
-        for _ in self._fill_in_steps(obstacles):
+        for _ in self._compute_nearest_obstacles_incrementally(obstacles):
             pass
 
     @classmethod
@@ -56,11 +56,13 @@ class ObstacleGrid:
             The cost of the next step in nodes, before doing it. See `beam`.
         """
         grid = cls.__new__(cls)
-        yield from grid._fill_in_steps(obstacles)
+        yield from grid._compute_nearest_obstacles_incrementally(obstacles)
         return grid
 
-    def _fill_in_steps(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
-        """Compute the nearest obstacle of each cell, in steps that a planner can spread over several ticks.
+    def _compute_nearest_obstacles_incrementally(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
+        """Compute the distance field: the nearest obstacle of each cell, and its distance.
+
+        The computation is a generator, whose steps a planner can spread over several ticks.
 
         Each obstacle is written into the cells within MAX_DISTANCE_M of its outline that have no nearer obstacle.
 
@@ -68,7 +70,7 @@ class ObstacleGrid:
             obstacles: The obstacles of the map.
 
         Yields:
-            The cost of the next step in nodes of the search, before the step.
+            Cost of the following step, in units of one expanded node of the path search.
         """
         self.obstacles = list(obstacles)
         self.outlines = Outlines.from_obstacles(self.obstacles)
@@ -76,17 +78,20 @@ class ObstacleGrid:
             self._fill_empty()
             return
         outlines = self.outlines
-        influence_radius_m = outlines.reach_m + MAX_DISTANCE_M
+        influence_radius_m = outlines.bounding_radius_m + MAX_DISTANCE_M
         self.min_corner_w = (outlines.center_w - influence_radius_m[:, None]).min(axis=0)
         max_corner_w = (outlines.center_w + influence_radius_m[:, None]).max(axis=0)
-        columns, rows = (np.ceil((max_corner_w - self.min_corner_w) / CELL_M).astype(int) + 1).tolist()
-        self.shape = (columns, rows)
-        self.cell_nearest = np.full(columns * rows, NO_OBSTACLE, dtype=np.int64)
-        self.cell_distance_m = np.full(columns * rows, MAX_DISTANCE_M)
+        # One more cell, so that the corner itself has one.
+        column_count, row_count = (np.ceil((max_corner_w - self.min_corner_w) / CELL_M).astype(int) + 1).tolist()
+        self.shape = (column_count, row_count)
+        self.nearest_obstacle_by_cell = np.full(column_count * row_count, NO_OBSTACLE, dtype=np.int64)
+        self.cell_distance_m = np.full(column_count * row_count, MAX_DISTANCE_M)
+        # Writes one obstacle into a window of cells: compiled, or the same in Python.
         mark_obstacle = self._choose_marking_function()
         for index, (center_w, radius_m) in enumerate(zip(outlines.center_w, influence_radius_m, strict=True)):
             if index % OBSTACLES_PER_STEP == 0:
                 yield NODE_COST_PER_OBSTACLE * min(OBSTACLES_PER_STEP, len(outlines) - index)
+            # The last cell is exclusive: + 1 because `astype` rounds down, + 1 for a cell of margin.
             first_cell = np.maximum(((center_w - radius_m - self.min_corner_w) / CELL_M).astype(int), 0)
             last_cell = np.minimum(((center_w + radius_m - self.min_corner_w) / CELL_M).astype(int) + 2, self.shape)
             mark_obstacle(index, first_cell, last_cell)
@@ -95,7 +100,7 @@ class ObstacleGrid:
         """Make a grid of one cell, which is free."""
         self.min_corner_w = np.zeros(2)
         self.shape = (1, 1)
-        self.cell_nearest = np.full(1, NO_OBSTACLE, dtype=np.int64)
+        self.nearest_obstacle_by_cell = np.full(1, NO_OBSTACLE, dtype=np.int64)
         self.cell_distance_m = np.full(1, MAX_DISTANCE_M)
 
     def _choose_marking_function(self) -> Callable[[int, Ints, Ints], None]:
@@ -121,7 +126,7 @@ class ObstacleGrid:
         to_obstacle_m, _ = self.outlines.compute_distances_and_normals(cells_w, np.full(cells_w.shape[:2], index))
         window = (slice(first_cell[0], last_cell[0]), slice(first_cell[1], last_cell[1]))
         distance_m = self.cell_distance_m.reshape(self.shape)[window]
-        nearest = self.cell_nearest.reshape(self.shape)[window]
+        nearest = self.nearest_obstacle_by_cell.reshape(self.shape)[window]
         is_nearer = to_obstacle_m < distance_m
         distance_m[is_nearer] = to_obstacle_m[is_nearer]
         nearest[is_nearer] = index
@@ -144,7 +149,7 @@ class ObstacleGrid:
         grid.max_distance_m = MAX_DISTANCE_M
         cells = (columns * rows,)
         grid.nearest = memory.get_array_address(
-            "the nearest obstacle of each cell", self.cell_nearest, cells, INTEGER_DTYPE
+            "the nearest obstacle of each cell", self.nearest_obstacle_by_cell, cells, INTEGER_DTYPE
         )
         grid.distance_m = memory.get_array_address("the distance of each cell", self.cell_distance_m, cells)
         grid.center_m = memory.get_array_address("the centers of the obstacles", outlines.center_w, (count, 2))
@@ -170,7 +175,7 @@ class ObstacleGrid:
         """
         shape = np.shape(x)
         is_inside, cell = self._find_cells(x, y)
-        obstacle = np.where(is_inside, self.cell_nearest[cell], NO_OBSTACLE)
+        obstacle = np.where(is_inside, self.nearest_obstacle_by_cell[cell], NO_OBSTACLE)
         distance_m = np.full(shape, MAX_DISTANCE_M)
         normal_w = np.zeros((*shape, 2))
         has_obstacle = obstacle >= 0

@@ -13,7 +13,7 @@ import numpy as np
 from snakesim_gnc.geometry.planar import SPACING_M, resample_evenly
 from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
 from snakesim_gnc.navigation.path_fit import PathFitParameters, fit_path
-from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearchSteps
 from snakesim_gnc.navigation.path_search.search_parameters import MIN_PUSH, STEP_M, SearchParameters
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath
 from snakesim_hal.base.arrays import Floats
@@ -188,7 +188,7 @@ def _get_committed_path(task: PlanningTask, body_length_m: float) -> Floats:
 
 def _search_whole_body(
     beam: BeamSearch, task: PlanningTask, parameters: SearchParameters, heading_rad: float
-) -> PathSearch:
+) -> PathSearchSteps:
     """Search a path for the whole body that changes its shape as little as possible, and on which it can push well.
 
     The search is repeated with wider limits until a path has a good propulsion margin ahead of the head.

@@ -18,7 +18,7 @@ from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Publisher, Query
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import IMAGES
+from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES
 from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status
 
 MAX_QUEUED_ACTIONS = 64  # queued actions; each sends one message, or all messages of a tick; the oldest are dropped
@@ -94,7 +94,7 @@ class Outbox:
         # Threads. Without a camera, images need no thread of their own.
         self._streams = SerialWorker("streams")
         self._answers = SerialWorker("answers")
-        has_camera = any(keys.find_message(sensor.key) in IMAGES for sensor in description.sensors)
+        has_camera = any(keys.find_message(sensor.key) in IMAGE_MESSAGE_TYPES for sensor in description.sensors)
         self._images = SerialWorker("images", MAX_QUEUED_IMAGES) if has_camera else self._streams
         # Latched messages and liveliness tokens.
         session.declare_latched_publisher(keys.DESCRIPTION, Description).put(description)
@@ -111,7 +111,7 @@ class Outbox:
             self._publish(messages)
             return
         if self._images is not self._streams:
-            images = [outgoing for outgoing in messages if isinstance(outgoing[1], IMAGES)]
+            images = [outgoing for outgoing in messages if isinstance(outgoing[1], IMAGE_MESSAGE_TYPES)]
             if images:
                 self._images.submit(lambda: self._publish(images))
                 messages = tuple(outgoing for outgoing in messages if outgoing not in images)

@@ -32,28 +32,31 @@ class _TimeOrigin(NamedTuple):
 
 
 class SimulatedTime:
-    """Pauses the time of one host's robot, and changes its speed. Converts wall time to safety time.
+    """Pauses the time of one host's robot, and changes its speed. Converts monotonic time to safety time.
+
+    Robot time is the time of the simulation: the tick times the control period. Safety time is the time by which the
+    host decides whether commands and the lease have expired; it does not advance while robot time is paused.
 
     If the time of the robot is not simulated, every request is refused, and the time never pauses.
     """
 
     def __init__(self, description: Description, clock_mode: ClockMode, read_monotonic_ns: Callable[[], int]) -> None:
-        """Start with robot time that passes at the speed of wall time.
+        """Initialize the clock; simulated time runs in real time until a client changes its speed.
 
         Args:
             description: Description of the robot.
             clock_mode: Clock mode of the run.
-            read_monotonic_ns: Function that returns the monotonic wall time in ns.
+            read_monotonic_ns: Function that returns the time of a monotonic clock in ns.
         """
         self._description = description
         self._clock_mode = clock_mode
         self._read_monotonic_ns = read_monotonic_ns
         # Requested by clients.
-        self.speed = 1.0  # robot time per wall time; used only in clock mode realtime
-        self.paused_by: str | None = None  # client that has paused the time, or lets single ticks pass
-        self._ticks_until_pause = 0  # only if `paused_by` is set
+        self.speed = 1.0  # simulated time per real time; used only in clock mode realtime
+        self.paused_by: str | None = None  # client that paused or single-steps the clock; None if time passes
+        self._remaining_ticks = 0  # single steps that are still to be made; used only if `paused_by` is set
         # Measured.
-        self.real_time_factor: float | None = None  # robot time per wall time; None if not measured yet
+        self.real_time_factor: float | None = None  # simulated time per real time; None if not measured yet
         self._measurement_start = _TimeOrigin(safety_ns=0, monotonic_ns=read_monotonic_ns(), tick=0)
         # Start of the time with the current pause and speed, from which safety time is extrapolated.
         self._safety_time_origin = _TimeOrigin(safety_ns=0, monotonic_ns=0, tick=0)
@@ -61,14 +64,14 @@ class SimulatedTime:
     @property
     def is_paused(self) -> bool:
         """Return whether robot time is paused: no tick begins."""
-        return self.paused_by is not None and self._ticks_until_pause == 0
+        return self.paused_by is not None and self._remaining_ticks == 0
 
     def safety_ns(self, tick: int, monotonic_ns: int | None = None) -> int:
         """Return the safety time at a moment in a tick, in ns.
 
         Args:
             tick: Tick that contains the moment.
-            monotonic_ns: Monotonic wall time of the moment. None means now.
+            monotonic_ns: Monotonic time of the moment. None means now.
         """
         period_ns = self._description.period_ns
         if self._clock_mode == "lockstep":
@@ -98,14 +101,14 @@ class SimulatedTime:
         match request.action:
             case "pause":
                 self.paused_by = request.requester
-                self._ticks_until_pause = 0
+                self._remaining_ticks = 0
                 return f"paused by {request.requester}, before tick {tick}"
             case "resume":
                 self.paused_by = None
                 return f"resumed by {request.requester}, at tick {tick}"
             case "step":
                 self.paused_by = request.requester
-                self._ticks_until_pause = request.ticks
+                self._remaining_ticks = request.ticks
                 return f"{request.ticks} ticks for {request.requester}, then paused before tick {tick + request.ticks}"
             case "speed":
                 self.speed = request.speed
@@ -136,9 +139,9 @@ class SimulatedTime:
             tick: Tick that comes next.
         """
         self._measure_real_time_factor(tick)
-        if self._ticks_until_pause == 1:
+        if self._remaining_ticks == 1:
             self._restart_safety_time(tick)  # before the pause starts, because safety time passes until now
-        self._ticks_until_pause = max(self._ticks_until_pause - 1, 0)
+        self._remaining_ticks = max(self._remaining_ticks - 1, 0)
 
     def describe_slowness(self) -> list[str]:
         """Return one warning if the requested speed is not reached; an empty list if it is, or if it is 1."""

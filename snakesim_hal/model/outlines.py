@@ -96,7 +96,7 @@ class Outlines:
         )
 
     @cached_property
-    def reach_m(self) -> Floats:
+    def bounding_radius_m(self) -> Floats:
         """Return the distance from each center to the farthest point of its outline, (m,)."""
         return np.hypot(*self.half_m.T) + self.rounding_m
 
@@ -186,7 +186,7 @@ def has_gap_below(single: Outlines, others: Outlines, limit_m: float) -> bool:
     """
     offset_w = others.center_w - single.center_w
     distances_m = np.hypot(offset_w[:, 0], offset_w[:, 1])
-    min_gaps_m = distances_m - others.reach_m - single.reach_m
+    min_gaps_m = distances_m - others.bounding_radius_m - single.bounding_radius_m
     near = np.flatnonzero(min_gaps_m < limit_m + ROUNDING_ERROR_M)
     if not len(near):
         return False

@@ -17,7 +17,7 @@ import msgspec
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Session, do_keys_intersect
+from snakesim_hal.network.session import Session, key_expressions_intersect
 from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, get_reader_depth
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, MessageT, encode, format_encoding
@@ -69,7 +69,7 @@ class LocalNetwork:
         """Return the callbacks of all subscribers of a key."""
         handlers = self._handlers.get(key)
         if handlers is None:
-            handlers = [handler for pattern, handler in self.subscribers if do_keys_intersect(pattern, key)]
+            handlers = [handler for pattern, handler in self.subscribers if key_expressions_intersect(pattern, key)]
             self._handlers[key] = handlers
         return handlers
 
@@ -92,7 +92,7 @@ class LocalNetwork:
         else:
             self.tokens.remove(key)
         for pattern, handler in self.watchers:
-            if do_keys_intersect(pattern, key):
+            if key_expressions_intersect(pattern, key):
                 handler(key, present)
 
 
@@ -194,7 +194,7 @@ class LocalSession(Session):
     def on_latched_arrival(self, key: str, handler: SampleHandler) -> None:
         """Call `handler` as `on_arrival` does, and also for the values that were latched before."""
         for latched_key, arrival in list(self._network.latched.items()):
-            if do_keys_intersect(key, latched_key):
+            if key_expressions_intersect(key, latched_key):
                 handler(arrival)
         self._subscribe(key, handler)
 
@@ -214,7 +214,7 @@ class LocalSession(Session):
         self._network.watchers.append(watcher)
         self._declare(lambda: self._network.watchers.remove(watcher))
         for token in self._network.tokens:
-            if do_keys_intersect(key, token):
+            if key_expressions_intersect(key, token):
                 handler(token, True)
 
     def close(self) -> None:
@@ -233,7 +233,9 @@ class LocalSession(Session):
 
     def send_query(self, pattern: str, request: Message) -> LocalQuery:
         """Send a query to all matching keys, without waiting: the answering part may have to run a cycle first."""
-        matching = [(key, handler) for key, handler in self._network.queryables if do_keys_intersect(pattern, key)]
+        matching = [
+            (key, handler) for key, handler in self._network.queryables if key_expressions_intersect(pattern, key)
+        ]
         query = LocalQuery(len(matching))
         for key, handler in matching:
             handler(Query(key, encode(request), format_encoding(type(request)), query))

@@ -33,10 +33,11 @@ from snakesim_hal.network.endpoint import require_safe_listening_endpoint
 from snakesim_hal.network.image_connection import configure_for_images
 from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, get_reader_depth
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import IMAGES, Decoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message, Preview
 
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
+DONE_KEY_PREFIX = keys.done_key("")  # of the keys on which services report that their tick is done
 POLL_S = 0.01  # between two looks for a latched value
 
 
@@ -83,12 +84,14 @@ class Session:
             The publisher, which is undeclared when this session is closed.
         """
         # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
-        is_last_of_tick = key in (keys.JOINT_COMMAND, keys.CLOCK) or key.startswith(keys.done_key(""))
+        is_last_of_tick = key in (keys.JOINT_COMMAND, keys.CLOCK) or key.startswith(DONE_KEY_PREFIX)
         congestion_control = zenoh.CongestionControl.DROP
         if lossless:
             congestion_control = zenoh.CongestionControl.BLOCK
         session = self._zenoh
-        if message in IMAGES and not lossless:  # in lockstep a clock must not overtake the images that it names
+        if (
+            message in IMAGE_MESSAGE_TYPES and not lossless
+        ):  # in lockstep, images must arrive before the clock of their tick
             session = self._open_image_session()
         publisher = session.declare_publisher(
             key,
@@ -371,7 +374,7 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
         yield session
 
 
-def key_expression(text: str) -> str:
+def normalize_key_expression(text: str) -> str:
     """Return a key that may have wildcards in Zenoh's canonical form.
 
     Raises:
@@ -386,14 +389,14 @@ def key_expression(text: str) -> str:
         ) from None
 
 
-def do_keys_intersect(pattern: str, key: str) -> bool:
+def key_expressions_intersect(pattern: str, key: str) -> bool:
     """Return whether two key expressions match a common key."""
     return zenoh.KeyExpr(pattern).intersects(zenoh.KeyExpr(key))
 
 
 def _choose_priority(key: str, message: type[Message]) -> zenoh.Priority:
     """Return the priority of a stream: commands first, then data, images, and previews of images."""
-    if message in IMAGES:
+    if message in IMAGE_MESSAGE_TYPES:
         return zenoh.Priority.DATA_LOW
     if message is Preview:
         return zenoh.Priority.BACKGROUND

@@ -8,7 +8,7 @@ from typing import Any, Generic
 import msgspec
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import IMAGES, Decoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, Decoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
 
 READER_DEPTH = 256  # samples; a burst of noise on a key must not displace the valid sample
@@ -126,4 +126,4 @@ class Query:
 
 def get_reader_depth(message: type[Message]) -> int:
     """Return how many samples of a stream a reader keeps."""
-    return IMAGES_DEPTH if message in IMAGES else READER_DEPTH
+    return IMAGES_DEPTH if message in IMAGE_MESSAGE_TYPES else READER_DEPTH

@@ -25,7 +25,7 @@ LINK_SIDE_INERTIA_RATIO = 0.1  # of the rotor's inertia: the gear's output stage
 MIN_ROTOR_INERTIA_KG_M2 = 1e-4  # a rotor without inertia could not be integrated
 
 
-def move_rotors_behind_gears(
+def move_rotor_inertia_to_motor_side(
     config: RunConfig, joints: Sequence[Joint], backlash_rad: Mapping[str, float]
 ) -> RunConfig:
     """Return a configuration in which joints with backlash have no friction and only a part of their rotor inertia.
@@ -59,8 +59,8 @@ class BacklashModel(PhysicsModel):
         """Place every rotor at a random angle within its backlash, at rest.
 
         Args:
-            physics_model: Model of the links. It is made from the configuration that `move_rotors_behind_gears` of this
-                module returns, so that the inertia and the friction of these rotors are not simulated twice.
+            physics_model: Model of the links. It is made from the configuration that `move_rotor_inertia_to_motor_side`
+                of this module returns, so that the inertia and the friction of these rotors are not simulated twice.
             joints: Every joint with its true (not nominal) parameters, tail to head.
             backlash_rad: Total backlash, peak to peak, by joint name. Joints that are missing have none.
             seed: Seed of the random start angles of the rotors.

@@ -51,15 +51,15 @@ def make_number_parser(min_value: float, max_value: float, unit: str = "") -> Ca
 
 def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the argument SCENARIO, and the options that change values of the scenario."""
-    add_scenario_name(parser)
+    add_scenario_name_argument(parser)
     parser.add_argument("--backend", metavar="NAME", help="backend, such as sim, can or odrive")
     parser.add_argument("--controller", metavar="NAME", help="installed controller, or ./file.py:Class")
     parser.add_argument(
         "--clock-mode", choices=["realtime", "lockstep", "free"], help="how robot time follows the wall clock"
     )
-    add_duration(parser, "seconds of robot time")
-    add_seed(parser, "default: the scenario's")
-    add_set(parser)
+    add_duration_argument(parser, "seconds of robot time")
+    add_seed_argument(parser, "default: the scenario's")
+    add_set_argument(parser)
     parser.add_argument(
         "--unset",
         action="append",
@@ -69,7 +69,7 @@ def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_scenario_name(parser: argparse.ArgumentParser) -> None:
+def add_scenario_name_argument(parser: argparse.ArgumentParser) -> None:
     """Add the argument SCENARIO, without options that change the scenario."""
     parser.add_argument(
         "scenario",
@@ -78,24 +78,24 @@ def add_scenario_name(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_set(parser: argparse.ArgumentParser, about: str = "change any value of the configuration") -> None:
+def add_set_argument(parser: argparse.ArgumentParser, about: str = "change any value of the configuration") -> None:
     """Add the option --set, with a text for the help."""
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about} (may be repeated)")
 
 
-def add_seed(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
+def add_seed_argument(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
     """Add the option --seed, which fixes every random number, with more text for the help."""
     parser.add_argument(
         "--seed", type=int, default=default, metavar="SEED", help=f"seed of all random numbers ({about})"
     )
 
 
-def add_out(parser: argparse.ArgumentParser, about: str, *, required: bool = False) -> None:
+def add_output_argument(parser: argparse.ArgumentParser, about: str, *, required: bool = False) -> None:
     """Add the option --out, the file or folder that a command writes, with a text for the help."""
     parser.add_argument("--out", type=Path, required=required, metavar="PATH", help=about)
 
 
-def add_duration(
+def add_duration_argument(
     parser: argparse.ArgumentParser, about: str, parse: Callable[[str], float] = float, default: float | None = None
 ) -> None:
     """Add `--duration`, in seconds.
@@ -109,7 +109,7 @@ def add_duration(
     parser.add_argument("--duration", type=parse, default=default, metavar="S", help=about)
 
 
-def add_fields(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
+def add_fields_argument(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
     """Add the option --fields, the number of random fields, with more text for the help."""
     parser.add_argument(
         "--fields",
@@ -120,12 +120,12 @@ def add_fields(parser: argparse.ArgumentParser, about: str, default: int | None 
     )
 
 
-def add_resume(parser: argparse.ArgumentParser) -> None:
+def add_resume_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option that continues what is in `--out`."""
     parser.add_argument("--resume", action="store_true", help="continue with what is in --out")
 
 
-def add_workers(parser: argparse.ArgumentParser) -> None:
+def add_workers_argument(parser: argparse.ArgumentParser) -> None:
     """Add the options --cluster and --workers, which select the processors for runs."""
     parser.add_argument(
         "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
@@ -138,7 +138,7 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_task(parser: argparse.ArgumentParser, about: str) -> None:
+def add_task_argument(parser: argparse.ArgumentParser, about: str) -> None:
     """Add the option --task, which describes a demonstration, with a text for the help."""
     parser.add_argument("--task", metavar="TEXT", help=about)
 
@@ -191,32 +191,32 @@ def add_network_arguments(parser: argparse.ArgumentParser, session: str = f"(def
         metavar="FILE",
         help=f"connect with the settings of a Zenoh session file (JSON5: router, certificates) {session}".rstrip(),
     )
-    add_namespace(parser)
+    add_namespace_argument(parser)
 
 
-def add_namespace(parser: argparse.ArgumentParser) -> None:
+def add_namespace_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option that selects a robot among those on a network."""
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the robot (default: the robot's name)")
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option for output that scripts read."""
     parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
 
 
-def add_insecure(parser: argparse.ArgumentParser) -> None:
+def add_insecure_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option that allows to listen without access control."""
     parser.add_argument(
         "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
     )
 
 
-def add_parent(parser: argparse.ArgumentParser) -> None:
+def add_parent_argument(parser: argparse.ArgumentParser) -> None:
     """Add the hidden option of the processes that `snakesim run` starts."""
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
 
 
-def add_unchecked(parser: argparse.ArgumentParser) -> None:
+def add_unchecked_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option of commands that arm a robot."""
     parser.add_argument(
         "--unchecked",
@@ -236,13 +236,13 @@ def add_host_arguments(parser: argparse.ArgumentParser) -> None:
     """
     add_scenario_arguments(parser)
     add_network_arguments(parser, "")
-    add_insecure(parser)
-    add_out(parser, "folder for the record: black box, description, statistics")
+    add_insecure_argument(parser)
+    add_output_argument(parser, "folder for the record: black box, description, statistics")
     parser.add_argument(
         "--end-after-duration", action="store_true", help="end when the robot was armed for the scenario's duration"
     )
     parser.add_argument("--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too")
-    add_parent(parser)
+    add_parent_argument(parser)
     for flag, kind in (("--memory", str), ("--parent-socket", int), ("--stop-port", int)):
         parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
 
@@ -252,7 +252,7 @@ def add_service_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
     add_scenario_arguments(parser)
     add_network_arguments(parser, "")
-    add_parent(parser)
+    add_parent_argument(parser)
 
 
 def check_network(arguments: argparse.Namespace) -> None:

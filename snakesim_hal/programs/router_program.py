@@ -9,7 +9,12 @@ from dataclasses import replace
 from snakesim_hal.base.process import call_on_stop_signals
 from snakesim_hal.base.terminal import run_tool
 from snakesim_hal.network.session import open_session
-from snakesim_hal.programs.arguments import add_insecure, add_network_arguments, add_parent, add_scenario_arguments
+from snakesim_hal.programs.arguments import (
+    add_insecure_argument,
+    add_network_arguments,
+    add_parent_argument,
+    add_scenario_arguments,
+)
 from snakesim_hal.programs.service_program import ProcessOptions, read_process_options
 
 
@@ -25,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Run a Zenoh router on a run's endpoint.")
     add_scenario_arguments(parser)
     add_network_arguments(parser)
-    add_insecure(parser)
-    add_parent(parser)
+    add_insecure_argument(parser)
+    add_parent_argument(parser)
     arguments = parser.parse_args(argv)
     return run_tool("snakesim start router", lambda: _run_router(read_process_options(arguments, hosts=True)))
 

@@ -14,7 +14,7 @@ Threads: the host's thread records; the writer's thread reads rows with `read_ro
 import hashlib
 import struct
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import msgspec
 import numpy as np
@@ -63,17 +63,21 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
     row_bytes: Annotated[int, Meta(ge=1, le=2**20)]
     columns: list[Column]  # in order; the rest of the row is padding
 
-    @staticmethod
-    def make_for_robot(robot: Description) -> "Layout":
+    @classmethod
+    def for_robot(cls, description: Description) -> Self:
         """Return the layout of a row of the black box for a robot.
 
-        Names of columns contain the units. Position and orientation are those of the tail end in the world frame. A row
+        Names of columns contain the units; that of `target` depends on the mode of the joint: rad, rad/s or N·m.
+        Position and orientation are those of the tail end in the world frame. A row
         is padded to a multiple of ROW_ALIGNMENT_BYTES. `BlackBox` packs rows in this order of columns.
 
         Args:
-            robot: Description of the robot, from which the number and the names of the joints are taken.
+            description: Description of the robot, from which the number and the names of the joints are taken.
+
+        Returns:
+            The layout, with the columns in their order in a row.
         """
-        joint_count = len(robot.joints)
+        joint_count = len(description.joints)
         joint_columns = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
         columns = [
             Column("tick", "<i8"),
@@ -87,8 +91,8 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
         ]
         used_bytes = sum(column.bytes for column in columns)
         padding_bytes = -used_bytes % ROW_ALIGNMENT_BYTES
-        joint_names = [joint.name for joint in robot.joints]
-        return Layout(robot=robot.robot, joints=joint_names, row_bytes=used_bytes + padding_bytes, columns=columns)
+        joint_names = [joint.name for joint in description.joints]
+        return cls(robot=description.robot, joints=joint_names, row_bytes=used_bytes + padding_bytes, columns=columns)
 
     def encode_header(self) -> bytes:
         """Return the first line of the file, padded so that the rows are aligned."""
@@ -116,7 +120,7 @@ class BlackBox:
 
     def __init__(self, description: Description, memory_bytes: int = MEMORY_BYTES) -> None:
         """Allocate the memory for a robot's rows."""
-        self.layout = Layout.make_for_robot(description)
+        self.layout = Layout.for_robot(description)
         joint_count = len(description.joints)
         # One row, in the order of the columns of `Layout.for_robot`: tick, time, five values of each joint, 7 of the
         # pose, 2 of the contacts, and the mode of each joint.

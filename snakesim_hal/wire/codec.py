@@ -15,7 +15,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 ENCODING_PREFIX = "application/msgpack;snakesim."
 MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; a longer payload is rejected before it is decoded
 MAX_IMAGE_BYTES = 4 * 1024 * 1024  # a color image of MAX_PIXELS fits
-IMAGES: tuple[type[Message], ...] = (DepthImage, ColorImage)
+IMAGE_MESSAGE_TYPES: tuple[type[Message], ...] = (DepthImage, ColorImage)
 MAX_DETAIL_LENGTH = 300  # characters of the reason why a payload is malformed
 MAX_ENCODING_LENGTH = 80  # characters of a foreign encoding that an error quotes
 # Everything that a msgspec decoder raises for untrusted bytes: a payload may be nested too deeply, or not be UTF-8.
@@ -39,7 +39,7 @@ class Decoder(Generic[MessageT]):
     def __init__(self, message: type[MessageT]) -> None:
         self.message = message
         self.encoding = format_encoding(message)
-        self._max_bytes = MAX_IMAGE_BYTES if message in IMAGES else MAX_PAYLOAD_BYTES
+        self._max_bytes = MAX_IMAGE_BYTES if message in IMAGE_MESSAGE_TYPES else MAX_PAYLOAD_BYTES
         self._decoder = msgspec.msgpack.Decoder(message)
 
     def decode(self, payload: bytes, encoding: str) -> MessageT:

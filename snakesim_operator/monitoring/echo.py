@@ -15,7 +15,7 @@ import msgspec
 from snakesim_hal.base.errors import ConfigError, WireError, shorten, suggest_word
 from snakesim_hal.base.terminal import print_json, print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Session, do_keys_intersect, key_expression
+from snakesim_hal.network.session import Session, key_expressions_intersect, normalize_key_expression
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import CustomSample
@@ -31,7 +31,7 @@ def print_topics(*, as_json: bool) -> int:
     if as_json:
         rows = [
             {"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about}
-            for row in _list_published_rows()
+            for row in _list_published_topics()
         ]
         print_json({"topics": rows})
         return 0
@@ -85,26 +85,31 @@ def print_rates(key: str, selection: RobotSelection, *, count: int | None, as_js
 def _subscribe_to_key(key: str, selection: RobotSelection) -> Iterator["OutputQueue"]:
     """Subscribe to a key of every selected robot, and yield the queue that gets the messages.
 
+    Args:
+        key: Key or key expression relative to the namespace of a robot, such as `joints` or `sensors/*`.
+        selection: Network and namespace of the robots.
+
     Raises:
         NotConnectedError: No robot is reachable.
         ConfigError: There is no such key.
     """
-    relative_key = key_expression(key.strip("/"))
-    rows = [row for row in _list_published_rows() if do_keys_intersect(relative_key, row.key)]
-    if not rows:
-        hint = suggest_word(key, [row.key for row in _list_published_rows()]).strip()
+    relative_key = normalize_key_expression(key.strip("/"))
+    topics = [topic for topic in _list_published_topics() if key_expressions_intersect(relative_key, topic.key)]
+    if not topics:
+        hint = suggest_word(key, [topic.key for topic in _list_published_topics()]).strip()
         lines = [*_format_key_list(), hint] if hint else _format_key_list()
         raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines, code="network/unknown-key")
+    # A session with a namespace adds it to keys. Without one, `**/` stands for the namespace of any robot.
     prefix = "" if selection.namespace is not None else "**/"
     queue = OutputQueue()
     with contextlib.ExitStack() as stack:
-        for _, session in open_sessions(selection, stack):
-            _subscribe_to_rows(session, queue, key_expression(f"{prefix}{relative_key}"), prefix, rows)
+        for _namespace, session in open_sessions(selection, stack):
+            _subscribe_to_topics(session, queue, normalize_key_expression(f"{prefix}{relative_key}"), prefix, topics)
         yield queue
 
 
-def _subscribe_to_rows(
-    session: Session, queue: "OutputQueue", pattern: str, prefix: str, rows: Sequence[keys.KeyRow]
+def _subscribe_to_topics(
+    session: Session, queue: "OutputQueue", pattern: str, prefix: str, topics: Sequence[keys.KeyRow]
 ) -> None:
     """Subscribe to the latched keys and to the streams separately.
 
@@ -115,29 +120,31 @@ def _subscribe_to_rows(
         queue: Gets the messages.
         pattern: Key expression of the requested keys, with wildcards.
         prefix: Prefix of every key on this network: empty, or a wildcard for the namespaces of the robots.
-        rows: Rows of the key space that match the pattern.
+        topics: Rows of the key space that match the pattern.
     """
-    latched_keys = [f"{prefix}{row.key}" for row in rows if row.kind == "latched"]
+    latched_keys = [f"{prefix}{topic.key}" for topic in topics if topic.kind == "latched"]
     for latched_key in latched_keys:
-        session.on_latched_arrival(latched_key, queue.make_filtered_add(lambda key: do_keys_intersect(pattern, key)))
-    if len(latched_keys) < len(rows):
+        session.on_latched_arrival(
+            latched_key, queue.make_filtered_add(lambda key: key_expressions_intersect(pattern, key))
+        )
+    if len(latched_keys) < len(topics):
         session.on_arrival(
             pattern,
             queue.make_filtered_add(
-                lambda key: not any(do_keys_intersect(latched_key, key) for latched_key in latched_keys)
+                lambda key: not any(key_expressions_intersect(latched_key, key) for latched_key in latched_keys)
             ),
         )
 
 
-def _list_published_rows() -> list[keys.KeyRow]:
+def _list_published_topics() -> list[keys.KeyRow]:
     """Return the rows of the key space whose messages are published."""
-    return [row for row in keys.SPACE if row.kind in ("stream", "latched")]
+    return [topic for topic in keys.SPACE if topic.kind in ("stream", "latched")]
 
 
 def _format_key_list() -> list[str]:
-    rows = _list_published_rows()
-    width = max(len(row.key) for row in rows)
-    return [f"  {row.key:<{width}}  {row.about}" for row in rows]
+    topics = _list_published_topics()
+    width = max(len(topic.key) for topic in topics)
+    return [f"  {topic.key:<{width}}  {topic.about}" for topic in topics]
 
 
 class MeasuredRate(msgspec.Struct, frozen=True, kw_only=True):

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.programs.arguments import (
-    add_duration,
-    add_json,
+    add_duration_argument,
+    add_json_argument,
     add_network_arguments,
-    add_out,
-    add_task,
+    add_output_argument,
+    add_task_argument,
     make_number_parser,
 )
 from snakesim_hal.programs.commands import Command, Commands, Noun
@@ -23,11 +23,11 @@ MAX_TASK_CHARACTERS = 200
 
 def _add_status(parser: argparse.ArgumentParser) -> None:
     add_network_arguments(parser)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_topic_list(parser: argparse.ArgumentParser) -> None:
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_echo(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def _add_rate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
     _add_count(parser, "end after this many seconds, with KEY")
     add_network_arguments(parser)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_count(parser: argparse.ArgumentParser, about: str) -> None:
@@ -50,15 +50,15 @@ def _add_count(parser: argparse.ArgumentParser, about: str) -> None:
 
 def _add_record(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim record`, which records the messages of a running robot, or demonstrations."""
-    add_out(parser, "the MCAP file (default: NAMESPACE-TIME.mcap)")
+    add_output_argument(parser, "the MCAP file (default: NAMESPACE-TIME.mcap)")
     parser.add_argument(
         "--episodes",
         type=Path,
         metavar="DIR",
         help="record demonstrations into this folder, one after the other, begun and ended by Enter",
     )
-    add_task(parser, "with --episodes: what is demonstrated, in words")
-    add_duration(parser, "end after this time by the wall clock", make_number_parser(0.0, 1e9, "s"))
+    add_task_argument(parser, "with --episodes: what is demonstrated, in words")
+    add_duration_argument(parser, "end after this time by the wall clock", make_number_parser(0.0, 1e9, "s"))
     parser.add_argument("--stamps", choices=LOG_TIME_CLOCKS, help=f"{LOG_TIME_CLOCK_HELP} (default: robot)")
     viewers = parser.add_mutually_exclusive_group()
     viewers.add_argument("--raw-only", action="store_true", help=RAW_ONLY_HELP)

@@ -9,7 +9,14 @@ from pathlib import Path
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
-from snakesim_hal.programs.arguments import add_json, add_namespace, add_out, add_set, add_task, make_number_parser
+from snakesim_hal.programs.arguments import (
+    add_json_argument,
+    add_namespace_argument,
+    add_output_argument,
+    add_set_argument,
+    add_task_argument,
+    make_number_parser,
+)
 from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.recording.stamps import LOG_TIME_CLOCK_HELP, LOG_TIME_CLOCKS
 
@@ -46,12 +53,12 @@ def _add_fps_option(
 
 def _add_info_options(parser: argparse.ArgumentParser) -> None:
     add_recording_argument(parser)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_report_options(parser: argparse.ArgumentParser) -> None:
     add_recording_argument(parser)
-    add_out(parser, "the page, an HTML file (default: beside the recording)")
+    add_output_argument(parser, "the page, an HTML file (default: beside the recording)")
 
 
 def _add_compare_options(parser: argparse.ArgumentParser) -> None:
@@ -59,11 +66,11 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "run_b", type=Path, metavar="RUN_B", help="folder of the other run, of a robot with the same joints"
     )
-    add_out(parser, "the page, an HTML file (default: RUN_B/compare.html)")
+    add_output_argument(parser, "the page, an HTML file (default: RUN_B/compare.html)")
     parser.add_argument(
         "--within", type=float, metavar="PERCENT", help="exit with 1 when the distances moved differ by more"
     )
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_replay_options(parser: argparse.ArgumentParser) -> None:
@@ -74,18 +81,18 @@ def _add_replay_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--endpoint", metavar="ENDPOINT", help="Zenoh endpoint to listen on (default: tcp/127.0.0.1:7447)"
     )
-    add_namespace(parser)
+    add_namespace_argument(parser)
     parser.add_argument(
         "--control", action="store_true", help="run the services on the recorded sensors, and compare their commands"
     )
-    add_set(parser, "with --control: change any value of the configuration")
+    add_set_argument(parser, "with --control: change any value of the configuration")
     parser.add_argument("--controller", metavar="NAME", help="with --control: another controller, as of `snakesim run`")
     parser.add_argument(
         "--run-recorded-code",
         action="store_true",
         help="with --control: run Python files that the recording names, as they are on this computer now",
     )
-    add_out(parser, "with --control: folder for a run that `snakesim study compare` reads")
+    add_output_argument(parser, "with --control: folder for a run that `snakesim study compare` reads")
 
 
 def _add_export_options(parser: argparse.ArgumentParser) -> None:
@@ -93,11 +100,11 @@ def _add_export_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--format", required=True, choices=["csv", "parquet", "npz", "lerobot", "mcap"], help="what to write"
     )
-    add_out(parser, "file or folder (default: beside the recording)")
+    add_output_argument(parser, "file or folder (default: beside the recording)")
     parser.add_argument(
         "--images", action="store_true", help="lerobot: with the images of the cameras, in the recordings"
     )
-    add_task(parser, "lerobot: the task, in words (default: the scenario's name)")
+    add_task_argument(parser, "lerobot: the task, in words (default: the scenario's name)")
     parser.add_argument("--stamps", choices=LOG_TIME_CLOCKS, help=f"mcap: {LOG_TIME_CLOCK_HELP} (default: as recorded)")
     _add_fps_option(
         parser, make_number_parser(1.0, 1000.0, "Hz"), None, "lerobot: frames a second (default: the robot's rate)"
@@ -107,7 +114,7 @@ def _add_export_options(parser: argparse.ArgumentParser) -> None:
 def _add_video_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim recording video`, which films a recorded run as MP4 or GIF."""
     add_recording_argument(parser)
-    add_out(parser, "FILE.mp4 or FILE.gif", required=True)
+    add_output_argument(parser, "FILE.mp4 or FILE.gif", required=True)
     parser.add_argument(
         "--width",
         type=make_number_parser(16, 4096),

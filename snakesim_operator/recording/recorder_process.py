@@ -28,7 +28,7 @@ from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
 from snakesim_hal.network.session import Link, Session
 from snakesim_hal.network.streams import Arrival
 from snakesim_hal.network.waiting import open_session_when_ready
-from snakesim_hal.programs.arguments import add_network_arguments, add_parent, add_scenario_arguments
+from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, add_scenario_arguments
 from snakesim_hal.programs.service_program import ProcessOptions, read_process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
@@ -343,7 +343,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY_HELP)
     add_scenario_arguments(parser)
     add_network_arguments(parser, "")
-    add_parent(parser)
+    add_parent_argument(parser)
     arguments = parser.parse_args(argv)
     return run_tool(f"snakesim {RECORDER}", lambda: _record_run_until_stop_signal(read_process_options(arguments)))
 

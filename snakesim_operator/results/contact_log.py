@@ -37,9 +37,9 @@ class ContactCollector:
     def __init__(self) -> None:
         """Prepare a collector without samples."""
         self._ticks = array("q")
-        self._sample = array("q")
-        self._link = array("q")
-        self._obstacle = array("q")
+        self._sample_indices = array("q")
+        self._link_indices = array("q")
+        self._obstacle_indices = array("q")
         self._force_l_n = array("d")
         self._obstacle_index_by_name: dict[str, int] = {}
 
@@ -48,32 +48,34 @@ class ContactCollector:
         sample = len(self._ticks)
         self._ticks.append(contacts.tick)
         for contact in contacts.contacts:
-            self._sample.append(sample)
-            self._link.append(contact.link)
-            self._obstacle.append(self._get_obstacle_index(contact.obstacle))
+            self._sample_indices.append(sample)
+            self._link_indices.append(contact.link)
+            self._obstacle_indices.append(self._get_obstacle_index(contact.obstacle))
             self._force_l_n.extend(contact.force_l)
 
     def make_log(self) -> ContactLog:
         """Return the collected contacts in the order of their ticks. Only the last sample of each tick is used."""
         ticks = np.array(self._ticks, dtype=np.int64)
+        # np.unique keeps the first occurrence: in reversed order, the last sample of each tick.
         unique_ticks, index_from_end = np.unique(ticks[::-1], return_index=True)
-        retained_rows = len(ticks) - 1 - index_from_end
-        new_sample_index = np.full(len(ticks), -1, dtype=np.int64)  # of each collected sample; -1: it is dropped
-        new_sample_index[retained_rows] = np.arange(len(retained_rows))
-        sample = new_sample_index[np.array(self._sample, dtype=np.int64)]
-        rows = np.flatnonzero(sample >= 0)
-        rows = rows[np.argsort(sample[rows], kind="stable")]
+        retained_samples = len(ticks) - 1 - index_from_end
+        # New index of each collected sample; -1 if it is dropped.
+        new_index_by_old_sample = np.full(len(ticks), -1, dtype=np.int64)
+        new_index_by_old_sample[retained_samples] = np.arange(len(retained_samples))
+        sample_indices = new_index_by_old_sample[np.array(self._sample_indices, dtype=np.int64)]
+        contact_rows = np.flatnonzero(sample_indices >= 0)
+        contact_rows = contact_rows[np.argsort(sample_indices[contact_rows], kind="stable")]
         obstacles = sorted(self._obstacle_index_by_name, key=_make_sort_key)
-        new_obstacle_index = np.zeros(len(obstacles), dtype=np.int64)
+        new_index_by_old_obstacle = np.zeros(len(obstacles), dtype=np.int64)
         for index, name in enumerate(obstacles):
-            new_obstacle_index[self._obstacle_index_by_name[name]] = index
+            new_index_by_old_obstacle[self._obstacle_index_by_name[name]] = index
         return ContactLog(
             ticks=unique_ticks,
             obstacles=obstacles,
-            sample_index=sample[rows],
-            link_index=np.array(self._link, dtype=np.int64)[rows],
-            obstacle_index=new_obstacle_index[np.array(self._obstacle, dtype=np.int64)[rows]],
-            force_l_n=np.array(self._force_l_n, dtype=float).reshape(-1, 3)[rows],
+            sample_index=sample_indices[contact_rows],
+            link_index=np.array(self._link_indices, dtype=np.int64)[contact_rows],
+            obstacle_index=new_index_by_old_obstacle[np.array(self._obstacle_indices, dtype=np.int64)[contact_rows]],
+            force_l_n=np.array(self._force_l_n, dtype=float).reshape(-1, 3)[contact_rows],
         )
 
     def _get_obstacle_index(self, name: str | None) -> int:

@@ -170,7 +170,7 @@ class RunFolderReader(RunReader):
     @cached_property
     def _ticks(self) -> Columns:
         layout, columns = read_black_box(self.path / BLACK_BOX)
-        if layout != Layout.make_for_robot(self._description):
+        if layout != Layout.for_robot(self._description):
             raise ConfigError(
                 f"{self.path / BLACK_BOX} is of another robot than {DESCRIPTION} beside it",
                 code="recording/not-comparable",

@@ -39,7 +39,7 @@ def get_report_time_s(record: RunRecord, state: ControlState) -> float:
     return min(max(state.timestamp_ns * 1e-9 - get_time_origin_s(record), 0.0), get_run_end_s(record))
 
 
-def list_report_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
+def list_control_state_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
     """Return start, end and state of each report of control on the time axis: a state holds until the next report."""
     starts = [get_report_time_s(record, state) for state in record.control_states]
     ends = [*starts, get_run_end_s(record)][1:]
@@ -54,7 +54,7 @@ def merge_equal_reports(record: RunRecord, values: Sequence[str | None]) -> list
         values: A label for each state that control reported; None if the report belongs to no interval.
     """
     intervals: list[Interval] = []
-    for (start_s, end_s, _), label in zip(list_report_spans(record), values, strict=True):
+    for (start_s, end_s, _), label in zip(list_control_state_spans(record), values, strict=True):
         if label is None or end_s <= start_s:
             continue
         if intervals and intervals[-1].label == label and intervals[-1].end_s >= start_s:

@@ -244,29 +244,42 @@ def request_from_host(
     return 0
 
 
-def request_while_driving(
-    session: Session, request: LifecycleRequest, done_text: str, link: Link, send_commands: Callable[[], object]
+def request_while_commanding(
+    session: Session,
+    request: LifecycleRequest,
+    success_message: str,
+    connection: Link,
+    send_commands: Callable[[], object],
 ) -> None:
     """Send a request to the robot's host, and keep commanding the robot until the host has answered.
 
-    An armed robot that gets no commands loses its lease, so the request is sent by another thread meanwhile.
+    An armed robot that gets no commands loses its lease (the permission to command), and stops. So another thread
+    sends the request meanwhile.
 
     Args:
         session: Session on the robot's network.
         request: The request to the host.
-        done_text: What is done if the host accepts, in words, such as "armed".
-        link: How the session reaches the robot, for messages.
+        success_message: What the host has done once it accepts, in words, such as "armed".
+        connection: How the session reaches the robot, for error messages.
         send_commands: Sends commands for a short time, and returns; called until the host has answered.
 
     Raises:
         NotConnectedError: No host answers.
-        RefusedError: The host refuses, or the status does not confirm the answer.
+        RefusedError: The host refuses, or the status does not confirm the response.
     """
     with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(request_from_host, session, keys.LIFECYCLE, request, done_text, link, lambda _line: None)
-        while not answer.done():
+        response = pool.submit(
+            request_from_host,
+            session,
+            keys.LIFECYCLE,
+            request,
+            success_message,
+            connection,
+            print_text=lambda _line: None,
+        )
+        while not response.done():
             send_commands()
-        answer.result()
+        response.result()
 
 
 def verify_answers(answers: Sequence[Answer], status_reader: Reader[Status]) -> Verification:

@@ -5,7 +5,12 @@ import contextlib
 import os
 from pathlib import Path
 
-from snakesim_hal.programs.arguments import add_duration, add_json, add_network_arguments, add_unchecked
+from snakesim_hal.programs.arguments import (
+    add_duration_argument,
+    add_json_argument,
+    add_network_arguments,
+    add_unchecked_argument,
+)
 from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.robot_commands.simulator_commands import SIMULATOR_COMMANDS
@@ -16,7 +21,7 @@ ESTOP_NICENESS = -10  # niceness of an emergency stop
 def _add_arm(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
     parser.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
-    add_unchecked(parser)
+    add_unchecked_argument(parser)
     parser.add_argument(
         "--wait",
         type=float,
@@ -44,13 +49,13 @@ def _add_teleop(parser: argparse.ArgumentParser) -> None:
 
 def _add_param_list(parser: argparse.ArgumentParser) -> None:
     add_network_arguments(parser)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_param_get(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", help="such as control.speed_kp_s")
     add_network_arguments(parser)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_param_set(parser: argparse.ArgumentParser) -> None:
@@ -59,13 +64,13 @@ def _add_param_set(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_fault_list(parser: argparse.ArgumentParser) -> None:
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_fault_inject(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", metavar="KIND", help="such as mute (`snakesim fault list` explains all of them)")
     parser.add_argument("target", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
-    add_duration(parser, "seconds of robot time until it ends (default: until --end)")
+    add_duration_argument(parser, "seconds of robot time until it ends (default: until --end)")
     parser.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
     parser.add_argument("--end", action="store_true", help="end it")
     add_network_arguments(parser)

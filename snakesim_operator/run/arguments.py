@@ -8,12 +8,12 @@ from snakesim_hal.base.process import tune_garbage_collector
 from snakesim_hal.base.terminal import tolerate_failed_output
 from snakesim_hal.programs.arguments import (
     add_host_arguments,
-    add_insecure,
+    add_insecure_argument,
     add_network_arguments,
-    add_out,
+    add_output_argument,
     add_scenario_arguments,
     add_service_arguments,
-    add_unchecked,
+    add_unchecked_argument,
     check_network,
     load_scenario_from_arguments,
     read_session_option,
@@ -39,7 +39,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stay", action="store_true", help="faults do not end the run: processes restart, you reset and arm"
     )
-    add_unchecked(parser)
+    add_unchecked_argument(parser)
     parser.add_argument("--with-router", action="store_true", help="start a router for the run, as in a lab")
     parser.add_argument(
         "--in-process",
@@ -55,9 +55,9 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
         default=False,
         help="show the run in the browser, and print the address",
     )
-    add_out(parser, "folder for the run's record (default: runs/NAME-TIME)")
-    add_network_arguments(parser, "")
-    add_insecure(parser)
+    add_output_argument(parser, "folder for the run's record (default: runs/NAME-TIME)")
+    add_network_arguments(parser, session="")  # --session has no default
+    add_insecure_argument(parser)
 
 
 def _run_scenario(arguments: argparse.Namespace) -> int:

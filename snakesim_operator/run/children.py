@@ -61,7 +61,7 @@ class Child:
     is_end_requested: bool = False  # by this process, while the child ran
     was_killed: bool = False  # by this process, because it did not end within STOP_LIMIT_S
 
-    def describe_end(self) -> str | None:
+    def describe_exit(self) -> str | None:
         """Describe how the process ended, with its last error message; None while it runs."""
         code = self.process.poll()
         if code is None:

@@ -30,7 +30,7 @@ def require_console() -> None:
 def run_console(
     common_arguments: Sequence[str], link: Link, files: RunFiles, report: Callable[[str], None]
 ) -> Iterator[None]:
-    """Run the console in two child processes while the context is active.
+    """Run the console in two child processes, the front process and the page server, while the context is active.
 
     Args:
         common_arguments: Command-line arguments of every process of the run, such as its scenario and endpoint.
@@ -39,18 +39,18 @@ def run_console(
         report: Called with the address of the page, and with warnings.
     """
     on_output = partial(files.append, LOG_FILENAME)
-    with open_console_ports(None) as ports:
-        front = start_console_front(ports, link, on_output)
+    with open_console_ports(port=None) as ports:
+        front_process = start_console_front(ports, link, on_output)
         pages_fd = ports.pages.fileno()
         arguments = [CONSOLE_MODULE, *common_arguments, "--listening", str(pages_fd)]
-        pages = children.start_child("console", arguments, on_output, pass_fds=[pages_fd])
+        page_server_process = children.start_child("console", arguments, on_output, pass_fds=[pages_fd])
         report(f"console: {ports.address}")
         # This process closes its copies: if the console ends, browsers then lose their connection at once.
         ports.close()
         try:
             yield
         finally:
-            children.stop_children([pages, front])
-            for child in (pages, front):
+            children.stop_children([page_server_process, front_process])
+            for child in (page_server_process, front_process):
                 if child.was_killed:
-                    report(f"warning: {child.describe_end()}")
+                    report(f"warning: {child.describe_exit()}")

@@ -128,7 +128,7 @@ class RunMonitor:
         """Describe why the run stops waiting to arm the robot; None while it waits."""
         now_s = time.monotonic()
         reason = self._status.reason if self._status else "no status"
-        if self._startup_timeout.update(self._status, now_s):
+        if self._startup_timeout.update_and_check_expired(self._status, now_s):
             timeout_s = self._startup_timeout.timeout_s
             return f"not ready to arm within {timeout_s:g} s (start_limit_s) with every service there: {reason}"
         if now_s > arming_deadline_s:

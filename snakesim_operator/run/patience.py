@@ -27,12 +27,13 @@ class StartupTimeout:
         self._services = frozenset(services)
         self._last_status: Status | None = None
         self._last_arrival_s = 0.0
-        self._waited_s = 0.0
+        self._elapsed_s = 0.0
 
-    def update(self, status: Status | None, now_s: float) -> bool:
-        """Count the time that has passed up to a status, and return whether it exceeds the timeout.
+    def update_and_check_expired(self, status: Status | None, now_s: float) -> bool:
+        """Add the time since the previous status, and return whether the sum exceeds the timeout.
 
-        While ticks advance, robot time is counted. Otherwise wall time is counted, at most MAX_STEP_S for each status.
+        While ticks advance, robot time (the timestamps of the statuses) is added. Otherwise real time is added, at most
+        MAX_STATUS_PERIOD_S for each status. Without a new status, nothing is added, and the result is False.
 
         Args:
             status: Newest status of the host; None before the first one.
@@ -45,12 +46,12 @@ class StartupTimeout:
         self._last_status = status
         self._last_arrival_s = now_s
         if previous is None or self._should_restart(previous, status):
-            self._waited_s = 0.0
+            self._elapsed_s = 0.0
         elif status.tick > previous.tick:
-            self._waited_s += (status.timestamp_ns - previous.timestamp_ns) * 1e-9
+            self._elapsed_s += (status.timestamp_ns - previous.timestamp_ns) * 1e-9
         else:
-            self._waited_s += min(elapsed_s, MAX_STATUS_PERIOD_S)
-        return self._waited_s > self.timeout_s
+            self._elapsed_s += min(elapsed_s, MAX_STATUS_PERIOD_S)
+        return self._elapsed_s > self.timeout_s
 
     def _should_restart(self, last_status: Status, status: Status) -> bool:
         """Return whether the count restarts: the robot is ready, a service is missing, or the services have changed."""

@@ -22,7 +22,7 @@ from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, Description, FaultRequest, LifecycleState
 from snakesim_operator.run.supervisor import Supervisor
 
-PROCESSES_THAT_ROUTE_REQUESTS = ("host", "router")
+REQUEST_ROUTING_PROCESSES = ("host", "router")
 MAX_REASON_CHARACTERS = 500
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGTERM, "freeze": signal.SIGSTOP}
 
@@ -183,7 +183,7 @@ class ProcessFaults:
                 f"there is no process {injection.target!r}; this run has {', '.join(self._supervisor.process_names)}",
                 code="injection/unknown-target",
             )
-        if injection.kind == "freeze" and injection.target in PROCESSES_THAT_ROUTE_REQUESTS and injection.end_s == inf:
+        if injection.kind == "freeze" and injection.target in REQUEST_ROUTING_PROCESSES and injection.end_s == inf:
             raise ConfigError(
                 f"freeze:{injection.target} needs an end, because a frozen {injection.target} cannot receive the "
                 f"request to end it: give --for SECONDS",

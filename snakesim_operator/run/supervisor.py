@@ -47,11 +47,11 @@ class SupervisedProcess:
     delay_s: float = MIN_RESTART_DELAY_S
     restart_due_s: float | None = None  # monotonic time of its restart; None while it runs
 
-    def describe_end(self) -> str | None:
+    def describe_exit(self) -> str | None:
         """Describe how the process ended; None while it runs, or if its restart is already scheduled."""
         if self.restart_due_s is not None:
             return None
-        return self.child.describe_end()
+        return self.child.describe_exit()
 
     def schedule_restart(self) -> float:
         """Schedule the restart with exponential back-off, and return the delay in s."""
@@ -207,7 +207,7 @@ class Supervisor:
         for process in self._processes.values():
             if not process.vital:
                 continue
-            how = process.child.describe_end()
+            how = process.child.describe_exit()
             if how is not None:
                 return how
         return None
@@ -219,7 +219,7 @@ class Supervisor:
             Whether the run continues: no process has ended that may not be restarted, and the host is not done.
         """
         for process in self._processes.values():
-            how = process.describe_end()
+            how = process.describe_exit()
             if how is not None:
                 if not self._handle_end(process, how):
                     return False
@@ -281,7 +281,7 @@ class Supervisor:
             if not process.vital and process.child.process.returncode:
                 self._note_loss(process)
             elif process.child.was_killed:
-                self._print_text(f"warning: {process.child.describe_end()}")
+                self._print_text(f"warning: {process.child.describe_exit()}")
         self._print_last_output()
 
     def _note_loss(self, process: SupervisedProcess) -> None:
@@ -290,7 +290,7 @@ class Supervisor:
             self.losses_by_process[process.name] = f"{process.name} had not started when the run ended"
             self._print_text(f"warning: {self.losses_by_process[process.name]}: there is nothing of it")
         else:
-            self._continue_without(process, process.child.describe_end() or "")
+            self._continue_without(process, process.child.describe_exit() or "")
 
     def _end_host(self) -> None:
         """End the host in order, and add the cause if it wrote no record."""
@@ -300,7 +300,7 @@ class Supervisor:
         children.request_child_end(host.child)
         with contextlib.suppress(subprocess.TimeoutExpired):
             host.child.process.wait(children.STOP_TIMEOUT_S)
-        how = host.child.describe_end()
+        how = host.child.describe_exit()
         if how is None or host.child.process.returncode in REGULAR_EXIT_CODES:
             return
         if _was_starting(host.child):
@@ -310,7 +310,7 @@ class Supervisor:
     def _note_early_ends(self) -> None:
         """Add the vital processes that ended by themselves as first causes: faults of the host are consequences."""
         for process in self._processes.values():
-            how = process.describe_end()
+            how = process.describe_exit()
             if process.name != HOST and process.vital and how is not None:
                 self._ending.add_cause(how, first=True)
 

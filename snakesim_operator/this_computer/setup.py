@@ -6,10 +6,10 @@ from pathlib import Path
 
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.programs.arguments import (
-    add_insecure,
-    add_json,
+    add_insecure_argument,
+    add_json_argument,
     add_network_arguments,
-    add_out,
+    add_output_argument,
     add_scenario_arguments,
     load_scenario_from_arguments,
 )
@@ -19,24 +19,24 @@ from snakesim_hal.programs.commands import Command, Commands, Noun
 def _add_config(parser: argparse.ArgumentParser) -> None:
     add_scenario_arguments(parser)
     parser.add_argument("--explain", metavar="KEY", help="show what one key or table means, and what it may be")
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_doctor(parser: argparse.ArgumentParser) -> None:
     add_network_arguments(parser)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_router(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "config", type=Path, nargs="?", metavar="FILE", help="JSON5 file (default: the shipped one, for this computer)"
     )
-    add_insecure(parser)
+    add_insecure_argument(parser)
 
 
 def _add_schema(parser: argparse.ArgumentParser) -> None:
-    add_out(parser, "folder into which to write schemas and key space, from the code")
-    add_json(parser)
+    add_output_argument(parser, "folder into which to write schemas and key space, from the code")
+    add_json_argument(parser)
 
 
 def _print_bundled_files(arguments: argparse.Namespace) -> int:
@@ -106,7 +106,7 @@ COMMANDS: Commands = (
     Command(
         name="scenario list",
         help="List the shipped scenarios, robots, scenes and suites.",
-        add=add_json,
+        add=add_json_argument,
         run=_print_bundled_files,
         examples=("scenario list", "scenario list --json"),
     ),

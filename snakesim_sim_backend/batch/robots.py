@@ -48,7 +48,7 @@ class SimulatedRobots:
         self._period_ns = config.period_ns
         self._joints = joints
         self._timing = encode_sensor_timing(config)
-        self._has_heat = config.robot.sensors.power is not None
+        self._models_winding_temperature = config.robot.sensors.power is not None
         self._simulations = _open_simulations(robots, joints, threads)
         self.all_robots: Mask = np.ones(robots, dtype=np.bool_)
         self._noise = NoiseStreams(self.all_robots)
@@ -140,8 +140,8 @@ class SimulatedRobots:
         """Step the physics of some robots through one control period.
 
         Args:
-            robots: Rows of the robots.
-            ticks: For every row, number of the control cycle that ends with this step, for messages.
+            robots: Indices of the robots, which are their rows in all arrays.
+            ticks: Control tick of each robot at the end of this step; used only in error messages.
 
         Returns:
             The reason of the divergence by row, for each simulation that has diverged.
@@ -149,13 +149,15 @@ class SimulatedRobots:
         simulations = self._simulations
         if self._robots_with_pending_limits:
             self._apply_pending_limits()
-        if simulations.motor_state.shape[1]:
-            # End wind-up above the limits, as `Motors.apply_pending_torque_limits` does. The state is the torque.
+        has_motor_dynamics = simulations.motor_state.shape[1] > 0
+        if has_motor_dynamics:
+            # The motor state (MuJoCo's activation) is the torque. Clamp it to limits that have decreased, as
+            # `Motors.apply_pending_torque_limits` does.
             motor_state = simulations.motor_state
             np.minimum(motor_state, self._max_torque_nm, out=motor_state)
             np.maximum(motor_state, self._min_torque_nm, out=motor_state)
         divergence_reasons = simulations.step(robots, ticks)
-        if self._has_heat:
+        if self._models_winding_temperature:
             self._update_winding_temperatures()
         return divergence_reasons
 

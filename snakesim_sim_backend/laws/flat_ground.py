@@ -140,14 +140,22 @@ class FlatGround:
         self._allocate_buffers(count)
 
     def _bind_mujoco_arrays(self, data: mujoco.MjData, feet: Feet) -> None:
-        """Create the views of MuJoCo's arrays that a step reads, and find the indices of the feet in them."""
+        """Cache the views and flat indices of MuJoCo's arrays from which a step computes the friction of the feet.
+
+        Args:
+            data: State of the simulation, whose arrays are viewed, not copied.
+            feet: The points at which the chain touches the ground.
+        """
         first_body = feet.first_body
         count = len(feet.geoms)
         xy_count = 2 * count
         # Foot i belongs to link i; only the last foot belongs to the head link, too, which has two feet.
-        bodies = np.minimum(np.arange(count) + first_body, first_body + count - 2)
+        link_count = count - 1
+        head_body = first_body + link_count - 1
+        bodies = np.minimum(np.arange(count) + first_body, head_body)
         self._bodies: list[int] = bodies.tolist()
-        # Neighbor link and its weight: a foot at a joint belongs equally to the link behind, one at an end to no other.
+        # Second link of each foot, and its weight. A foot at a joint belongs half to the link behind the joint. A foot
+        # at an end of the body belongs to one link only, so that its second link has no weight.
         self._neighbors = [
             (first_body, 0.0),
             *((body - 1, 0.5) for body in self._bodies[1:-1]),
@@ -157,13 +165,17 @@ class FlatGround:
         z_indices = 3 * feet.geoms + 2
         self._positions = data.geom_xpos.reshape(-1)
         self._position_indices = np.concatenate((xy_indices, z_indices))
-        self._twists = data.cvel.reshape(-1)  # per body: angular velocity, then linear velocity
+        self._body_cvel = data.cvel.reshape(-1)  # per body: angular velocity (x, y, z), then linear velocity
+        # The velocity of a point, v = omega x r, has the x component omega_y r_z and the y component -omega_x r_z: so y
+        # comes first.
         self._angular_yx_indices = np.add.outer(6 * bodies, [1, 0]).ravel()
-        # The point about which MuJoCo takes moments.
-        self._reference_xy = data.subtree_com[first_body, :2, None]
-        self._reference_z = data.subtree_com[first_body, 2:]
-        self._stretch_xy = data.userdata[:xy_count]
-        self._stretch = self._stretch_xy.view(np.complex128)
+        # Reference point of `cvel`: center of mass of the whole chain.
+        self._cvel_reference_xy = data.subtree_com[first_body, :2, None]
+        self._cvel_reference_z = data.subtree_com[first_body, 2:]
+        # In `userdata`: deflection of the friction bristle of every foot (x, y), then the last positions of all feet.
+        # As complex numbers, the absolute values of the deflections are computed at once.
+        self._bristle_deflection_xy = data.userdata[:xy_count]
+        self._bristle_deflection_complex = self._bristle_deflection_xy.view(np.complex128)
         self._last_position = data.userdata[xy_count : VALUES_PER_FOOT * count]
 
     def _allocate_buffers(self, count: int) -> None:
@@ -194,7 +206,7 @@ class FlatGround:
 
     def begin(self) -> None:
         """Let all feet stick where they are now, without stretch of their springs."""
-        self._stretch_xy[:] = 0.0
+        self._bristle_deflection_xy[:] = 0.0
         self._last_position[:] = self._positions[self._position_indices]
 
     def apply(self) -> None:
@@ -208,7 +220,7 @@ class FlatGround:
         self._last_position[:] = self._position
 
         # ds = dx + dt r (-w_y, w_x)
-        self._twists.take(self._angular_yx_indices, None, slip_xy, "clip")
+        self._body_cvel.take(self._angular_yx_indices, None, slip_xy, "clip")
         slip_xy *= self._roll_per_rad_s_xy
         slip_xy += self._motion_xy
 
@@ -229,11 +241,13 @@ class FlatGround:
         divisor = np.maximum(max_friction_n, self._min_divisor)
 
         # s = (s + ds) min(1, mu N / (k |s + ds|))
-        self._stretch_xy += slip_xy
-        self._stretch_xy *= (max_friction_n / np.maximum(self._stiffness * np.abs(self._stretch), divisor)).repeat(2)
+        self._bristle_deflection_xy += slip_xy
+        self._bristle_deflection_xy *= (
+            max_friction_n / np.maximum(self._stiffness * np.abs(self._bristle_deflection_complex), divisor)
+        ).repeat(2)
 
         # F = -(k s + d ds), limited to mu N
-        np.multiply(self._minus_stiffness_xy, self._stretch_xy, self._pull_xy)
+        np.multiply(self._minus_stiffness_xy, self._bristle_deflection_xy, self._pull_xy)
         slip_xy *= self._minus_damping_xy
         self._pull_xy += slip_xy
         forces = self._forces
@@ -280,8 +294,8 @@ class FlatGround:
         arms = self._arms
         moments = self._moments
         # `_height` is the height of each foot's lowest point by now, where the force acts.
-        np.subtract(self._position_by_axis, self._reference_xy, arms[:2])
-        np.subtract(self._height, self._reference_z, arms[2])
+        np.subtract(self._position_by_axis, self._cvel_reference_xy, arms[:2])
+        np.subtract(self._height, self._cvel_reference_z, arms[2])
         arms[3:] = arms[:2]
         # moment = arm x force
         np.multiply(arms[1:4], self._forces[2:], moments)

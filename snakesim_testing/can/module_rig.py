@@ -150,6 +150,6 @@ def measure_bus_traffic(
         emulators.receive(0, make_sync(tick, 0))
         for node in range(1, joint_count + 1):
             emulators.receive(0, setpoint(tick, node=node, target=0.0))
-        waiting_frames = sum(map(len, emulators.buses[0]._waiting_frames.values()))
+        waiting_frames = sum(map(len, emulators.buses[0]._waiting_frame_by_mailbox_by_sender.values()))
         max_waiting_frames = max(max_waiting_frames, waiting_frames)
     return lateness_periods, traffic_before, emulators.traffic()[0], max_waiting_frames

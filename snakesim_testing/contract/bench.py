@@ -72,32 +72,34 @@ class Bench:
         overrides: tuple[str, ...] = (),
         mute_joint: MuteJoint | None = None,
         make_emulated_drives: MakeEmulatedDrives | None = None,
-        unavailable: str | None = None,
+        unavailable_reason: str | None = None,
     ) -> None:
-        """Describe the backend without opening it.
+        """Store the backend and its settings, without opening the backend.
 
         Args:
-            name: Name of the bench, and of its column in the table of results.
+            name: Name of the bench (this fixture), and of its column in the table of results.
             backend: Name of an installed backend, `./file.py:Class`, or the class itself.
             scenario: Name or path of the scenario.
             overrides: Changes of the scenario, as `--set KEY=VALUE` of `snakesim run` takes them.
-            mute_joint: Function `mute_joint(backend, joint)` that silences one joint module, as a broken wire does.
+            mute_joint: Function `mute_joint(backend, joint)` that disconnects one joint module, as a broken wire does.
                 None if that is not possible.
             make_emulated_drives: Function that returns the emulated drives of an open backend. None if the backend
                 has none.
-            unavailable: Reason why the bench cannot be used on this machine. None if it can.
+            unavailable_reason: Reason why the bench cannot be used on this machine. None if it can.
         """
         self.name = name
-        self.unavailable = unavailable
+        self.unavailable_reason = unavailable_reason
         self.mute_joint = mute_joint
         self.make_emulated_drives = make_emulated_drives
         self._backend = backend
         self._scenario = scenario
-        self._sets = overrides
+        self._overrides = overrides
+        # The open backend: in a rig without a network, or in a host; None if it is closed.
         self._rig: Rig | None = None
-        self._open_backend_and_drives: tuple[Backend, EmulatedDrives] | None = None  # an open backend with its drives
-        self.was_opened = False  # since the bench was made
+        self._open_backend_and_drives: tuple[Backend, EmulatedDrives] | None = None  # the pair that belongs together
+        self.was_opened = False  # whether the backend was ever opened
         self._hosted_backend: HostedBackend | None = None
+        # Measurements that several tests share.
         self._recording_by_name: dict[str, Any] = {}
 
     # --- what it is ----------------------------------------------------------------------------------------
@@ -113,7 +115,7 @@ class Bench:
     def config(self) -> RunConfig:
         """The scenario with the backend, at the clock mode of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
-        overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set_option, self._sets)]
+        overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set_option, self._overrides)]
         config = apply_backend_modes(load_scenario(self._scenario, overrides).config, self.backend_type)
         # The tests' own controller is the only service.
         clock_modes = self.backend_type.check(config, decode_backend_settings(config, self.backend_type))

@@ -189,8 +189,8 @@ def _make_bench_from_options(backend: str, config: pytest.Config) -> "Bench":
 def bench(request: pytest.FixtureRequest) -> "Iterator[Bench]":
     """Provide the bench of the backend under test, which is not opened yet, and close it after its last test."""
     bench: Bench = request.param
-    if bench.unavailable is not None:
-        pytest.skip(bench.unavailable)
+    if bench.unavailable_reason is not None:
+        pytest.skip(bench.unavailable_reason)
     yield bench
     bench.close()
 

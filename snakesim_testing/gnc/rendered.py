@@ -14,8 +14,8 @@ from snakesim_operator.features.robots.urdf_tree import make_rotation_from_rpy
 
 Ground = Callable[[Floats, Floats], Floats]
 INTRINSICS = Intrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
-RANGE_M = (0.05, 3.0)
-SCALE_M = 0.001
+DEPTH_RANGE_M = (0.05, 3.0)
+DEPTH_UNIT_M = 0.001
 
 
 def make_cylinder(name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2) -> Obstacle:
@@ -49,7 +49,7 @@ class SensorErrors:
     dropout: float = 0.0
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
 
-    def through(self, distance_m: Floats) -> Floats:
+    def apply(self, distance_m: Floats) -> Floats:
         """Return measured distances, with errors; infinite where nothing is measured."""
         with np.errstate(invalid="ignore"):
             noise = (self.floor_m + self.per_m2 * distance_m**2) * self.random.standard_normal(distance_m.shape)
@@ -113,7 +113,7 @@ def render_depth_image(
     link: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> DepthImage:
-    """Return the image of a depth camera.
+    """Render the image of a depth camera with the optics of INTRINSICS. The tick of the image is 0.
 
     Args:
         obstacles: What the camera can see, besides the ground.
@@ -122,15 +122,16 @@ def render_depth_image(
         ground: Height of the ground as a function of x and y.
         sensor_errors: Errors of the camera. If None, the camera is exact.
         timestamp_ns: Time of the image.
-        link: Link of the camera, as the message reports it.
+        link: Index of the link that carries the camera, as the message reports it.
         position_l: Position of the camera on this link, as the message reports it, m. It does not move the camera.
     """
+    # Their component along the viewing direction is 1, so that distances along them are depths.
     rays = INTRINSICS.compute_rays().astype(np.float64) @ world_from_camera.T
     errors = sensor_errors or SensorErrors()
-    depth_m = errors.through(compute_ray_distances(position_w, rays, obstacles, ground))
-    min_range_m, max_range_m = RANGE_M
+    depth_m = errors.apply(compute_ray_distances(position_w, rays, obstacles, ground))
+    min_range_m, max_range_m = DEPTH_RANGE_M
     is_measured = np.isfinite(depth_m) & (depth_m < max_range_m) & (depth_m > min_range_m)
-    depth_counts = np.where(is_measured, depth_m / SCALE_M, 0.0)  # 0: not measured
+    depth_counts = np.where(is_measured, depth_m / DEPTH_UNIT_M, 0.0)  # 0: not measured
     return DepthImage(
         tick=0,
         timestamp_ns=timestamp_ns,
@@ -140,7 +141,7 @@ def render_depth_image(
         **asdict(INTRINSICS),
         range_min_m=min_range_m,
         range_max_m=max_range_m,
-        scale_m=SCALE_M,
+        scale_m=DEPTH_UNIT_M,
         depth=np.round(depth_counts).astype("<u2").tobytes(),
     )
 

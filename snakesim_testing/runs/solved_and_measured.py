@@ -139,7 +139,7 @@ def measure_difference_causes(scenario: str, controller: str, **options: Any) ->
     requests_force = (desired_n >= MIN_DESIRED_FORCE_N).any(axis=1)
     desired_n = desired_n[requests_force]
     measured_n = measured_n[requests_force]
-    parts_n = _split_difference(desired_n, measured_n)
+    parts_n = _decompose_force_error(desired_n, measured_n)
     fractions = " | ".join(f"{part_n / sum(parts_n):.0%}" for part_n in parts_n)
     correlations = [compute_correlation(*tabulate_forces(states, forces, float(shift_s))) for shift_s in SHIFTS_S]
     best = int(np.argmax(correlations))
@@ -151,8 +151,8 @@ def measure_difference_causes(scenario: str, controller: str, **options: Any) ->
     )
 
 
-def _split_difference(desired_n: Floats, measured_n: Floats) -> tuple[float, float, float, float]:
-    """Split the difference between desired and measured contact forces by its causes.
+def _decompose_force_error(desired_n: Floats, measured_n: Floats) -> tuple[float, float, float, float]:
+    """Decompose the difference between desired and measured contact forces (in N) by its causes.
 
     Args:
         desired_n: (n_states, n_obstacles) forces that the controller desired.
@@ -164,15 +164,15 @@ def _split_difference(desired_n: Floats, measured_n: Floats) -> tuple[float, flo
     """
     without_contact_n = float(desired_n[measured_n < MIN_CONTACT_FORCE_N].sum())
     undesired_n = float(measured_n[desired_n == 0.0].sum())
-    is_common = (desired_n > 0.0) & (measured_n >= MIN_CONTACT_FORCE_N)
+    in_both = (desired_n > 0.0) & (measured_n >= MIN_CONTACT_FORCE_N)
     total_error_n = 0.0
     distribution_error_n = 0.0
-    for state in np.flatnonzero(is_common.any(axis=1)):
-        desired = desired_n[state, is_common[state]]
-        actual = measured_n[state, is_common[state]]
-        scale = actual.sum() / desired.sum()
-        total_error_n += abs(actual.sum() - desired.sum())
-        distribution_error_n += float(np.abs(actual - scale * desired).sum())
+    for state_index in np.flatnonzero(in_both.any(axis=1)):
+        desired_forces_n = desired_n[state_index, in_both[state_index]]
+        measured_forces_n = measured_n[state_index, in_both[state_index]]
+        scale = measured_forces_n.sum() / desired_forces_n.sum()
+        total_error_n += abs(measured_forces_n.sum() - desired_forces_n.sum())
+        distribution_error_n += float(np.abs(measured_forces_n - scale * desired_forces_n).sum())
     return without_contact_n, undesired_n, total_error_n, distribution_error_n
 
 

@@ -308,7 +308,7 @@ def test_drive_with_other_id_is_missing_then_a_stranger(robot: Robot, monkeypatc
 
     def elsewhere(emulator: Any, *rest: Any) -> None:
         made(emulator, *rest)
-        emulator._index_of_node.pop((id(emulator.wires[1]), 2))
+        emulator._index_by_node_id.pop((id(emulator.wires[1]), 2))
 
     monkeypatch.setattr(twin_class, "__init__", elsewhere)
     with raises_error(BackendError, code="drive/not-complete", field="joint_2"):

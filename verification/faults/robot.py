@@ -101,11 +101,11 @@ class Robot:
 
     def ended(self) -> list[str]:
         """Which of its processes are gone, and how."""
-        return [ending for child in self.running.values() if (ending := child.describe_end()) is not None]
+        return [ending for child in self.running.values() if (ending := child.describe_exit()) is not None]
 
     def last_words(self) -> str:
         """Of those that are gone."""
-        ended = [child for child in self.running.values() if child.describe_end()]
+        ended = [child for child in self.running.values() if child.describe_exit()]
         return " | ".join(line for child in ended for line in child.output.last_lines())
 
     def signal(self, name: str, number: signal.Signals) -> int:

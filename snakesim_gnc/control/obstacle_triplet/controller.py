@@ -28,7 +28,12 @@ from snakesim_gnc.control.climb import PlatformClimb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, find_push_points, plan_contact
 from snakesim_gnc.control.obstacle_triplet.parameters import TripletParameters
-from snakesim_gnc.control.obstacle_triplet.selection import ObstacleNames, TripletChoice, TripletFinder, choose_triplet
+from snakesim_gnc.control.obstacle_triplet.selection import (
+    ObstacleNames,
+    PropulsionChoice,
+    TripletFinder,
+    choose_triplet,
+)
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallDetector, explain_stall
 from snakesim_gnc.control.obstacle_triplet.telemetry import compute_bending_torques_nm, make_contact_messages
 from snakesim_gnc.control.progress import BodyLocation, PathProgress
@@ -96,7 +101,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             authority_min=parameters.authority_min,
             hold_on_m=parameters.hold_on_m,
         )
-        self._choice: TripletChoice | None = None
+        self._choice: PropulsionChoice | None = None
         self._refusal_reasons: list[str] = []  # why triplets cannot be used
         # Propulsion of the tick before.
         self._unlimited_force_n = 0.0  # before the joint's torque limit
@@ -140,7 +145,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
         return self._make_command(observation, location, body_pose, reference_rad)
 
     def _switch_propulsion_joint(
-        self, observation: Observation, location: BodyLocation, reference_rad: Floats, last_choice: TripletChoice | None
+        self,
+        observation: Observation,
+        location: BodyLocation,
+        reference_rad: Floats,
+        last_choice: PropulsionChoice | None,
     ) -> None:
         """Switch torque mode to the joint of the chosen triplet, and advance the ramps by time and by travel.
 
@@ -254,7 +263,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         return self._filtered_loads_nm / self._stiffness
 
     def _compute_propulsion_demand(
-        self, observation: Observation, location: BodyLocation, choice: TripletChoice
+        self, observation: Observation, location: BodyLocation, choice: PropulsionChoice
     ) -> PropulsionDemand:
         """Compute the torque with which the propulsion joint pushes the body along the path in this tick.
 
@@ -366,7 +375,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         excluded_joint = None
         if self._excluded_joint is not None:
             excluded_joint, _ = self._excluded_joint
-        choices, self._refusal_reasons = self._triplet_finder.find_choices(
+        choices, self._refusal_reasons = self._triplet_finder.find_propulsion_choices(
             self._push_points, body_pose.body_points_w, self._body.body_points_s_m, self._choice, excluded_joint
         )
         if location.trajectory.speed_m_s <= 0 or observation.time_s < self._position_mode_until_s:
@@ -413,7 +422,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             self._choice = None
 
     def _watch_stall(
-        self, observation: Observation, location: BodyLocation, choice: TripletChoice, demand: PropulsionDemand
+        self, observation: Observation, location: BodyLocation, choice: PropulsionChoice, demand: PropulsionDemand
     ) -> None:
         """Detect a standstill while pushing, and release a triplet that is strained but does not move the body.
 
@@ -502,7 +511,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         return self._stall is not None and self._stall[0].is_jammed
 
     def _make_push_telemetry(
-        self, location: BodyLocation, body_pose: BodyPose, choice: TripletChoice, demand: PropulsionDemand
+        self, location: BodyLocation, body_pose: BodyPose, choice: PropulsionChoice, demand: PropulsionDemand
     ) -> Telemetry:
         """Return the telemetry of a tick in which a triplet propels: its joint, its contacts and its forces.
 

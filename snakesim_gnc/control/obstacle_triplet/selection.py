@@ -50,7 +50,7 @@ class Triplet:
 
 
 @dataclass(frozen=True)
-class TripletChoice:
+class PropulsionChoice:
     """A triplet, its current place on the body, and the propulsion joint."""
 
     triplet: Triplet
@@ -141,12 +141,12 @@ def find_propulsion_joint(
 
 
 def choose_triplet(
-    choices: Sequence[TripletChoice],
+    choices: Sequence[PropulsionChoice],
     current_triplet: Triplet | None,
     *,
     switch_fraction: float,
     banned_triplets: Collection[ObstacleNames] = (),
-) -> TripletChoice | None:
+) -> PropulsionChoice | None:
     """Choose the triplet of push-points with which the body pushes itself forward.
 
     The current triplet stays as long as it can be used, unless another needs less than `switch_fraction` of its torque.
@@ -177,7 +177,7 @@ def choose_triplet(
     if current_triplet is not None:
         current_obstacles = frozenset(current_triplet.names)
 
-    def compute_rank(choice: TripletChoice) -> tuple[int, float, float]:
+    def compute_rank(choice: PropulsionChoice) -> tuple[int, float, float]:
         shared_count = len(current_obstacles.intersection(choice.triplet.names))
         return shared_count, -round(choice.triplet.torque_per_n, TORQUE_DECIMALS), -choice.body_s_m[1]
 
@@ -202,44 +202,47 @@ class TripletFinder:
         self._hold_on_m = hold_on_m
         self._solved_triplets: dict[ObstacleNames, Triplet] = {}
 
-    def find_choices(
+    def find_propulsion_choices(
         self,
         points: Sequence[PushPoint],
         body_points_w: Floats,
-        body_points_s_m: Sequence[float],
-        current_choice: TripletChoice | None,
+        body_point_arc_lengths_m: Sequence[float],
+        current_choice: PropulsionChoice | None,
         excluded_joint: int | None,
-    ) -> tuple[list[TripletChoice], list[str]]:
-        """Find every triplet that can propel with some joint.
+    ) -> tuple[list[PropulsionChoice], list[str]]:
+        """Find every contact triplet against which some joint can propel the robot.
 
         Args:
             points: Push-points, tail to head.
-            body_points_w: (2, n_points) tail end, joints that bend and head end of the body in the world, m.
-            body_points_s_m: (n_points,) arc lengths of these points from the tail end.
-            current_choice: The choice that pushes now; None if none does.
+            body_points_w: (2, n_points) tail end, joints about the vertical axis and head end of the body in the
+                world, m.
+            body_point_arc_lengths_m: (n_points,) arc lengths of these points from the tail end.
+            current_choice: The choice that propels the robot now; None if none does.
             excluded_joint: Index of a joint that must not propel; None if every joint may.
 
         Returns:
-            The choices, and for each other triplet a text with its obstacles and why it cannot propel.
+            The choices (a triplet with its propelling joint), and for each other triplet a text with its obstacles and
+            why no joint can propel.
         """
-        choices: list[TripletChoice] = []
+        choices: list[PropulsionChoice] = []
         refusal_reasons: list[str] = []
-        triples = find_alternating_triples([point.contact.side for point in points])
-        triplets = self._solve_new_triplets(
-            [(points[i].contact, points[j].contact, points[k].contact) for i, j, k in triples]
+        index_triples = find_alternating_triples([point.contact.side for point in points])
+        triplets = self._solve_triplets_cached(
+            [(points[i].contact, points[j].contact, points[k].contact) for i, j, k in index_triples]
         )
-        for (i, j, k), triplet in zip(triples, triplets, strict=True):
-            contacts_s_m = (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m)
+        for (i, j, k), triplet in zip(index_triples, triplets, strict=True):
+            contact_arc_lengths_m = (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m)
+            # Triplets are cached: contacts that have not changed give the same object.
             current_joint = None
             if current_choice is not None and current_choice.triplet is triplet:
                 current_joint = current_choice.joint
-            choice = self._choose_propulsion_joint(
-                triplet, contacts_s_m, body_points_w, body_points_s_m, current_joint, excluded_joint
+            choice_or_reason = self._choose_propulsion_joint(
+                triplet, contact_arc_lengths_m, body_points_w, body_point_arc_lengths_m, current_joint, excluded_joint
             )
-            if isinstance(choice, TripletChoice):
-                choices.append(choice)
+            if isinstance(choice_or_reason, PropulsionChoice):
+                choices.append(choice_or_reason)
             else:
-                refusal_reasons.append(f"{'/'.join(triplet.names)}: {choice}")
+                refusal_reasons.append(f"{'/'.join(triplet.names)}: {choice_or_reason}")
         return choices, refusal_reasons
 
     def _choose_propulsion_joint(
@@ -250,7 +253,7 @@ class TripletFinder:
         body_points_s_m: Sequence[float],
         current_joint: int | None,
         excluded_joint: int | None,
-    ) -> TripletChoice | str:
+    ) -> PropulsionChoice | str:
         """Return a triplet with its propulsion joint and the torque for 1 N, or the reason why it cannot propel.
 
         Args:
@@ -276,9 +279,9 @@ class TripletFinder:
         if authority_problem:
             return authority_problem
         torque_per_n = compute_torque_per_newton(triplet.force_3_per_n, o_3.point_w, o_3.normal_w, joint_w)
-        return TripletChoice(triplet, contacts_s_m, joint, torque_per_n)
+        return PropulsionChoice(triplet, contacts_s_m, joint, torque_per_n)
 
-    def _solve_new_triplets(self, contact_triples: Sequence[ContactTriple]) -> list[Triplet]:
+    def _solve_triplets_cached(self, contact_triples: Sequence[ContactTriple]) -> list[Triplet]:
         """Return the triplets of these contacts in order. Solve only those that are new, and forget all others."""
         solved_triplets: dict[ObstacleNames, Triplet] = {}
         for contact_triple in contact_triples:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_gnc.control.obstacle_triplet.selection import TripletChoice
+from snakesim_gnc.control.obstacle_triplet.selection import PropulsionChoice
 from snakesim_gnc.control.obstacle_triplet.statics import compute_joint_torques
 from snakesim_gnc.geometry.body_on_path import BodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
@@ -12,7 +12,9 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import World, WorldContact
 
 
-def compute_bending_torques_nm(body: PlanarBody, body_pose: BodyPose, choice: TripletChoice, force_n: float) -> Floats:
+def compute_bending_torques_nm(
+    body: PlanarBody, body_pose: BodyPose, choice: PropulsionChoice, force_n: float
+) -> Floats:
     """Compute the torque of every joint for the planned contact forces.
 
     Args:
@@ -32,7 +34,7 @@ def compute_bending_torques_nm(body: PlanarBody, body_pose: BodyPose, choice: Tr
 
 
 def make_contact_messages(
-    body: PlanarBody, world: World, choice: TripletChoice, forces_n: Sequence[float]
+    body: PlanarBody, world: World, choice: PropulsionChoice, forces_n: Sequence[float]
 ) -> list[WorldContact]:
     """Return the three contacts of a triplet with their desired forces, as messages.
 

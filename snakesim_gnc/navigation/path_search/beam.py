@@ -44,7 +44,9 @@ from snakesim_hal.base.arrays import Floats
 TAIL_OFFSETS_M = (-0.03, 0.0, 0.03)  # to the left
 TAIL_TURNS_RAD = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
 
-PathSearch = Generator[int, None, SearchedPath | None]  # yields the nodes of each step; returns None without a path
+PathSearchSteps = Generator[
+    int, None, SearchedPath | None
+]  # yields the nodes of each step; returns None without a path
 
 
 class BeamSearch:
@@ -71,40 +73,52 @@ class BeamSearch:
             expander_class = NativeExpander if is_native_available() else NumpyExpander
         self._expander_class = expander_class
 
-    def search_ahead(self, body_w: Floats, goal_rad: float, steps: int) -> PathSearch:
+    def search_ahead(self, body_w: Floats, travel_direction_rad: float, arc_count: int) -> PathSearchSteps:
         """Search the best path ahead of the head.
 
         Args:
-            body_w: (n, 2) the body's curve, tail to head.
-            goal_rad: Direction of travel.
-            steps: Number of arcs.
+            body_w: (n, 2) points of the body's curve in the world, tail to head.
+            travel_direction_rad: Direction of travel in the world frame.
+            arc_count: Number of arcs (path segments of STEP_M) of the path.
+
+        Yields:
+            The number of expanded nodes of each step, so that a caller can spread the search over several ticks.
 
         Returns:
             A path of that many arcs, or of as many as there is room for; None if there is no room for one.
         """
         initial_body_w = sample_back_from_end(body_w, STEP_M, self._arcs_per_body)
         origin_w = body_w[-1]
-        middles_w, tangents = _compute_chord_middles_and_tangents(initial_body_w)
+        midpoints_w, tangents = _compute_chord_midpoints_and_tangents(initial_body_w)
         task = SearchTask(
             origin_w=origin_w,
-            goal_rad=goal_rad,
-            goal_w=np.array([np.cos(goal_rad), np.sin(goal_rad)]),
-            initial_drag_m=STEP_M * compute_wrenches(middles_w - origin_w, tangents),
+            travel_direction_rad=travel_direction_rad,
+            travel_direction_w=np.array([np.cos(travel_direction_rad), np.sin(travel_direction_rad)]),
+            # Integral of the wrench of the unit tangent over each arc of the body.
+            initial_drag_m=STEP_M * compute_wrenches(midpoints_w - origin_w, tangents),
         )
-        start = self._make_start_node_at_head(body_w, middles_w, tangents, task)
-        return (yield from self._expand_layers(start, steps, task))
+        start = self._make_start_node_at_head(body_w, midpoints_w, tangents, task)
+        return (yield from self._expand_layers(start, arc_count, task))
 
     def search_whole_body(
-        self, body_w: Floats, goal_rad: float, steps: int, max_sideways_m: float, failed_w: Floats | None = None
-    ) -> PathSearch:
+        self,
+        body_w: Floats,
+        travel_direction_rad: float,
+        arc_count: int,
+        max_sideways_m: float,
+        failed_w: Floats | None = None,
+    ) -> PathSearchSteps:
         """Search the best path for the whole body, which begins at the tail, and beyond the head.
 
         Args:
-            body_w: (n, 2) the body's curve, tail to head, m.
-            goal_rad: Direction of travel.
-            steps: Number of arcs beyond the head.
+            body_w: (n, 2) points of the body's curve in the world, tail to head, m.
+            travel_direction_rad: Direction of travel in the world frame.
+            arc_count: Number of arcs beyond the head.
             max_sideways_m: Maximum distance of the path from the current body.
             failed_w: (k, 2) points of paths on which the body got stuck here, m; the search prefers other ways round.
+
+        Yields:
+            The number of expanded nodes of each step.
 
         Returns:
             A path, which may have fewer arcs; None if there is none.
@@ -112,23 +126,25 @@ class BeamSearch:
         initial_body_w = sample_back_from_end(body_w, STEP_M, self._arcs_per_body)
         task = SearchTask(
             origin_w=body_w[-1],
-            goal_rad=goal_rad,
-            goal_w=np.array([np.cos(goal_rad), np.sin(goal_rad)]),
+            travel_direction_rad=travel_direction_rad,
+            travel_direction_w=np.array([np.cos(travel_direction_rad), np.sin(travel_direction_rad)]),
             initial_drag_m=np.zeros((self._arcs_per_body, 3)),
             initial_body_w=initial_body_w,
             max_sideways_m=max_sideways_m,
             failed_w=failed_w,
         )
         return (
-            yield from self._expand_layers(_make_start_nodes_at_tail(initial_body_w), self._arcs_per_body + steps, task)
+            yield from self._expand_layers(
+                _make_start_nodes_at_tail(initial_body_w), self._arcs_per_body + arc_count, task
+            )
         )
 
-    def _expand_layers(self, start: NodeLayer, steps: int, task: SearchTask) -> PathSearch:
+    def _expand_layers(self, start: NodeLayer, arc_count: int, task: SearchTask) -> PathSearchSteps:
         """Expand a number of layers of the search, and return the cheapest path.
 
         Args:
             start: Nodes of the first layer.
-            steps: Maximum number of arcs of the path.
+            arc_count: Maximum number of arcs of the path.
             task: Goal of the search, and the body from which it starts.
 
         Yields:
@@ -137,8 +153,8 @@ class BeamSearch:
         Returns:
             The cheapest path, or None if no arc is free.
         """
-        expander = self._expander_class(self._obstacles, self._parameters, task, start, steps)
-        for _ in range(steps):
+        expander = self._expander_class(self._obstacles, self._parameters, task, start, arc_count)
+        for _ in range(arc_count):
             yield expander.node_count
             if not expander.expand_layer():
                 break
@@ -169,7 +185,7 @@ class BeamSearch:
         return node
 
 
-def _compute_chord_middles_and_tangents(points_w: Floats) -> tuple[Floats, Floats]:
+def _compute_chord_midpoints_and_tangents(points_w: Floats) -> tuple[Floats, Floats]:
     """Return the middles (k, 2) and the unit vectors (k, 2) of the k chords between successive points (k + 1, 2)."""
     chords = np.diff(points_w, axis=0)
     lengths_m = np.maximum(np.hypot(chords[:, 0], chords[:, 1]), 1e-9)

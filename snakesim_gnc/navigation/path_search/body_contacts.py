@@ -57,7 +57,7 @@ def find_obstacle_contacts(
     is_close = gap_m < parameters.contact_distance_m
     is_at_side = np.abs(_dot(normals, tangents)) < MAX_FRONTAL
     is_contact = has_obstacle & is_close & is_at_side
-    propulsion = _dot(normals, task.goal_w)
+    propulsion = _dot(normals, task.travel_direction_w)
     contact_points_m = points_w - normals * parameters.radius_m - task.origin_w  # on the skin, from the origin
     unit_force = normals - parameters.assumed_obstacle_friction * tangents
     return ObstacleContacts(
@@ -76,7 +76,7 @@ def compute_node_margins_n(nodes: NodeLayer, parameters: SearchParameters) -> Fl
     """
     first_s_m = nodes.path_length_m - parameters.body_length_m + parameters.unused_tail_m
     last_s_m = nodes.path_length_m - parameters.unused_head_m
-    is_usable = (nodes.contact_s_m >= first_s_m) & (nodes.contact_s_m <= last_s_m)
+    is_usable = (nodes.contact_arc_length_m >= first_s_m) & (nodes.contact_arc_length_m <= last_s_m)
     usable_wrenches = np.where(is_usable[..., None], nodes.contact_wrench, 0.0)
     drag_per_newton = nodes.drag_m / parameters.body_length_m  # wrench of a drag of 1 N, spread over the whole body
     return compute_margins_n(usable_wrenches, drag_per_newton)

@@ -171,8 +171,8 @@ class NativeExpander(PathExpander):
         """
         native = self._native_search.task
         native.origin_x_m, native.origin_y_m = task.origin_w
-        native.goal_rad = task.goal_rad
-        native.goal_x, native.goal_y = task.goal_w
+        native.goal_rad = task.travel_direction_rad
+        native.goal_x, native.goal_y = task.travel_direction_w
         body_arcs = count_arcs_per_body(parameters)
         native.lying_drag_m = self._memory.get_array_address(
             "the drag of the lying body", task.initial_drag_m, (body_arcs, 3)
@@ -263,8 +263,8 @@ def _make_node_array(layer: NodeLayer, capacity: int) -> Array:
     used["curvature_per_m"] = layer.curvature_per_m
     used["cost_m"] = layer.cost_m
     used["drag_m"] = layer.drag_m
-    used["contacts"]["obstacle"] = layer.obstacle
-    used["contacts"]["s_m"] = layer.contact_s_m
+    used["contacts"]["obstacle"] = layer.contact_obstacle_index
+    used["contacts"]["s_m"] = layer.contact_arc_length_m
     used["contacts"]["gap_m"] = layer.contact_gap_m
     used["contacts"]["wrench"] = layer.contact_wrench
     return nodes

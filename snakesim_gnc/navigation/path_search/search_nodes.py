@@ -29,8 +29,8 @@ class NodeLayer:
     parent: Ints  # (n,) row in the layer before
     cost_m: Floats  # (n,) of the path from its start, in meters of path
     # Contacts of the body; the newest is last.
-    obstacle: Ints  # (n, C) index; NO_OBSTACLE in an empty slot
-    contact_s_m: Floats  # (n, C) arc length of the contact along the path
+    contact_obstacle_index: Ints  # (n, C) index; NO_OBSTACLE in an empty slot
+    contact_arc_length_m: Floats  # (n, C) arc length of the contact along the path
     contact_gap_m: Floats  # (n, C) between skin and obstacle
     contact_wrench: Floats  # (n, C, 3) of a unit push: fx, fy, moment about the search's origin in m
     # What resists the body.
@@ -47,29 +47,38 @@ class NodeLayer:
         }
         return NodeLayer(**arrays, path_length_m=self.path_length_m)
 
-    def add_contacts(self, is_touching: Bools, obstacle: Ints, gap_m: Floats, wrench: Floats, s_m: float) -> None:
-        """Store the contact of each node that touches an obstacle at an arc length.
+    def add_contacts(
+        self, touches: Bools, obstacle_index: Ints, gap_m: Floats, wrench: Floats, arc_length_m: float
+    ) -> None:
+        """Store a contact in each node of the search tree whose path touches an obstacle at an arc length.
 
-        A body slides along an obstacle over several arcs. That is one contact, stored where the gap is smallest; its
-        arc length is that of the newest arc. A contact with another obstacle takes a new slot and drops the oldest.
+        A path is a sequence of arcs. Consecutive arcs that touch the same obstacle are one contact: its gap and wrench
+        are those of the closest point, and its arc length is updated at every arc. A contact with another obstacle
+        becomes the newest of the MAX_CONTACTS contacts, in the last column, and the oldest, in column 0, is dropped.
 
         Args:
-            is_touching: (n,) which nodes touch an obstacle there; the other rows are ignored.
-            obstacle: (n,) index of the obstacle.
-            gap_m: (n,) gap between skin and obstacle.
-            wrench: (n, 3) wrench of a unit push.
-            s_m: Arc length of the contact.
+            touches: (n,) which nodes touch an obstacle at this arc length; the rows of all other nodes are ignored.
+            obstacle_index: (n,) index of the touched obstacle.
+            gap_m: (n,) gap between skin and obstacle, in m.
+            wrench: (n, 3) wrench of a unit normal force: fx, fy, and moment in m.
+            arc_length_m: Arc length of the contact along the path.
         """
-        is_same = is_touching & (self.obstacle[:, -1] == obstacle)
-        is_nearer = is_same & (gap_m < self.contact_gap_m[:, -1])
-        is_new = is_touching & ~is_same
-        for slots in (self.obstacle, self.contact_gap_m, self.contact_wrench, self.contact_s_m):
-            slots[is_new, :-1] = slots[is_new, 1:]
-        is_stored = is_new | is_nearer
-        self.obstacle[is_stored, -1] = obstacle[is_stored]
-        self.contact_gap_m[is_stored, -1] = gap_m[is_stored]
-        self.contact_wrench[is_stored, -1] = wrench[is_stored]
-        self.contact_s_m[is_touching, -1] = s_m
+        touches_same = touches & (self.contact_obstacle_index[:, -1] == obstacle_index)
+        touches_nearer = touches_same & (gap_m < self.contact_gap_m[:, -1])
+        touches_other = touches & ~touches_same
+        for column_array in (
+            self.contact_obstacle_index,
+            self.contact_gap_m,
+            self.contact_wrench,
+            self.contact_arc_length_m,
+        ):
+            column_array[touches_other, :-1] = column_array[touches_other, 1:]
+        is_updated = touches_other | touches_nearer
+        self.contact_obstacle_index[is_updated, -1] = obstacle_index[is_updated]
+        self.contact_gap_m[is_updated, -1] = gap_m[is_updated]
+        self.contact_wrench[is_updated, -1] = wrench[is_updated]
+        # Every touching node gets the new arc length, also if the gap is not smaller.
+        self.contact_arc_length_m[touches, -1] = arc_length_m
 
 
 def make_start_nodes(points_w: Floats, headings_rad: Floats) -> NodeLayer:
@@ -87,8 +96,8 @@ def make_start_nodes(points_w: Floats, headings_rad: Floats) -> NodeLayer:
         curvature_per_m=np.zeros(count),
         parent=np.full(count, NO_OBSTACLE),
         cost_m=np.zeros(count),
-        obstacle=np.full((count, MAX_CONTACTS), NO_OBSTACLE),
-        contact_s_m=np.full((count, MAX_CONTACTS), -np.inf),
+        contact_obstacle_index=np.full((count, MAX_CONTACTS), NO_OBSTACLE),
+        contact_arc_length_m=np.full((count, MAX_CONTACTS), -np.inf),
         contact_gap_m=np.full((count, MAX_CONTACTS), np.inf),
         contact_wrench=np.zeros((count, MAX_CONTACTS, 3)),
         drag_m=np.zeros((count, 3)),

@@ -24,8 +24,8 @@ class SearchTask:
     """The goal of one search, and the body from which it starts."""
 
     origin_w: Floats  # (2,) the head of the measured body; moments are about it
-    goal_rad: float
-    goal_w: Floats  # (2,) unit vector
+    travel_direction_rad: float
+    travel_direction_w: Floats  # (2,) unit vector
     initial_drag_m: Floats  # (a, 3) drag of each arc of the body that the start node has, tail to head
     # For a search of the whole body.
     initial_body_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head

@@ -116,7 +116,7 @@ class NumpyExpander(PathExpander):
             self._obstacles, arcs.middle_x_m, arcs.middle_y_m, arcs.middle_heading_rad
         )
         is_allowed &= self._arc_table.find_clear_poses(self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad)
-        from_goal_rad = arcs.heading_rad - self._task.goal_rad
+        from_goal_rad = arcs.heading_rad - self._task.travel_direction_rad
         heading_error_rad = np.abs(np.remainder(from_goal_rad + np.pi, 2 * np.pi) - np.pi)
         is_allowed &= heading_error_rad < MAX_HEADING_ERROR_RAD
         if sideways_m is not None:
@@ -142,7 +142,7 @@ class NumpyExpander(PathExpander):
         curvature_change = np.abs(self._arc_table.curvatures_per_m - parents.curvature_per_m[:, None])
         step_x = arcs.x_m - parents.x_m[:, None]
         step_y = arcs.y_m - parents.y_m[:, None]
-        progress_m = step_x * task.goal_w[0] + step_y * task.goal_w[1]
+        progress_m = step_x * task.travel_direction_w[0] + step_y * task.travel_direction_w[1]
         cost_m = (
             parents.cost_m[:, None]
             + STEP_M

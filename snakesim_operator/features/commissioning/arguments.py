@@ -3,7 +3,12 @@
 import argparse
 from pathlib import Path
 
-from snakesim_hal.programs.arguments import add_json, add_network_arguments, add_out, make_number_parser
+from snakesim_hal.programs.arguments import (
+    add_json_argument,
+    add_network_arguments,
+    add_output_argument,
+    make_number_parser,
+)
 from snakesim_hal.programs.commands import Command, Commands, Noun
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
@@ -85,7 +90,7 @@ def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RAD",
         help=f"as much may be lost in a gear when its load reverses (default: {ALLOWED_BACKLASH_RAD:g} rad)",
     )
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_identify_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,8 +98,8 @@ def _add_identify_arguments(parser: argparse.ArgumentParser) -> None:
         "run", type=Path, metavar="RUN", help="folder of the run, in which the robot was suspended by its tail"
     )
     add_write_option(parser, "the values are written into it")
-    add_out(parser, "the page, an HTML file (default: identified.html in the run)")
-    add_json(parser)
+    add_output_argument(parser, "the page, an HTML file (default: identified.html in the run)")
+    add_json_argument(parser)
 
 
 def _run_calibrate_zero(arguments: argparse.Namespace) -> int:

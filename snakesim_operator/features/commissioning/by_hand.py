@@ -28,9 +28,9 @@ from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, fi
 from snakesim_operator.features.commissioning.capture import (
     HandTurn,
     HandTurnDetector,
-    NotStillError,
+    RobotMovedError,
     TravelRange,
-    compute_zeros_rad,
+    compute_zero_offsets_rad,
 )
 from snakesim_operator.features.commissioning.judge import MAX_RATIO_ERROR
 from snakesim_operator.features.commissioning.robot_edit import (
@@ -164,7 +164,7 @@ def _connect_to_disarmed_robot(path: Path, selection: RobotSelection, command: s
 
     Args:
         path: Path of the user's own robot file.
-        selection: Selects the robot to connect to.
+        selection: Network and namespace of the robot to connect to.
         command: Name of the command for error messages, such as `robot calibrate zero`.
 
     Raises:
@@ -180,7 +180,7 @@ def calibrate_zeros(path: Path, selection: RobotSelection, *, wait_for_enter: bo
 
     Args:
         path: Path of the robot file.
-        selection: Selects the robot to connect to.
+        selection: Network and namespace of the robot to connect to.
         wait_for_enter: Whether to ask the person to lay the robot straight, and wait for Enter.
 
     Returns:
@@ -193,21 +193,23 @@ def calibrate_zeros(path: Path, selection: RobotSelection, *, wait_for_enter: bo
     with _connect_to_disarmed_robot(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
             print_line("Lay the robot straight on a flat floor, take your hands off it, then press Enter.")
-            list(robot.read_angles_rad(_is_enter_pressed))
+            for _ in robot.read_angles_rad(_is_enter_pressed):
+                pass  # reading continues until Enter is pressed; these samples are not needed
         start_s = time.monotonic()
         samples = list(robot.read_angles_rad(lambda: time.monotonic() - start_s > ZERO_SAMPLING_S))
         try:
-            zeros_rad = compute_zeros_rad(robot.joints, np.array(samples))
-        except NotStillError as error:
+            zero_offsets_rad = compute_zero_offsets_rad(robot.joints, np.array(samples))
+        except RobotMovedError as error:
             raise RefusedError(
                 f"{error} within {ZERO_SAMPLING_S:g} s; take your hands off the robot, and try again",
                 code="commissioning/not-possible",
             ) from None
     values_by_joint: dict[str, dict[str, Any]] = {}
-    for joint, zero_rad in zip(robot.joints, zeros_rad, strict=True):
-        print_line(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_rad:+8.4f}")
-        values_by_joint[joint.name] = {"zero_rad": zero_rad}
+    for joint, zero_offset_rad in zip(robot.joints, zero_offsets_rad, strict=True):
+        print_line(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_offset_rad:+8.4f}")
+        values_by_joint[joint.name] = {"zero_rad": zero_offset_rad}
         if joint.limits.cable_turns is not None:
+            # Time at which the cable was unwound; the host accepts it for an hour.
             values_by_joint[joint.name]["cable_unwound"] = datetime.now(UTC).isoformat(timespec="seconds")
             print_line(f"{joint.name:<10} its cable counts as unwound here: restart the host within an hour")
     _write_joint_values(path, values_by_joint, "straight pose")
@@ -221,7 +223,7 @@ def calibrate_directions(path: Path, selection: RobotSelection, names: Sequence[
 
     Args:
         path: Path of the robot file.
-        selection: Selects the robot to connect to.
+        selection: Network and namespace of the robot to connect to.
         names: Names of the joints to calibrate; all joints if empty.
 
     Returns:
@@ -257,7 +259,7 @@ def check_gears(path: Path, selection: RobotSelection, names: Sequence[str], deg
 
     Args:
         path: Path of the robot file.
-        selection: Selects the robot to connect to.
+        selection: Network and namespace of the robot to connect to.
         names: Names of the joints to check; all joints if empty.
         degrees: Angle by which the person turns each joint, in either direction.
 
@@ -343,7 +345,7 @@ def calibrate_limits(path: Path, selection: RobotSelection, names: Sequence[str]
 
     Args:
         path: Path of the robot file.
-        selection: Selects the robot to connect to.
+        selection: Network and namespace of the robot to connect to.
         names: Names of the joints whose limits are written; all joints if empty.
 
     Returns:

@@ -13,7 +13,7 @@ from snakesim_drivers.mounting import Mounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 
-MAX_STILL_MOTION_RAD = 0.01  # a joint that is not touched moves less, noise included
+STILLNESS_TOLERANCE_RAD = 0.01  # a joint that is not touched moves less, noise included
 MIN_TURN_RAD = 0.15  # about 9 degrees; a smaller turn may be a shake of the hand
 MAX_REST_MOTION_RAD = 0.02  # a robot that rests, or that a hand holds still, moves less within `REST_S`: 0.04 rad/s
 REST_S = 0.5
@@ -22,27 +22,27 @@ LIMIT_MARGIN_RAD = 0.02  # between the end that a hand found and the limit that 
 MIN_TRAVEL_RAD = 0.2
 
 
-class NotStillError(Exception):
+class RobotMovedError(Exception):
     """A joint moved while it should have been still."""
 
 
-def compute_zeros_rad(joints: Sequence[Joint], angles_rad: Floats) -> list[float]:
-    """Compute `zero_rad` of every drive from samples of a robot that lies straight.
+def compute_zero_offsets_rad(joints: Sequence[Joint], angles_rad: Floats) -> list[float]:
+    """Compute the zero offset (`zero_rad`) of every drive from samples of a robot that lies straight.
 
     Args:
         joints: Joints of the robot, tail to head.
         angles_rad: Joint angles of all samples, (n_samples, n_joints).
 
     Returns:
-        The drive angle of the straight pose in rad, for each joint.
+        The angle of each drive in the straight pose, in rad, tail to head.
 
     Raises:
-        NotStillError: A joint moved.
+        RobotMovedError: A joint moved while the samples were taken.
     """
-    range_rad = np.ptp(angles_rad, axis=0)
-    joint_index = int(np.argmax(range_rad))  # the joint that moved most
-    if range_rad[joint_index] > MAX_STILL_MOTION_RAD:
-        raise NotStillError(f"{joints[joint_index].name} moved by {range_rad[joint_index]:.3f} rad")
+    peak_to_peak_rad = np.ptp(angles_rad, axis=0)
+    joint_index = int(np.argmax(peak_to_peak_rad))  # the joint that moved most
+    if peak_to_peak_rad[joint_index] > STILLNESS_TOLERANCE_RAD:
+        raise RobotMovedError(f"{joints[joint_index].name} moved by {peak_to_peak_rad[joint_index]:.3f} rad")
     return Mounting(joints).to_drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
 
 

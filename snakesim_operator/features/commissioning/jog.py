@@ -33,7 +33,7 @@ from snakesim_hal.wire.messages import (
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.features.commissioning.by_hand import load_running_joints, select_joints
-from snakesim_operator.robot_commands.command import request_while_driving
+from snakesim_operator.robot_commands.command import request_while_commanding
 from snakesim_operator.robot_commands.teleop.keyboard import Keyboard
 
 KEY_HOLD_S = 0.15  # a key repeats 20 to 30 times a second
@@ -273,7 +273,7 @@ class _JogSession:
 
     def _send_request(self, request: LifecycleRequest, outcome: str) -> None:
         """Send a lifecycle request, and run cycles until the host confirms its outcome, such as `armed`."""
-        request_while_driving(self._session, request, outcome, self._connection, self._run_cycle)
+        request_while_commanding(self._session, request, outcome, self._connection, self._run_cycle)
 
     def _request_stop(self) -> None:
         self._stop_requested = True

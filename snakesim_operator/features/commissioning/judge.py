@@ -116,7 +116,7 @@ def judge_joints(
         allowed_backlash_rad: Motion that may be lost in a gear when its load reverses.
     """
     evaluator = _JointEvaluator(run, was_laid_straight=was_laid_straight, allowed_backlash_rad=allowed_backlash_rad)
-    return [evaluator.judge_joint(joint) for joint in range(len(run.joint_names))]
+    return [evaluator.check_joint(joint) for joint in range(len(run.joint_names))]
 
 
 class _JointEvaluator:
@@ -148,25 +148,29 @@ class _JointEvaluator:
             link_force_m_s2=measurements.link_force_m_s2[:, link_order],
         )
 
-    def judge_joint(self, joint: int) -> JointVerdict:
-        """Judge all properties of a joint: its drive, order, sign, gear and zero.
+    def check_joint(self, joint: int) -> JointVerdict:
+        """Check the drive of a joint and how it is mounted: its order, sign, gear ratio and zero offset.
 
         Args:
             joint: Index of the joint.
+
+        Returns:
+            A finding for each of these properties, and the measured range of motion (rad), ratio of the motions of link
+            and drive, and torque (N·m); a measurement is None if it could not be made.
         """
         measurements = self._measurements
         torque_nm = _compute_mean_driving_torque_nm(measurements, joint)
         motion_ratio = self._measure_motion_ratio(joint)
-        moved_rad = None
+        motion_range_rad = None
         if measurements.is_moved_by_target(joint).any():
-            moved_rad = measurements.measure_motion_range_rad(joint)
+            motion_range_rad = measurements.measure_motion_range_rad(joint)
         return JointVerdict(
             joint=measurements.joint_names[joint],
             findings={
                 "drive": _judge_drive(measurements, joint, torque_nm),
                 **self._judge_mounting(joint, motion_ratio),
             },
-            moved_rad=moved_rad,
+            moved_rad=motion_range_rad,
             turned=None if np.isnan(motion_ratio) else motion_ratio,
             torque_nm=torque_nm,
         )

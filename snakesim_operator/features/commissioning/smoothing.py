@@ -59,7 +59,7 @@ def is_slow(velocity_rad_s: Floats, threshold_rad_s: float, max_fraction: float)
 
 
 def _make_window(derivative_order: int = 0) -> Floats:
-    """Make the smoothing window or its first or second derivative with respect to ticks, (2 HALF_WINDOW_TICKS + 1,).
+    """Make the power-of-cosine smoothing window, or its first or second derivative with respect to ticks.
 
     With s = pi / (2 HALF_WINDOW_TICKS), at tick k from the middle:
 
@@ -69,7 +69,16 @@ def _make_window(derivative_order: int = 0) -> Floats:
 
     `sum` is the sum of cos(s k)^4 over the window, so that w sums to 1.
 
-    Differences of neighboring samples instead of w'' would make accelerations too small, and so rotors too heavy.
+    Finite differences instead of w'' would bias accelerations low, and hence the estimated rotor inertia high.
+
+    Args:
+        derivative_order: 0 for the window, 1 or 2 for its first or second derivative.
+
+    Returns:
+        (2 HALF_WINDOW_TICKS + 1,) weights of the samples, oldest first.
+
+    Raises:
+        ValueError: There is no such derivative.
     """
     phase_step = np.pi / (2 * HALF_WINDOW_TICKS)
     phase = np.arange(-HALF_WINDOW_TICKS, HALF_WINDOW_TICKS + 1) * np.pi / (2 * HALF_WINDOW_TICKS)
@@ -80,6 +89,8 @@ def _make_window(derivative_order: int = 0) -> Floats:
             shape = cos**4
         case 1:
             shape = -4 * cos**3 * sin * phase_step
-        case _:
+        case 2:
             shape = (12 * cos**2 * sin**2 - 4 * cos**4) * phase_step**2
+        case _:
+            raise ValueError(f"the derivative of order {derivative_order} is not available")
     return shape / np.sum(cos**4)

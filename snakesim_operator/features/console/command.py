@@ -17,7 +17,7 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import read_config
 from snakesim_hal.network.local_registry import list_local_robots
 from snakesim_hal.network.session import Link
-from snakesim_hal.programs.arguments import add_network_arguments, add_parent, add_scenario_arguments
+from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, add_scenario_arguments
 from snakesim_hal.programs.service_program import read_process_options
 from snakesim_operator.base import extras
 from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
@@ -97,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add_scenario_arguments(parser)
     add_network_arguments(parser, "")
-    add_parent(parser)
+    add_parent_argument(parser)
     parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited descriptor
     options = read_process_options(parser.parse_args(argv))
     _prepare_process()
@@ -139,11 +139,11 @@ def _run_front_server(port: int | None, link: Link | None, stop_event: threading
         start_restarting_thread("console front watch", partial(_set_after_exit, front, stop_event))
         try:
             yield ports
-            end_reason = front.describe_end()
+            end_reason = front.describe_exit()
         finally:
             children.stop_children([front])
             if front.was_killed:
-                print_line(f"warning: {front.describe_end()}")
+                print_line(f"warning: {front.describe_exit()}")
     if end_reason is not None:
         raise NotConnectedError(f"no browser can connect any more: {end_reason}")
 

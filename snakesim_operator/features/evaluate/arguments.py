@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.programs.arguments import (
-    add_fields,
-    add_out,
-    add_resume,
-    add_scenario_name,
-    add_seed,
-    add_set,
-    add_workers,
+    add_fields_argument,
+    add_output_argument,
+    add_resume_argument,
+    add_scenario_name_argument,
+    add_seed_argument,
+    add_set_argument,
+    add_workers_argument,
     make_number_parser,
 )
 from snakesim_hal.programs.commands import Command, Commands
@@ -29,7 +29,7 @@ MAX_TITLE_CHARACTERS = 200  # of a suite
 def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", metavar="SUITE", help="name of a shipped suite, or path of a suite file")
     parser.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
-    add_fields(parser, "for each row and controller (default: the suite's)")
+    add_fields_argument(parser, "for each row and controller (default: the suite's)")
     _add_rows(parser, "only these rows of the table, by number")
     parser.add_argument(
         "--against",
@@ -39,15 +39,15 @@ def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="pair with the score card there",
     )
-    add_set(parser)
+    add_set_argument(parser)
     _add_shared_options(parser)
 
 
 def _add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
-    add_scenario_name(parser)
+    add_scenario_name_argument(parser)
     _add_vary(parser, "values of a key: KEY=LOW:HIGH:COUNT, or KEY=[A, B] (may be repeated)")
     _add_seeds(parser, "runs for each value (default: 1)")
-    add_set(parser)
+    add_set_argument(parser)
     _add_shared_options(parser)
 
 
@@ -76,9 +76,9 @@ def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="SQLite file, which is continued if it exists (default: a new one in runs/)",
     )
-    add_set(parser)
+    add_set_argument(parser)
     _add_study_seed(parser)
-    add_workers(parser)
+    add_workers_argument(parser)
 
 
 def _add_rows(parser: argparse.ArgumentParser, about: str) -> None:
@@ -95,14 +95,14 @@ def _add_seeds(parser: argparse.ArgumentParser, about: str) -> None:
 
 def _add_shared_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
-    add_out(parser, "folder of the results (default: runs/NAME-TIME)")
-    add_resume(parser)
+    add_output_argument(parser, "folder of the results (default: runs/NAME-TIME)")
+    add_resume_argument(parser)
     _add_study_seed(parser)
-    add_workers(parser)
+    add_workers_argument(parser)
 
 
 def _add_study_seed(parser: argparse.ArgumentParser) -> None:
-    add_seed(
+    add_seed_argument(
         parser,
         "of the first field, of which each following field has the next number (default: 1, or drawn by the suite)",
     )

@@ -186,15 +186,17 @@ def _report_best(request: SearchRequest, study: Study) -> int:
     Returns:
         The exit code: 0, or 1 if no trial has a result.
     """
+    metric = request.goal
+    set_options = request.set
     if not study.get_trials(states=(TrialState.COMPLETE,)):
-        print_line(f"no trial had a {request.goal}")
+        print_line(f"no trial had a {metric}")
         return 1
     best_trial = study.best_trial
-    print_line(f"best {request.goal}: {best_trial.value:.4g}, trial {best_trial.user_attrs[TRIAL_NUMBER_ATTRIBUTE]}")
-    if request.rows:
+    print_line(f"best {metric}: {best_trial.value:.4g}, trial {best_trial.user_attrs[TRIAL_NUMBER_ATTRIBUTE]}")
+    if request.rows:  # the trial evaluated rows of a suite
         rows = ",".join(map(str, request.rows))
         command = ["snakesim", "study", "evaluate", request.scenario, "--rows", rows]
-        print_line(f"  {_format_command_line(command, request.set, best_trial.params)}")
+        print_line(f"  {_format_command_line(command, set_options, best_trial.params)}")
         return 0
     results = best_trial.user_attrs[TRIAL_RESULTS_ATTRIBUTE]
     if len(results) > 1:
@@ -203,12 +205,12 @@ def _report_best(request: SearchRequest, study: Study) -> int:
         print_line(
             "  the search ended this run when it was stuck; this command runs it to its end, so its number may differ:"
         )
-    table = compose_config_table(request.scenario, list(map(parse_set_option, request.set)))
-    values = {**best_trial.params, **dict.fromkeys(list_seed_keys(table), request.seed)}
+    config_table = compose_config_table(request.scenario, list(map(parse_set_option, set_options)))
+    overrides = {**best_trial.params, **dict.fromkeys(list_seed_keys(config_table), request.seed)}
     command = ["snakesim", "run", request.scenario, "--clock-mode", "lockstep"]
-    if table.values.get("mission", {}).get("goal"):
+    if config_table.values.get("mission", {}).get("goal"):
         command.append("--until-goal")  # without a goal it would be refused
-    print_line(f"  {_format_command_line(command, request.set, values)}")
+    print_line(f"  {_format_command_line(command, set_options, overrides)}")
     return 0
 
 

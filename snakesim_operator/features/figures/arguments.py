@@ -2,7 +2,7 @@
 
 import argparse
 
-from snakesim_hal.programs.arguments import add_out, make_number_parser
+from snakesim_hal.programs.arguments import add_output_argument, make_number_parser
 from snakesim_hal.programs.commands import Command, Commands
 from snakesim_operator.playback.arguments import add_span_options
 
@@ -26,7 +26,7 @@ def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
     instead.add_argument(
         "--paper", action="store_true", help="instead: the paper's Figures 8 to 13, of this run, one file each"
     )
-    add_out(parser, "FILE.pdf, .svg or .png, or a folder with --paper (default: in RUN)")
+    add_output_argument(parser, "FILE.pdf, .svg or .png, or a folder with --paper (default: in RUN)")
     parser.add_argument(
         "--width-in",
         type=make_number_parser(1.0, 40.0, "inches"),

@@ -101,7 +101,7 @@ def _plot_signals(
     Args:
         axes: The axes to plot into.
         groups: The runs.
-        signals_by_group: The columns of each run of each group.
+        signals_by_group: Signals of each run of each group, in the order of `groups`; there is at least one run.
         names: Names of signals with a common unit. A signal with several columns gets one line for each column.
 
     Returns:
@@ -114,6 +114,7 @@ def _plot_signals(
         _validate_signal_name(name, signals_by_group)
     unit = _find_common_unit(names, signals_by_group[0][0])
     curves: list[Curve] = []
+    # Several groups have a color each. In a single group, each curve gets the next color of the cycle below.
     for i, (group, runs) in enumerate(zip(groups, signals_by_group, strict=True)):
         color = RUN_COLORS[i % len(RUN_COLORS)] if len(groups) > 1 else None
         curves += _make_curves(group, runs, names, unit, color)
@@ -124,8 +125,9 @@ def _plot_signals(
     title = names[0] if len(names) == 1 else ""
     axes.set_ylabel(_make_axis_label(title, unit))
     labels = list(dict.fromkeys(curve.label for curve in curves))
-    is_mean = any(len(group.records) > 1 for group in groups)
-    return labels if len(labels) > 1 or is_mean else []
+    # A single mean curve has a legend, too, because its label names the group of runs.
+    has_mean_curve = any(len(group.records) > 1 for group in groups)
+    return labels if len(labels) > 1 or has_mean_curve else []
 
 
 def _make_curves(

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import IMAGES, MAX_IMAGE_BYTES, MAX_PAYLOAD_BYTES
+from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, MAX_IMAGE_BYTES, MAX_PAYLOAD_BYTES
 from snakesim_hal.wire.roles import Permission, Role, iterate_permissions
 from snakesim_operator.features.lab.identities import Identity, iterate_identities
 from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, Lab
@@ -139,7 +139,7 @@ def make_size_limits() -> list[dict[str, Any]]:
 
     Routers drop longer messages. Every key of the key space belongs to one of four groups with a common maximum.
     """
-    image_keys = [row.key for row in keys.SPACE if row.message in IMAGES]
+    image_keys = [row.key for row in keys.SPACE if row.message in IMAGE_MESSAGE_TYPES]
     query_keys = [row.key for row in keys.SPACE if row.kind == "query"]
     command_keys = [keys.JOINT_COMMAND, keys.INTENT, keys.DONE_ALL]
     grouped_keys = (*image_keys, *query_keys, *command_keys)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from snakesim_hal.base.process import raise_on_stop_signals
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.programs.arguments import add_json, add_out
+from snakesim_hal.programs.arguments import add_json_argument, add_output_argument
 from snakesim_hal.programs.commands import Command, Commands, Noun
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ AUTHORITY = "authority"
 
 def _add_lab_file_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lab", type=Path, metavar="LAB.toml", help="the lab file")
-    add_out(parser, "folder, with one folder for each machine in there", required=True)
+    add_output_argument(parser, "folder, with one folder for each machine in there", required=True)
 
 
 def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
     _add_lab_file_argument(parser)
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _run_example(_arguments: argparse.Namespace) -> int:

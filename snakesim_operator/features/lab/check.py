@@ -286,24 +286,24 @@ def _find_expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> 
 
 
 def check_emulation(robot: LabRobot, description: Description | None, results: CheckResults) -> None:
-    """Check that a robot is emulated if, and only if, the lab file names no bus for it.
+    """Check that a robot whose bus the lab file names has real drives, and that a simulated or emulated one has none.
+
+    A robot of another kind passes, because the lab file does not tell what moves.
 
     Args:
         robot: The robot's entry in the lab file.
         description: Description that the host of the robot publishes; None if there is none.
         results: Collects and prints the results.
     """
-    statement = describe_what_moves(description)
+    summary = describe_what_moves(description)
     if description is None:
-        results.report_failed(statement)
+        results.report_failed(summary)
     elif has_real_drives(robot) and description.emulated:
-        results.report_failed(
-            f"{statement}, but the lab file names its bus; render again, install, and restart the host"
-        )
+        results.report_failed(f"{summary}, but the lab file names its bus; render again, install, and restart the host")
     elif (robot.backend == SIMULATOR_BACKEND or robot.emulated) and not description.emulated:
-        results.report_failed(f"{statement}, but by the lab file nothing real is to move; see which host runs")
+        results.report_failed(f"{summary}, but by the lab file nothing real is to move; see which host runs")
     else:
-        results.report_passed(statement)
+        results.report_passed(summary)
 
 
 def _check_process(

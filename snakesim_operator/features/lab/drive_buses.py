@@ -18,15 +18,20 @@ SIMULATOR_BACKEND = "sim"
 MIXED_BACKEND = "mixed"  # each joint's drive type is in the robot file
 
 
+BusInterface = Literal["can", "serial"]
+
+
 @dataclass(frozen=True)
 class DriveType:
     """A drive type of SnakeSIM: where its buses are named."""
 
-    interface: Literal["can", "serial"]  # the key of the lab file
+    interface: BusInterface  # the key of the lab file
     buses_key: str  # in the backend's section of the scenario
     is_can_fd: bool = False
 
 
+OTHER_INTERFACE: dict[BusInterface, BusInterface] = {"can": "serial", "serial": "can"}
+BUS_EXAMPLES: dict[BusInterface, str] = {"can": 'can = ["can0"]', "serial": 'serial = ["/dev/ttyUSB0"]'}
 DRIVE_TYPES: dict[str, DriveType] = {
     "can": DriveType("can", "channels"),
     "odrive": DriveType("can", "channels"),
@@ -138,16 +143,17 @@ def validate_robot_buses(robots: Mapping[str, LabRobot], source: str) -> None:
         source: Path of the lab file, for error messages.
 
     Raises:
-        ConfigError: A robot would be driven without its buses, or two robots name the same bus.
+        ConfigError: A robot names no bus, or two robots name the same bus.
     """
     robot_by_bus: dict[tuple[str, str], str] = {}  # by machine and bus
     for name, robot in robots.items():
-        context = f"{source}: `robots.{name}"  # messages go on with the key, and close the backtick
-        _validate_no_bus_settings(robot, context)
+        context = f"{source}: `robots.{name}"  # helpers append `.KEY` and the closing backtick
+        _validate_absence_of_bus_settings(robot, context)
         if not is_on_bus(robot):
             continue
         _validate_bus_assignment(robot, context)
         for bus in (*robot.can, *robot.serial):
+            # The name of the first robot on this bus, which is this robot if the bus was free.
             other_robot = robot_by_bus.setdefault((robot.machine, bus), name)
             if other_robot != name:
                 raise ConfigError(
@@ -167,12 +173,12 @@ def _validate_bus_assignment(robot: LabRobot, context: str) -> None:
             code="lab/invalid-file",
         )
     elif robot.backend in DRIVE_TYPES:
-        _validate_single_drive_type(robot, context)
+        _validate_buses_of_single_drive_type(robot, context)
     else:
         _validate_external_backend(robot, context)
 
 
-def _validate_single_drive_type(robot: LabRobot, context: str) -> None:
+def _validate_buses_of_single_drive_type(robot: LabRobot, context: str) -> None:
     """Check the buses of a robot whose drives are all of one type: only buses of that type's interface may be named.
 
     Args:
@@ -182,15 +188,9 @@ def _validate_single_drive_type(robot: LabRobot, context: str) -> None:
     Raises:
         ConfigError: The robot has buses of the other interface (CAN or serial), or none.
     """
-    match DRIVE_TYPES[robot.backend].interface:
-        case "can":
-            interface = "can"
-            other_interface = "serial"
-            example = 'can = ["can0"]'
-        case "serial":
-            interface = "serial"
-            other_interface = "can"
-            example = 'serial = ["/dev/ttyUSB0"]'
+    interface = DRIVE_TYPES[robot.backend].interface
+    other_interface = OTHER_INTERFACE[interface]
+    example = BUS_EXAMPLES[interface]
     other_buses = _get_buses_of_interface(robot, other_interface)
     if other_buses:
         raise ConfigError(
@@ -288,7 +288,7 @@ def _validate_external_backend(robot: LabRobot, context: str) -> None:
         )
 
 
-def _validate_no_bus_settings(robot: LabRobot, context: str) -> None:
+def _validate_absence_of_bus_settings(robot: LabRobot, context: str) -> None:
     """Check that no setting names buses or bit rates: the units need them, and read them from their own keys."""
     for setting in robot.set:
         key = setting.partition("=")[0]

@@ -3,14 +3,14 @@
 import argparse
 from pathlib import Path
 
-from snakesim_hal.programs.arguments import add_json, add_out
+from snakesim_hal.programs.arguments import add_json_argument, add_output_argument
 from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim robot import`, which converts a URDF into a robot file."""
     parser.add_argument("file", type=Path, metavar="FILE.urdf", help="the URDF")
-    add_out(parser, "robot file to write (default: NAME.toml)")
+    add_output_argument(parser, "robot file to write (default: NAME.toml)")
     parser.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")
     parser.add_argument(
         "--up",
@@ -31,12 +31,12 @@ def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ROBOT",
         help="robot file with what URDF has no words for (default: planar13)",
     )
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
-    add_out(parser, "URDF to write (default: NAME.urdf)")
+    add_output_argument(parser, "URDF to write (default: NAME.urdf)")
 
 
 def _run_import(arguments: argparse.Namespace) -> int:

@@ -23,7 +23,7 @@ HEADING_BY_KEY = {
 
 
 def import_robot(file: Path, options: ImportOptions, output_path: Path | None, *, as_json: bool = False) -> int:
-    """Write a robot file from a URDF, and print how the two differ.
+    """Write a robot file from a URDF, and print what the import has changed, assumed or left out.
 
     Args:
         file: Path of the URDF.
@@ -51,6 +51,7 @@ def import_robot(file: Path, options: ImportOptions, output_path: Path | None, *
     if as_json:
         print_json({"file": str(path), **result.report})
         return 0
+    # The console shows the first notes after the heading of the file; the file has all of them.
     shown_count = _count_shown_notes(notes)
     for note in notes[1:shown_count]:
         print_line(note)

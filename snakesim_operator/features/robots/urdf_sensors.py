@@ -21,6 +21,8 @@ from snakesim_operator.features.robots.xml_tree import Element
 SECTION_BY_SENSOR_TYPE = {"imu": "imu", "contact": "contacts"}  # Gazebo's type -> its section in [sensors]
 DEPTH_SENSOR_TYPES = ("depth", "depth_camera", "rgbd_camera")
 RANGE_SENSOR_TYPES = ("ray", "gpu_ray", "lidar", "gpu_lidar")
+DEFAULT_BEAMS = "one beam"  # of a lidar without <horizontal>, as the report of the import says it
+DEFAULT_LIDAR_RANGE = "0.02 to 5 m"  # of a lidar without <range>, as the report of the import says it
 MAX_ROLL_RAD = 0.01  # about the viewing direction; more is reported
 POSE_DIGITS = 9  # decimals, which removes the noise of multiplying transforms
 DEFAULT_RATE_HZ_BY_SECTION = {
@@ -217,7 +219,8 @@ def _read_camera(result: ImportResult, sensor: Element) -> dict[str, Any]:
 def _read_lidar(result: ImportResult, sensor: Element, mounted_yaw_rad: float) -> dict[str, Any]:
     """Read beams, field of view, range and noise of a lidar.
 
-    A robot file's scan is symmetric about the viewing direction, so another scan also changes the sensor's yaw.
+    The scan in a robot file is symmetric about the viewing direction. An asymmetric scan is converted to a symmetric
+    one by rotating the sensor's yaw.
 
     Args:
         result: Result of the import, whose report is extended.
@@ -227,18 +230,20 @@ def _read_lidar(result: ImportResult, sensor: Element, mounted_yaw_rad: float) -
     Returns:
         The values by the key of the robot file.
     """
-    lidar = sensor.find_child("ray") or sensor.find_child("lidar")
+    lidar = sensor.find_child("ray")
     if lidar is None:
-        sensor.note_absent("<lidar>", "one beam, from 0.02 to 5 m")
+        lidar = sensor.find_child("lidar")
+    if lidar is None:
+        sensor.note_absent("<lidar>", f"{DEFAULT_BEAMS}, from {DEFAULT_LIDAR_RANGE}")
         return {}
     values: dict[str, Any] = {}
     scan = lidar.find_child("scan")
     horizontal = None if scan is None else scan.find_child("horizontal")
     if horizontal is None:
-        lidar.note_absent("<scan><horizontal>", "one beam")
+        lidar.note_absent("<scan><horizontal>", DEFAULT_BEAMS)
     else:
         values |= _read_scan(result, horizontal, mounted_yaw_rad)
-    values |= _read_distance_range(lidar, "range", "min", "max", "0.02 to 5 m")
+    values |= _read_distance_range(lidar, "range", "min", "max", DEFAULT_LIDAR_RANGE)
     values |= _read_noise(result, lidar)
     return values
 

@@ -6,7 +6,7 @@ import re
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.endpoint import check_endpoint
-from snakesim_hal.programs.arguments import add_network_arguments, add_out, make_number_parser
+from snakesim_hal.programs.arguments import add_network_arguments, add_output_argument, make_number_parser
 from snakesim_hal.programs.commands import Command, Commands
 from snakesim_operator.playback.arguments import add_recording_argument
 
@@ -86,7 +86,7 @@ def validate_arguments(arguments: argparse.Namespace) -> None:
 def _add_rosbag_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim recording rosbag`."""
     add_recording_argument(parser)
-    add_out(parser, "folder of the bag (default: beside the recording)")
+    add_output_argument(parser, "folder of the bag (default: beside the recording)")
     parser.add_argument(
         "--stamps",
         choices=["robot", "wall"],

@@ -108,7 +108,7 @@ class JointCommander:
         """Accept the joint targets of all messages that have arrived since the last tick, and report refused ones."""
         for message in self._message_reader.drain():
             wall_ns = time.time_ns()
-            age_ns = self._sender_clocks.measure_age(message, wall_ns, time.monotonic_ns())
+            age_ns = self._sender_clocks.estimate_age_ns(message, wall_ns, time.monotonic_ns())
             ros_now_ns = clock.timestamp_ns
             if self._wall_time:
                 ros_now_ns = wall_ns

@@ -21,7 +21,7 @@ WINDOW_PART_NS = 10_000_000_000
 WINDOW_PARTS = 12  # times WINDOW_PART_NS: the two minutes in which the fastest message is searched
 
 
-class _MinimumOffset:
+class _SlidingMinimumOffset:
     """The smallest difference between our wall clock and a sender's, for each part of the last two minutes.
 
     Each difference is clock offset plus latency, so the smallest one belongs to the fastest message.
@@ -30,8 +30,8 @@ class _MinimumOffset:
     def __init__(self) -> None:
         self._parts: deque[tuple[int, int]] = deque(maxlen=WINDOW_PARTS)  # number of the part, smallest offset in ns
 
-    def add_offset(self, offset_ns: int, monotonic_ns: int) -> int:
-        """Take in the offset of a message, and return in ns by how much it exceeds the smallest one."""
+    def update_and_get_delay(self, offset_ns: int, monotonic_ns: int) -> int:
+        """Record the offset of a message, and return by how many ns it exceeds the minimum of the last two minutes."""
         part = monotonic_ns // WINDOW_PART_NS
         while self._parts and self._parts[0][0] <= part - WINDOW_PARTS:
             self._parts.popleft()
@@ -48,34 +48,39 @@ class SenderClocks:
     """Measures the delay of each message by comparison with the fastest message of its sender."""
 
     def __init__(self) -> None:
-        self._min_offset_by_sender: OrderedDict[bytes, _MinimumOffset] = (
+        self._min_offset_by_sender: OrderedDict[bytes, _SlidingMinimumOffset] = (
             OrderedDict()
         )  # by sender, longest silent first
 
-    def measure_age(self, sample: RawSample, wall_ns: int, monotonic_ns: int) -> int:
-        """Measure the age of a message in ns, by comparison with the fastest message of its sender.
+    def estimate_age_ns(self, sample: RawSample, wall_ns: int, monotonic_ns: int) -> int:
+        """Estimate the age of a message in ns: its delay relative to the minimum observed clock offset of its sender.
 
-        The age is never below the time that the message has waited in this process.
+        The offset between the clocks is unknown, so the message with the smallest offset is taken to have no delay. The
+        age is never below the time that the message has waited in this process.
 
         Args:
             sample: The message with its attachment and its arrival time.
             wall_ns: Current time of this computer's wall clock.
-            monotonic_ns: Current monotonic time.
+            monotonic_ns: Current monotonic time, of the clock of `sample.arrived_ns`.
+
+        Returns:
+            The estimated age. Without an attachment that names the sender, only the time in this process.
         """
         waiting_ns = monotonic_ns - sample.arrived_ns
-        sender_and_time = read_sender(sample.attachment)
+        sender_and_time = parse_attachment(sample.attachment)
         if sender_and_time is None:
             return waiting_ns
         sender, sent_ns = sender_and_time
-        min_offset = self._min_offset_by_sender.setdefault(sender, _MinimumOffset())
+        min_offset = self._min_offset_by_sender.setdefault(sender, _SlidingMinimumOffset())
+        # Forget the senders that have been silent longest.
         self._min_offset_by_sender.move_to_end(sender)
         while len(self._min_offset_by_sender) > MAX_SENDERS:
             self._min_offset_by_sender.popitem(last=False)
-        delay_ns = min_offset.add_offset(wall_ns - sent_ns, monotonic_ns)
+        delay_ns = min_offset.update_and_get_delay(wall_ns - sent_ns, monotonic_ns)
         return max(delay_ns, waiting_ns)
 
 
-def read_sender(attachment: bytes) -> tuple[bytes, int] | None:
+def parse_attachment(attachment: bytes) -> tuple[bytes, int] | None:
     """Return the sender of a message and its wall-clock time of sending in ns; None without such an attachment."""
     if len(attachment) != ATTACHMENT.size:
         return None
@@ -118,7 +123,7 @@ def find_request_age_problem(attachment: bytes, wall_ns: int) -> str:
     Returns:
         The reason to refuse the request; empty if the request is recent.
     """
-    sender_and_time = read_sender(attachment)
+    sender_and_time = parse_attachment(attachment)
     if sender_and_time is None:
         return "the request has no time attached"
     _, sent_ns = sender_and_time

@@ -57,7 +57,7 @@ class CmdVelInput:
             return
         wall_ns = time.time_ns()
         monotonic_ns = time.monotonic_ns()
-        age_ns = self._sender_clocks.measure_age(twist, wall_ns, monotonic_ns)
+        age_ns = self._sender_clocks.estimate_age_ns(twist, wall_ns, monotonic_ns)
         body_heading_w_rad = find_heading()
         intent = self._steering.make_intent(twist.payload, robot_ns, body_heading_w_rad, age_ns)
         if intent is not None:

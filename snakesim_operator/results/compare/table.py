@@ -22,20 +22,24 @@ def format_comparison(difference: RunDifference) -> list[str]:
         difference: The comparison of the runs A and B.
 
     Returns:
-        Sections with an empty line between them: the runs, the settings that differ, the distances, the differences of
-        angles, speeds and torques, a row for each joint, and a summary in sentences.
+        Sections with an empty line between them: the runs, the settings that differ, the distances, the hand-overs
+        between controllers, the differences of angles, speeds and torques, a row for each joint, and a
+        summary in sentences.
     """
     common_s = difference.aligned.time_s[-1]
-    gap_heading = f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when"
+    difference_heading = f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when"
     lines = [_format_row("", "A", "B"), *_format_identifying_settings(difference)]
     lines += ["", *_format_differing_settings(difference.differing_settings)]
     if difference.drive_difference:
         lines.append(difference.drive_difference)
     lines += ["", f"over {common_s:.2f} s from the first arming, {difference.aligned.sampling_description}"]
     lines += _format_distance(difference)
-    lines += _format_hand_overs(difference)
-    lines += ["", gap_heading]
-    lines += [_format_quantity_difference(gap, difference.joints) for gap in difference.quantities]
+    lines += _format_controller_handovers(difference)
+    lines += ["", difference_heading]
+    lines += [
+        _format_quantity_difference(quantity_difference, difference.joints)
+        for quantity_difference in difference.quantities
+    ]
     lines += _format_torques_and_tracking(difference)
     lines += ["", *_format_joint_rows(difference)]
     lines += ["", *describe_difference(difference)]
@@ -156,7 +160,7 @@ def _format_distance(difference: RunDifference) -> list[str]:
     return [_format_row("moved", f"{advance.a_m:.3f} m", f"{advance.b_m:.3f} m", note), f"    ({advance.measure})"]
 
 
-def _format_hand_overs(difference: RunDifference) -> list[str]:
+def _format_controller_handovers(difference: RunDifference) -> list[str]:
     """Format the rows about the order in which joints propelled the robot.
 
     A hand-over is the time at which a joint begins to propel instead of the one before. For each hand-over to the same

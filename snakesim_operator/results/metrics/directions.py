@@ -4,6 +4,7 @@ A body that travels sideways goes far, but hardly along its heading. None is unk
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -23,34 +24,35 @@ class HeadingEffort:
     heading_body_lengths_s: float | None = None
     heading_cost_of_transport: float | None = None
 
-    @staticmethod
+    @classmethod
     def from_run(
+        cls,
         record: RunRecord,
         progress: ForwardProgress | None,
-        pose_known_duration_s: float,
+        tracked_duration_s: float,
         *,
         has_torque_and_velocity: bool,
-    ) -> "HeadingEffort":
+    ) -> Self:
         """Compute speed and energy use along the heading.
 
         Args:
             record: The recorded run.
-            progress: Advance of the body; None if the pose is unknown.
-            pose_known_duration_s: Time from the first known pose to the last, in s.
+            progress: Path of the center of mass, and its advance along the heading. None if the pose is unknown.
+            tracked_duration_s: Time from the first known pose to the last, in s.
             has_torque_and_velocity: Whether joint torques and velocities are known, so that energy can be computed.
 
         Returns:
             The metrics. All are None if the pose is unknown. Metrics of energy are None if torques or velocities are
             unknown.
         """
-        if progress is None or pose_known_duration_s <= 0:
-            return HeadingEffort()
+        if progress is None or tracked_duration_s <= 0:
+            return cls()
         distance_m = float(progress.max_heading_advance_m[-1])
         cost = _compute_energy_cost(record, distance_m, has_torque_and_velocity=has_torque_and_velocity)
-        return HeadingEffort(
+        return cls(
             heading_advance_m=distance_m,
             heading_energy_j_per_m=cost.energy_j_per_m,
-            heading_body_lengths_s=distance_m / pose_known_duration_s / get_body_length_m(record),
+            heading_body_lengths_s=distance_m / tracked_duration_s / get_body_length_m(record),
             heading_cost_of_transport=cost.cost_of_transport,
         )
 
@@ -68,37 +70,38 @@ class Displacement:
     displacement_slip: float | None = None  # 1 minus the displacement over the mean path length of the links
     lateral_slip: float | None = None  # fraction of the links' paths that is across their own axes
 
-    @staticmethod
+    @classmethod
     def from_run(
+        cls,
         record: RunRecord,
         progress: ForwardProgress | None,
-        pose_known_duration_s: float,
+        tracked_duration_s: float,
         *,
         has_torque_and_velocity: bool,
-    ) -> "Displacement":
+    ) -> Self:
         """Compute speed, energy use and slip along the net displacement of the center of mass.
 
         Args:
             record: The recorded run.
-            progress: Advance of the body; None if the pose is unknown.
-            pose_known_duration_s: Time from the first known pose to the last, in s.
+            progress: Path of the center of mass, and its advance along the heading. None if the pose is unknown.
+            tracked_duration_s: Time from the first known pose to the last, in s.
             has_torque_and_velocity: Whether joint torques and velocities are known, so that energy can be computed.
 
         Returns:
             The metrics. All are None if the pose is unknown. Metrics of energy are None if torques or velocities are
             unknown.
         """
-        if progress is None or pose_known_duration_s <= 0:
-            return Displacement()
+        if progress is None or tracked_duration_s <= 0:
+            return cls()
         displacement_w = progress.center_w[-1] - progress.center_w[0]
         distance_m = float(np.linalg.norm(displacement_w))
         cost = _compute_energy_cost(record, distance_m, has_torque_and_velocity=has_torque_and_velocity)
         slip = measure_slip(record, distance_m)
-        return Displacement(
-            displacement_m_s=distance_m / pose_known_duration_s,
+        return cls(
+            displacement_m_s=distance_m / tracked_duration_s,
             displacement_bearing_rad=_find_bearing_rad(progress, displacement_w),
             displacement_energy_j_per_m=cost.energy_j_per_m,
-            displacement_body_lengths_s=distance_m / pose_known_duration_s / get_body_length_m(record),
+            displacement_body_lengths_s=distance_m / tracked_duration_s / get_body_length_m(record),
             displacement_cost_of_transport=cost.cost_of_transport,
             displacement_efficiency=compute_propulsive_efficiency(record, cost.cost_of_transport),
             displacement_slip=slip.longitudinal,

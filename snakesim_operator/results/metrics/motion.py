@@ -104,12 +104,13 @@ def _read_center_of_mass_path(record: RunRecord) -> tuple[Floats, Floats] | None
         time_s: (m,) times from the start of the time axis, in s.
         center_w: (m, 2) positions of the center of mass in the world, in m.
     """
+    # The record has a pose sensor: its path is also that of the forward progress.
     progress = ForwardProgress.from_run(record)
     if progress is not None:
         return progress.time_s, progress.center_w
     time_origin_s = get_time_origin_s(record)
     samples: list[tuple[float, float, float]] = []
-    for world in record.worlds:  # messages with the pose that guidance used
+    for world in record.worlds:  # world models, with the pose that guidance used
         time_s = world.timestamp_ns * 1e-9
         if time_s < time_origin_s or world.pose_from != "sensor" or world.center_w is None:
             continue
@@ -117,8 +118,8 @@ def _read_center_of_mass_path(record: RunRecord) -> tuple[Floats, Floats] | None
         samples.append((time_s - time_origin_s, x, y))
     if len(samples) < 2:
         return None
-    table = np.array(samples)  # (m, 3)
-    return table[:, 0], table[:, 1:]
+    samples_array = np.array(samples)  # (m, 3): time, x, y
+    return samples_array[:, 0], samples_array[:, 1:]
 
 
 def _find_window_starts(time_s: Floats) -> NDArray[np.intp]:

@@ -18,7 +18,8 @@ PlotlyDict = dict[str, Any]
 LIBRARY = Path(__file__).parent / "vendor" / "plotly-cartesian.min.js"
 TIME_BUCKET_COUNT = 500  # of the time axis; of each bucket the minimum and the maximum are drawn
 MAP_COLUMNS = 480
-ROW_HEIGHT = 25  # height of a row of bars in px, enough for text of 11 px
+ROW_HEIGHT_PX = 25  # height of a row of bars in px, enough for text of 11 px
+BAR_CHART_MARGIN_PX = 64  # above and below the rows of bars, for the title and the time axis
 MAX_BARS = 2000
 MIN_LABELED_FRACTION = 0.03  # of the time axis; a shorter bar has no room for its text
 
@@ -110,22 +111,24 @@ def make_line_chart(
         "yaxis": {"title": {"text": axis}, "rangemode": range_mode},
     }
     traces = [line.make_trace() for line in drawn_lines]
-    return _make_time_figure(title, traces, height, end_s, shapes, annotations, markers, layout)
+    return _make_time_figure(
+        title, traces, height, end_s, shapes=shapes, annotations=annotations, markers=markers, layout=layout
+    )
 
 
 def make_bar_chart(
-    title: str, rows: Sequence[str], drawn_bars: Sequence[Bar], end_s: float, markers: Sequence[TimeMarker] = ()
+    title: str, rows: Sequence[str], bars: Sequence[Bar], end_s: float, markers: Sequence[TimeMarker] = ()
 ) -> PlotlyDict:
     """Make a Plotly chart of horizontal bars over time, such as the states of a run.
 
     Args:
         title: Title of the chart.
         rows: Names of the rows; the first is on top.
-        drawn_bars: The bars, each in one of the rows. The longest MAX_BARS are drawn if there are more.
+        bars: The bars, each in one of the rows. If there are more than MAX_BARS, only the longest are drawn.
         end_s: End of the time axis, in s.
         markers: Times that get a dashed vertical line.
     """
-    longest_first = sorted(drawn_bars, key=lambda bar: bar.start_s - bar.end_s)
+    longest_first = sorted(bars, key=lambda bar: bar.end_s - bar.start_s, reverse=True)
     shown = longest_first[:MAX_BARS]
     min_labeled_s = MIN_LABELED_FRACTION * end_s
     durations_s = [bar.end_s - bar.start_s for bar in shown]
@@ -153,8 +156,8 @@ def make_bar_chart(
         "hovermode": "closest",
         "yaxis": {"type": "category", "categoryarray": bottom_to_top, "range": [-0.5, len(rows) - 0.5]},
     }
-    height = 64 + ROW_HEIGHT * len(rows)
-    return _make_time_figure(title, [trace], height, end_s, [], [], markers, layout)
+    height = BAR_CHART_MARGIN_PX + ROW_HEIGHT_PX * len(rows)
+    return _make_time_figure(title, [trace], height, end_s, shapes=[], annotations=[], markers=markers, layout=layout)
 
 
 def make_joint_heatmap(
@@ -201,7 +204,9 @@ def make_joint_heatmap(
         shapes.append(_make_rectangle(start_s, end_s, joint - 0.5, joint + 0.5, "y", line=outline))
     rows_height = min(max(len(joints) * 18, 120), 420)
     layout = {"hovermode": "closest", "yaxis": {"type": "category", "nticks": 16, "showgrid": False}}
-    return _make_time_figure(title, [trace], 60 + rows_height, end_s, shapes, [], markers, layout)
+    return _make_time_figure(
+        title, [trace], 60 + rows_height, end_s, shapes=shapes, annotations=[], markers=markers, layout=layout
+    )
 
 
 def select_rows_to_draw(values: Floats, buckets: int = TIME_BUCKET_COUNT) -> NDArray[np.intp]:
@@ -242,6 +247,7 @@ def _make_time_figure(
     traces: list[PlotlyDict],
     height: int,
     end_s: float,
+    *,
     shapes: list[PlotlyDict],
     annotations: list[PlotlyDict],
     markers: Sequence[TimeMarker],

@@ -4,7 +4,7 @@ A phrase that is part of a longer sentence ends with its own separator; without 
 """
 
 from snakesim_operator.results.metrics.motion import StopIntervals
-from snakesim_operator.results.report.timeline import find_report_mismatch
+from snakesim_operator.results.report.timeline import find_false_not_locomoting_reports
 from snakesim_operator.results.run_ending import COMPLETE, UNKNOWN_PREFIX
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary
@@ -99,7 +99,7 @@ def describe_ending(ended: str) -> str:
 
 def describe_contradiction(record: RunRecord, motion: StopIntervals) -> str:
     """Describe for how long control reported no motion while the body moved; empty if it did not for long."""
-    mismatch = find_report_mismatch(record, motion)
+    mismatch = find_false_not_locomoting_reports(record, motion)
     if mismatch is None:
         return ""
     reason = mismatch.reason.strip().rstrip(".;")

@@ -14,7 +14,12 @@ from snakesim_operator.results.metrics.motion import find_stops
 from snakesim_operator.results.page.charts import Bar, Line, PlotlyDict, make_bar_chart, make_line_chart
 from snakesim_operator.results.report.timeline import find_longest_reason, find_state_intervals
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.time_axis import get_report_time_s, get_run_end_s, get_time_origin_s, list_report_spans
+from snakesim_operator.results.time_axis import (
+    get_report_time_s,
+    get_run_end_s,
+    get_time_origin_s,
+    list_control_state_spans,
+)
 
 MAX_OBSTACLES = 24  # with a row of their own: those with the largest impulse
 MIN_FORCE_N = 0.5  # a smaller desired force is ignored
@@ -165,7 +170,7 @@ def _draw_pushed_obstacles(record: RunRecord) -> PlotlyDict:
 
 def _spans_by_obstacle(record: RunRecord) -> dict[str, list[ForceSpan]]:
     spans: dict[str, list[ForceSpan]] = {}
-    for start_s, until_s, state in list_report_spans(record):
+    for start_s, until_s, state in list_control_state_spans(record):
         for contact in state.push_points:
             force_n = math.hypot(*contact.force_w[:2])
             if force_n >= MIN_FORCE_N and until_s > start_s:

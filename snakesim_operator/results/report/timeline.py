@@ -16,7 +16,7 @@ from snakesim_operator.results.time_axis import (
     Interval,
     get_report_time_s,
     get_time_origin_s,
-    list_report_spans,
+    list_control_state_spans,
     merge_equal_reports,
 )
 
@@ -45,7 +45,7 @@ def find_state_intervals(record: RunRecord) -> list[Interval]:
 
 
 @dataclass(frozen=True)
-class ReportMismatch:
+class FalseNotLocomotingReports:
     """Control reported for some time that the body did not locomote while it moved."""
 
     duration_s: float
@@ -53,28 +53,30 @@ class ReportMismatch:
     reason: str  # the reason that was reported for longest
 
 
-def find_report_mismatch(record: RunRecord, stop_intervals: StopIntervals) -> ReportMismatch | None:
-    """Find the reports of control that the body did not locomote while it moved.
+def find_false_not_locomoting_reports(
+    record: RunRecord, stop_intervals: StopIntervals
+) -> FalseNotLocomotingReports | None:
+    """Find where the controller reported NotLocomoting although the body was moving.
 
     Args:
         record: The recorded run.
         stop_intervals: Measured intervals without motion.
 
     Returns:
-        Their total duration, start and main reason; None if they lasted less than MIN_MISMATCH_S.
+        Total duration, first start and main reason of these reports; None if they lasted less than MIN_MISMATCH_S.
     """
     duration_s_by_reason: dict[str, float] = {}
     start_times_s: list[float] = []
-    for start_s, end_s, state in list_report_spans(record):
-        is_report = state.state == "NotLocomoting" and state.reason != STANDING_STILL
-        if not is_report or end_s <= start_s or stop_intervals.is_stationary_at((start_s + end_s) / 2):
+    for start_s, end_s, state in list_control_state_spans(record):
+        claims_no_locomotion = state.state == "NotLocomoting" and state.reason != STANDING_STILL
+        if not claims_no_locomotion or end_s <= start_s or stop_intervals.is_stationary_at((start_s + end_s) / 2):
             continue
         duration_s_by_reason[state.reason] = duration_s_by_reason.get(state.reason, 0.0) + end_s - start_s
         start_times_s.append(start_s)
     total_s = sum(duration_s_by_reason.values())
     if total_s < MIN_MISMATCH_S:
         return None
-    return ReportMismatch(
+    return FalseNotLocomotingReports(
         total_s, start_times_s[0], max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason])
     )
 
@@ -82,7 +84,7 @@ def find_report_mismatch(record: RunRecord, stop_intervals: StopIntervals) -> Re
 def find_longest_reason(record: RunRecord, interval: Interval) -> str:
     """Return the reason for no motion that control reported for longest in an interval; without any, STANDING_STILL."""
     duration_s_by_reason: dict[str, float] = {}
-    for start_s, end_s, state in list_report_spans(record):
+    for start_s, end_s, state in list_control_state_spans(record):
         overlap_s = min(end_s, interval.end_s) - max(start_s, interval.start_s)
         if state.state != "Locomoting" and overlap_s > 0:
             duration_s_by_reason[state.reason] = duration_s_by_reason.get(state.reason, 0.0) + overlap_s

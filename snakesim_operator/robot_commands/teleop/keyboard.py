@@ -22,7 +22,7 @@ MAX_KEYS_PER_READ = (
     8  # keys in one reading; teleop reads 20 times a second, and a keyboard repeats up to 50 times a second
 )
 RATE_WINDOW_S = 0.5
-MAX_KEYS_HZ = 60.0  # more keys a second than any keyboard repeats
+MAX_KEY_RATE_HZ = 60.0  # more keys a second than any keyboard repeats
 MAX_UNREAD_DURATION_S = 0.5  # between two readings; keys may have waited for that long
 NO_TERMINAL_MESSAGE = "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
 INPUT_FLAGS, LOCAL_FLAGS, CONTROL_CHARACTERS = 0, 3, 6  # indices of what termios.tcgetattr returns
@@ -39,8 +39,11 @@ class KeyTiming:
         self._last_read_s: float | None = None  # None: no reading yet
         self._key_times_s: deque[float] = deque()  # of the keys of the last RATE_WINDOW_S
 
-    def are_late(self, key_count: int, now_s: float) -> bool:
-        """Record a reading of the keyboard, and return whether its keys may be old.
+    def record_read(self, key_count: int, now_s: float) -> bool:
+        """Record a reading of the keyboard, and return whether its keys may be stale.
+
+        After a stall, keys that were pressed meanwhile arrive together. So more keys than a keyboard sends, or any key
+        after a long pause between readings, may be stale.
 
         Call this for each reading, also for a reading without keys.
 
@@ -48,17 +51,17 @@ class KeyTiming:
             key_count: Number of keys in this reading.
             now_s: Monotonic time of this reading.
         """
-        unread_duration_s = math.inf
+        time_since_last_read_s = math.inf
         if self._last_read_s is not None:
-            unread_duration_s = now_s - self._last_read_s
+            time_since_last_read_s = now_s - self._last_read_s
         self._last_read_s = now_s
         while self._key_times_s and now_s - self._key_times_s[0] > RATE_WINDOW_S:
             self._key_times_s.popleft()
         self._key_times_s.extend([now_s] * key_count)
         if key_count == 0:
             return False
-        has_too_many_keys = key_count > MAX_KEYS_PER_READ or len(self._key_times_s) > MAX_KEYS_HZ * RATE_WINDOW_S
-        return has_too_many_keys or unread_duration_s > MAX_UNREAD_DURATION_S
+        has_too_many_keys = key_count > MAX_KEYS_PER_READ or len(self._key_times_s) > MAX_KEY_RATE_HZ * RATE_WINDOW_S
+        return has_too_many_keys or time_since_last_read_s > MAX_UNREAD_DURATION_S
 
 
 class Keyboard:
@@ -109,7 +112,7 @@ class Keyboard:
         """
         readable, _, _ = select.select([self._file_descriptor], [], [], timeout_s)
         pressed = self._read_keys() if readable else []
-        self.has_late_keys = self._timing.are_late(len(pressed), time.monotonic())
+        self.has_late_keys = self._timing.record_read(len(pressed), time.monotonic())
         return pressed
 
     def _read_keys(self) -> list[str]:

@@ -218,7 +218,7 @@ def test_a_loop_has_the_bits_of_a_batch(monkeypatch: pytest.MonkeyPatch) -> None
         envs.reset(seed=1)
         actions = draw_actions(make(CASES["delayed sensors"]), seed=1)
         returned = [envs.step(np.tile(next(actions), (3, 1))) for _ in range(16)]
-        simulations = envs._episodes.robots._batch.simulated._simulations  # pyright: ignore
+        simulations = envs._episodes.robots._batch.simulation._simulations  # pyright: ignore
         envs.close()
         return returned, type(simulations)
 
@@ -239,7 +239,7 @@ def test_a_simulation_that_diverges_stops_only_its_environment() -> None:
         action = still if isinstance(envs, SnakeEnv) else np.tile(still, (3, 1))
         envs.step(action)
         episodes = envs._episodes
-        simulations = episodes.robots._batch.simulated._simulations  # pyright: ignore
+        simulations = episodes.robots._batch.simulation._simulations  # pyright: ignore
         simulations.base_velocity[0, 0] = 1e4
         _, _, terminated, _, infos = envs.step(action)
         if isinstance(envs, SnakeEnv):

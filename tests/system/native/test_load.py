@@ -26,13 +26,13 @@ def small_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[P
         monkeypatch.setattr(module, "SHIPPED_FOLDER", package / "compiled")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("SNAKESIM_NATIVE", raising=False)
-    load._load_once.cache_clear()
+    load._load_cached.cache_clear()
     yield package
-    load._load_once.cache_clear()
+    load._load_cached.cache_clear()
 
 
 def load_again() -> load.LoadedLibrary:
-    load._load_once.cache_clear()
+    load._load_cached.cache_clear()
     return load.load_shared_library(NUMBERS)
 
 

@@ -80,4 +80,4 @@ def test_child_that_does_not_end_is_killed_and_described(tmp_path: Path, monkeyp
     child = start_child("control", ["deaf"], said.extend, extra_env={"PYTHONPATH": str(tmp_path)})
     wait_until(lambda: b"ready" in said, "a child that ignores SIGTERM")
     stop_children([child])
-    assert child.describe_end() == "control was killed: it had not ended 0.2 s after the request to end"
+    assert child.describe_exit() == "control was killed: it had not ended 0.2 s after the request to end"

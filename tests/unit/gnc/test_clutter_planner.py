@@ -10,7 +10,7 @@ from snakesim_gnc.geometry.body_on_path import compute_chain_points
 from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_grid import MAX_DISTANCE_M, NO_OBSTACLE, ObstacleGrid
-from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearchSteps
 from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath
 from snakesim_hal.model.outlines import compute_outline_distance_m
@@ -66,7 +66,7 @@ def planned(
     return found
 
 
-def path_of(search: PathSearch) -> SearchedPath | None:
+def path_of(search: PathSearchSteps) -> SearchedPath | None:
     while True:
         try:
             next(search)

@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_gnc.geometry.planar import resample_evenly
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearch
+from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearchSteps
 from snakesim_gnc.navigation.path_search.native_growth import NativeExpander
 from snakesim_gnc.navigation.path_search.native_library import PlannerLibraryError, is_native_available, load_library
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
@@ -58,7 +58,7 @@ def make_obstacles(random: np.random.Generator, body_w: Floats) -> list[Obstacle
     return obstacles
 
 
-def finish(search: PathSearch) -> tuple[list[int], SearchedPath | None]:
+def finish(search: PathSearchSteps) -> tuple[list[int], SearchedPath | None]:
     """Return the nodes of each step of a search, and its path."""
     nodes: list[int] = []
     while True:
@@ -141,7 +141,12 @@ def test_the_random_scenes_reach_what_they_are_to_compare() -> None:
 
 
 def make_task(initial_drag_m: Floats) -> SearchTask:
-    return SearchTask(origin_w=np.zeros(2), goal_rad=0.0, goal_w=np.array([1.0, 0.0]), initial_drag_m=initial_drag_m)
+    return SearchTask(
+        origin_w=np.zeros(2),
+        travel_direction_rad=0.0,
+        travel_direction_w=np.array([1.0, 0.0]),
+        initial_drag_m=initial_drag_m,
+    )
 
 
 def start_layer() -> NodeLayer:
@@ -186,9 +191,9 @@ def test_the_grid_of_obstacles_is_the_same_without_the_library(request: pytest.F
     native = ObstacleGrid(obstacles)
     request.getfixturevalue("no_library")
     specified = ObstacleGrid(obstacles)
-    assert native.cell_nearest.tobytes() == specified.cell_nearest.tobytes()
+    assert native.nearest_obstacle_by_cell.tobytes() == specified.nearest_obstacle_by_cell.tobytes()
     assert native.cell_distance_m.tobytes() == specified.cell_distance_m.tobytes()
-    assert len(np.unique(native.cell_nearest)) > len(obstacles) // 2
+    assert len(np.unique(native.nearest_obstacle_by_cell)) > len(obstacles) // 2
 
 
 @pytest.mark.usefixtures("no_library")

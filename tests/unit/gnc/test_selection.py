@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.obstacle_triplet.contacts import PushPoint, find_push_points, plan_contact
 from snakesim_gnc.control.obstacle_triplet.selection import (
-    TripletChoice,
+    PropulsionChoice,
     TripletFinder,
     choose_triplet,
     find_alternating_triples,
@@ -140,7 +140,9 @@ def test_noise_does_not_pass_the_turn_to_and_fro():
 def choices_in_row(count=7):
     row = planned_row()
     triplets = solve_triplets([(row[i], row[i + 1], row[i + 2]) for i in range(count)], condition_max=100.0)
-    return [TripletChoice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
+    return [
+        PropulsionChoice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)
+    ]
 
 
 def test_selection_keeps_triplet_and_successor_shares_most_push_points():
@@ -160,7 +162,7 @@ def test_of_equals_the_one_nearest_to_the_tail_is_chosen():
 def test_points_become_choices_with_a_joint_each():
     points, lie = points_at(0.2)
     triplets = TripletFinder(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.find_choices(points, lie.body_points_w, NODE_S, None, None)
+    found, refused = triplets.find_propulsion_choices(points, lie.body_points_w, NODE_S, None, None)
     threes = [[int(name[-1]) for name in c.triplet.names] for c in found]
     assert threes == [[0, 1, 2], [0, 1, 4], [1, 2, 3], [2, 3, 4]]
     assert len(refused) == 1
@@ -168,7 +170,7 @@ def test_points_become_choices_with_a_joint_each():
     for choice in found:
         assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
-    barred, why = triplets.find_choices(points, lie.body_points_w, NODE_S, None, found[0].joint)
+    barred, why = triplets.find_propulsion_choices(points, lie.body_points_w, NODE_S, None, found[0].joint)
     assert [c.joint for c in barred] == [c.joint for c in found if c.joint != found[0].joint]
     assert len(barred) + len(why) == len(found) + len(refused)
 
@@ -182,7 +184,7 @@ def test_the_steepest_wave_depends_on_the_spacing(slope_deg: float, pushes: list
     planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:5]]
     points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
     triplets = TripletFinder(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.find_choices(
+    found, refused = triplets.find_propulsion_choices(
         points, BodyOnPath(route, SEGMENTS).compute_pose_at(0.2).body_points_w, NODE_S, None, None
     )
     assert ["".join(name[-1] for name in c.triplet.names) for c in found] == pushes

@@ -79,7 +79,7 @@ class DrivesOutside:
 
     def output(self) -> str:
         """What the process printed."""
-        if (ending := self._child.describe_end()) is not None:
+        if (ending := self._child.describe_exit()) is not None:
             raise TrialError(ending)
         return b"".join(self._words).decode(errors="replace")
 

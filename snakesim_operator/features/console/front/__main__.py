@@ -15,7 +15,7 @@ from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.programs.arguments import add_network_arguments, add_parent, read_session_option
+from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, read_session_option
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_operator.base.console_port import TOKEN_VARIABLE
 from snakesim_operator.base.robot_selection import RobotSelection
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--pages", type=Path, required=True, help="Unix socket of the page server")
     parser.add_argument("--recording", action="store_true", help="there is no robot that can be stopped")
     add_network_arguments(parser, "")
-    add_parent(parser)
+    add_parent_argument(parser)
     return run_tool("snakesim console", partial(_run, parser.parse_args(argv)))
 
 

@@ -97,8 +97,8 @@ def _list_alarms(snapshot: RobotSnapshot) -> list[str]:
         lines.append(
             _format_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them.")
         )
-    if snapshot.silent_s > MAX_SILENCE_S:
-        lines.append(_format_warning(f"NO ANSWER for {snapshot.silent_s:.0f} s. What is shown is old."))
+    if snapshot.time_since_status_s > MAX_SILENCE_S:
+        lines.append(_format_warning(f"NO ANSWER for {snapshot.time_since_status_s:.0f} s. What is shown is old."))
     return lines
 
 

@@ -144,26 +144,31 @@ class LiveRobot:
         return self._newest_by_key.get(keys.DESCRIPTION)
 
     def take_snapshot(self) -> RobotSnapshot | None:
-        """Decode what has arrived, and return what is known of the robot; None before it has described itself."""
+        """Decode the messages that have arrived, and return the newest state of the robot.
+
+        Returns:
+            The newest message of each kind; a field is None if none has arrived. None until the description of the
+            robot has been received.
+        """
         self._decode_arrivals()
         self._measure_rates()
         robot = self.robot
         if robot is None:
             return None
         now_s = time.monotonic()
-        get_newest = self._newest_by_key.get
+        get_newest = self._newest_by_key.get  # returns None for a key without messages
         clock: Clock | None = get_newest(keys.CLOCK)
         world: World | None = get_newest(keys.WORLD)
         body, base = self._find_body_and_base(world)
         return RobotSnapshot(
             robot=robot,
-            # Host.
+            # What the host reports.
             time_s=None if clock is None else clock.timestamp_ns * 1e-9,
-            silent_s=now_s - self._last_status_time_s,
+            time_since_status_s=now_s - self._last_status_time_s,
             status=get_newest(keys.STATUS),
             configuration=self._find_configuration(robot),
             hosts=self._list_hosts(now_s),
-            # Robot.
+            # What the robot measures.
             joints=get_newest(keys.JOINTS),
             body=body,
             base=base,
@@ -175,12 +180,12 @@ class LiveRobot:
                 key: image for key, image in self._newest_by_key.items() if isinstance(image, DepthImage | ColorImage)
             },
             custom={key: sample for key, sample in self._newest_by_key.items() if isinstance(sample, CustomSample)},
-            # Controller.
+            # What guidance and control publish.
             world=world,
             trajectory=get_newest(keys.TRAJECTORY),
             control=get_newest(keys.CONTROL_STATE),
             parameters=get_newest(keys.PARAMETERS_IN_FORCE),
-            # Network.
+            # What this process measures.
             streams=self._list_streams(clock),
         )
 

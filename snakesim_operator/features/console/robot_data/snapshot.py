@@ -43,7 +43,7 @@ class RobotSnapshot:
     # Host.
     expected: bool = False  # True: the run is starting, and no host has described the robot yet
     time_s: float | None = None  # robot time
-    silent_s: float = 0.0  # since the newest status of the host arrived
+    time_since_status_s: float = 0.0  # since the newest status of the host arrived
     status: Status | None = None
     configuration: Configuration | None = None
     hosts: frozenset[str] = frozenset()  # ids of all hosts that publish a status; more than one: an impostor

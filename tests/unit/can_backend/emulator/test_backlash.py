@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
-from snakesim_hal.physics.backlash import BacklashModel, move_rotors_behind_gears
+from snakesim_hal.physics.backlash import BacklashModel, move_rotor_inertia_to_motor_side
 from snakesim_testing.can.driver_loop import config
 
 BACKLASH_RAD = 0.03
@@ -14,7 +14,7 @@ def test_backlash_drive_turns_through_gap_before_its_link_moves() -> None:
     run = config(3)
     joints = run.robot.joint_table
     backlash_rad = {"joint_2": BACKLASH_RAD}
-    links = InertiaModel(move_rotors_behind_gears(run, joints, backlash_rad), InertiaSettings(drag_nm=0.02))
+    links = InertiaModel(move_rotor_inertia_to_motor_side(run, joints, backlash_rad), InertiaSettings(drag_nm=0.02))
     physics_model = BacklashModel(links, joints, backlash_rad, seed=1)
     sound = InertiaModel(run, InertiaSettings(drag_nm=0.02))
     apart: list[float] = []

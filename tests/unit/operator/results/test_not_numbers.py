@@ -62,7 +62,7 @@ def write_record(folder: Path, record: RunRecord) -> None:
     messages = [(keys.CONTROL_STATE, state) for state in record.control_states] + [
         (keys.WORLD, world) for world in record.worlds
     ]
-    layout, count = Layout.make_for_robot(record.description), len(record.time_s)
+    layout, count = Layout.for_robot(record.description), len(record.time_s)
     encoded = [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in messages]
     record_messages(folder, encoded, count)
     rows = bytearray(count * layout.row_bytes)

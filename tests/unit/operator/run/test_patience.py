@@ -19,17 +19,17 @@ def status(
 
 def test_patience_counts_robot_time_on_a_slow_computer() -> None:
     patience = StartupTimeout(ALL, 60.0)
-    assert not any(patience.update(status(tick), now_s=100.0 * tick) for tick in range(1, 6001, 100))
-    assert patience.update(status(6102), now_s=0.0)
+    assert not any(patience.update_and_check_expired(status(tick), now_s=100.0 * tick) for tick in range(1, 6001, 100))
+    assert patience.update_and_check_expired(status(6102), now_s=0.0)
 
 
 def test_patience_in_paused_time_counts_only_while_host_answers() -> None:
     patience = StartupTimeout(ALL, 60.0)
-    assert not any(patience.update(status(), now_s=3600.0 * hour) for hour in range(60))
+    assert not any(patience.update_and_check_expired(status(), now_s=3600.0 * hour) for hour in range(60))
     same = status()
-    assert not any(patience.update(same, now_s=3600.0 * hour) for hour in range(60, 160))
-    assert not patience.update(None, now_s=1e6)
-    assert any(patience.update(status(), now_s=1e6 + 0.5 * half) for half in range(10))
+    assert not any(patience.update_and_check_expired(same, now_s=3600.0 * hour) for hour in range(60, 160))
+    assert not patience.update_and_check_expired(None, now_s=1e6)
+    assert any(patience.update_and_check_expired(status(), now_s=1e6 + 0.5 * half) for half in range(10))
 
 
 def test_patience_restarts_with_every_progress() -> None:
@@ -45,5 +45,5 @@ def test_patience_restarts_with_every_progress() -> None:
         status(55000, waiting_for=["control"]),
         status(60000, waiting_for=["control"]),
     ]
-    assert not any(patience.update(step, now_s=0.0) for step in steps)
-    assert patience.update(status(62000, waiting_for=["control"]), now_s=0.0)
+    assert not any(patience.update_and_check_expired(step, now_s=0.0) for step in steps)
+    assert patience.update_and_check_expired(status(62000, waiting_for=["control"]), now_s=0.0)

@@ -10,8 +10,8 @@ PERIOD_S = 0.05  # of teleop
 def held_keys(keys_a_look: list[int], period_s: float = PERIOD_S) -> list[bool]:
     """Whether the keys of each look are late; before the first one nothing was typed."""
     timing = KeyTiming()
-    timing.are_late(0, 0.0)
-    return [timing.are_late(count, (look + 1) * period_s) for look, count in enumerate(keys_a_look)]
+    timing.record_read(0, 0.0)
+    return [timing.record_read(count, (look + 1) * period_s) for look, count in enumerate(keys_a_look)]
 
 
 @pytest.mark.parametrize(("hz", "period_s"), [(30, 0.05), (30, 0.01), (50, 0.05), (20, 0.01)])
@@ -34,8 +34,8 @@ def test_what_a_network_held_back_for_14_seconds_is_late(flushed: list[int], per
 
 def test_keys_that_nobody_has_read_for_a_while_are_late() -> None:
     timing = KeyTiming()
-    assert timing.are_late(1, 0.0), "typed before the first look"
-    assert not timing.are_late(1, 0.05)
-    assert timing.are_late(1, 0.05 + MAX_UNREAD_DURATION_S + 0.01), "a program that was stopped meanwhile"
-    assert not timing.are_late(MAX_KEYS_PER_READ, 0.7)
-    assert timing.are_late(MAX_KEYS_PER_READ + 1, 0.8)
+    assert timing.record_read(1, 0.0), "typed before the first look"
+    assert not timing.record_read(1, 0.05)
+    assert timing.record_read(1, 0.05 + MAX_UNREAD_DURATION_S + 0.01), "a program that was stopped meanwhile"
+    assert not timing.record_read(MAX_KEYS_PER_READ, 0.7)
+    assert timing.record_read(MAX_KEYS_PER_READ + 1, 0.8)
