@@ -33,7 +33,7 @@ for backend, has, changes in ROWS:
     ]
     summaries = [run.summary for run in runs]
     moved = " ".join(f"{one.path_distance_m:5.3f}" for one in summaries)
-    off = max((one.reckoned_off_m for one in summaries if one.reckoned_off_m is not None), default=None)
+    off = max((one.dead_reckoning_error_m for one in summaries if one.dead_reckoning_error_m is not None), default=None)
     lost = "measured" if off is None else f"at most {100 * off:.1f} cm off"
     torque_nm = max(one.peak_joint_torque_nm or 0.0 for one in summaries)
     energy = sum(one.energy_j or 0.0 for one in summaries)
