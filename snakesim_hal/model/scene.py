@@ -3,6 +3,7 @@
 The simulator builds the scene, guidance uses it as its map, and the report draws it. `placement` places its obstacles.
 """
 
+import math
 from typing import Annotated
 
 import numpy as np
@@ -14,8 +15,10 @@ from snakesim_hal.model.friction import Surface, Viscous
 from snakesim_hal.model.outlines import Coordinate, Friction, Heading, Point, Size
 from snakesim_hal.model.random_field import RandomField
 from snakesim_hal.model.route import Route, sample_sine_curve
-from snakesim_hal.model.solids import Solid, Upright
-from snakesim_hal.wire.quantities import Name, above
+from snakesim_hal.model.solids import GRAVITY_M_S2, Solid, Upright
+from snakesim_hal.wire.quantities import Name, Vector, above, from_zero
+
+MAX_SLOPE_RAD = 0.7854  # 45 degrees
 
 
 class Heightfield(FileStruct, frozen=True, kw_only=True):
@@ -45,6 +48,14 @@ class Ground(Surface, frozen=True, kw_only=True):
 
     heightfield: Heightfield | None = None
     """Random hills. None: the ground is flat."""
+
+    slope_rad: Annotated[float, from_zero(MAX_SLOPE_RAD, "rad")] = 0.0
+    """Angle by which the ground slopes down. The world frame stays on the ground, with z normal to it, and gravity
+    tilts. 0: the ground is level.
+    """
+
+    slope_towards_rad: Heading = 0.0
+    """Direction in which the ground slopes down most steeply. 0: along x."""
 
 
 class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="kind"):
@@ -201,6 +212,9 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     ground: Ground
     """The ground, and its friction."""
 
+    gravity_m_s2: Annotated[float, above(30, "m/s²")] = GRAVITY_M_S2
+    """Acceleration of gravity, such as 1.62 on the Moon."""
+
     reference_robot: ReferenceRobot | None = None
     """Body that the scene was laid out for, and in proportion to which it is scaled. None: it is the same for every
     robot.
@@ -230,6 +244,23 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
 
     random_field: list[RandomField] = []
     """Areas with randomly placed obstacles, each an entry `[[random_field]]`."""
+
+
+def compute_gravity_w(scene: SceneFile) -> Vector:
+    """Return the acceleration of gravity in m/s² in the world frame, whose z axis is normal to the ground."""
+    ground = scene.ground
+    along_ground_m_s2 = scene.gravity_m_s2 * math.sin(ground.slope_rad)
+    # Adding 0.0 turns -0.0 into 0.0.
+    return (
+        along_ground_m_s2 * math.cos(ground.slope_towards_rad) + 0.0,
+        along_ground_m_s2 * math.sin(ground.slope_towards_rad) + 0.0,
+        -compute_normal_gravity_m_s2(scene),
+    )
+
+
+def compute_normal_gravity_m_s2(scene: SceneFile) -> float:
+    """Return the part of gravity that presses bodies onto the ground, in m/s²."""
+    return scene.gravity_m_s2 * math.cos(scene.ground.slope_rad)
 
 
 def make_route(scene: SceneFile) -> Route | None:

@@ -8,7 +8,7 @@ from snakesim_hal.model.friction import Surface
 from snakesim_hal.model.outlines import Friction, Heading, Point
 from snakesim_hal.wire.messages import Obstacle
 
-GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless configured otherwise
+GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless the scene says otherwise
 PEG_FRICTION = 0.2  # plastic shell against plastic or metal: 0.13 to 0.32 in tables, see docs/how-to/scenes.md
 BASE_FRICTION = 0.4  # an obstacle on the ground on which it slides
 MAX_LEAN_RAD = 0.6
@@ -34,12 +34,17 @@ class Solid(Surface, frozen=True, kw_only=True):
         """Return whether the obstacle moves when it is pushed."""
         return self.stiffness_n_per_m is not None or self.mass_kg is not None
 
-    @property
-    def sliding_force_n(self) -> float | None:
-        """Return the smallest force that moves the obstacle along the ground; None if it is fixed."""
+    def compute_sliding_force_n(self, normal_gravity_m_s2: float = GRAVITY_M_S2) -> float | None:
+        """Return the smallest force that moves the obstacle along the ground; None if it is fixed.
+
+        On a slope, the weight of the obstacle is a part of that force.
+
+        Args:
+            normal_gravity_m_s2: Part of gravity that presses the obstacle onto the ground.
+        """
         if self.mass_kg is None:
             return None
-        return self.base_friction * GRAVITY_M_S2 * self.mass_kg
+        return self.base_friction * normal_gravity_m_s2 * self.mass_kg
 
 
 class Upright(Solid, frozen=True, kw_only=True):

@@ -14,9 +14,10 @@ static const mjtNum FOOT = 1.0;            // first number of a geom's user data
 // Parameters of all feet.
 typedef struct {
   mjtNum step;                // dt
-  mjtNum gravity;             // g
+  mjtNum gravity;             // g, the part of gravity that is normal to the ground
   mjtNum sink;                // sink
   mjtNum damping_root;        // sqrt(g / sink)
+  mjtNum start_stretch[2];    // holds a foot on a slope: g_xy sink / g
   mjtNum min_friction;
   const Chain* chain;
 } Ground;
@@ -51,6 +52,8 @@ static Ground describe_ground(const mjModel* m, const Chain* chain, mjtNum min_f
   ground.gravity = gravity;
   ground.sink = SINK_M > gravity * (slow * slow) ? SINK_M : gravity * (slow * slow);
   ground.damping_root = sqrt(gravity / ground.sink);
+  ground.start_stretch[0] = m->opt.gravity[0] * (ground.sink / gravity);
+  ground.start_stretch[1] = m->opt.gravity[1] * (ground.sink / gravity);
   ground.min_friction = min_friction;
   ground.chain = chain;
   return ground;
@@ -113,8 +116,8 @@ static FootStep compute_foot(const mjModel* m, const mjData* d, const Ground* gr
   mjtNum roll = r * ground->step;
   mjtNum slip_x = w[1] * -roll + (position[0] - last[0]);
   mjtNum slip_y = w[0] * roll + (position[1] - last[1]);
-  mjtNum stretch_x = (placed ? before->stretch[0] : 0.0) + slip_x;
-  mjtNum stretch_y = (placed ? before->stretch[1] : 0.0) + slip_y;
+  mjtNum stretch_x = (placed ? before->stretch[0] : ground->start_stretch[0]) + slip_x;
+  mjtNum stretch_y = (placed ? before->stretch[1] : ground->start_stretch[1]) + slip_y;
 
   // s
   mjtNum scale = max_friction / maximum(k * compute_length(stretch_x, stretch_y), divisor);

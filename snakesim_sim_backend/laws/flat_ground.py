@@ -88,6 +88,9 @@ class FlatGround:
 
     On ground on which links slide more easily in one direction, `directional` changes F.
 
+    The z axis is normal to the ground, and g is the part of gravity along it. On a slope, gravity has a part g_xy along
+    the ground. Each spring then begins with the stretch that holds its foot: s = g_xy sink / g.
+
     A call of NumPy costs more than what it computes for so few feet, and a physics step runs each millisecond or two.
     So `apply` makes few calls, on arrays and views that were allocated before. An array `..._xy` holds x and y of the
     first foot, then of the next: viewed as complex numbers, each foot has one number, whose absolute value is a length.
@@ -131,6 +134,8 @@ class FlatGround:
         self._minus_damping = -damping
         self._minus_stiffness_xy = -stiffness.repeat(2)
         self._minus_damping_xy = -damping.repeat(2)
+        self._gravity_along_ground = model.opt.gravity[:2]  # m/s², along x and y; a view
+        self._start_stretch_per_gravity = sink_m / gravity  # s²
         self._roll_per_rad_s_xy = np.tile([-feet.radius_m * step_s, feet.radius_m * step_s], count)  # m for 1 rad/s
         self._radius_m = np.full(count, feet.radius_m)
         self._zeros = np.full(count, 0.0)
@@ -175,6 +180,7 @@ class FlatGround:
         # In `userdata`: deflection of the friction bristle of every foot (x, y), then the last positions of all feet.
         # As complex numbers, the absolute values of the deflections are computed at once.
         self._bristle_deflection_xy = data.userdata[:xy_count]
+        self._bristle_deflection_by_axis = self._bristle_deflection_xy.reshape(count, 2).T
         self._bristle_deflection_complex = self._bristle_deflection_xy.view(np.complex128)
         self._last_position = data.userdata[xy_count : VALUES_PER_FOOT * count]
 
@@ -205,8 +211,9 @@ class FlatGround:
         self._wrenches = rows[:6]
 
     def begin(self) -> None:
-        """Let all feet stick where they are now, without stretch of their springs."""
-        self._bristle_deflection_xy[:] = 0.0
+        """Let all feet stick where they are now. On a slope, their bristles hold the weight along it."""
+        start_deflection = self._gravity_along_ground * self._start_stretch_per_gravity
+        self._bristle_deflection_by_axis[:] = start_deflection[:, None]
         self._last_position[:] = self._positions[self._position_indices]
 
     def apply(self) -> None:

@@ -60,16 +60,20 @@ def compute_max_stiffness_n_per_m(placed: PlacedObstacle, step_s: float) -> floa
     return compute_mass_kg(placed) * (MAX_PHASE_RAD / step_s) ** 2
 
 
-def validate_yielding_obstacles(placed: Sequence[PlacedObstacle], scene: str, step_s: float) -> None:
-    """Check that the springs of obstacles that yield can be simulated.
+def validate_yielding_obstacles(
+    placed: Sequence[PlacedObstacle], scene: str, step_s: float, slope_rad: float = 0.0
+) -> None:
+    """Check that the springs of obstacles that yield can be simulated, and that no obstacle slides down by itself.
 
     Args:
         placed: Obstacles that yield.
         scene: Name of the scene, for messages.
         step_s: Duration of a physics step in s.
+        slope_rad: Slope of the ground.
 
     Raises:
-        ConfigError: Too many obstacles yield, or a spring is too stiff for its mass and the physics step.
+        ConfigError: Too many obstacles yield, a spring is too stiff for its mass and the physics step, or an obstacle
+            with a mass is on a slope that is steeper than its friction holds.
     """
     if len(placed) > MAX_OBSTACLES:
         raise ConfigError(
@@ -77,7 +81,15 @@ def validate_yielding_obstacles(placed: Sequence[PlacedObstacle], scene: str, st
             f"may: leave some of them rigid and fixed",
             code="scene/invalid",
         )
+    min_base_friction = math.tan(slope_rad)
     for item in placed:
+        if item.mass_kg is not None and item.base_friction < min_base_friction:
+            raise ConfigError(
+                f"scene {scene!r}: obstacle {item.obstacle.name!r}: `base_friction` = {item.base_friction:g} does not "
+                f"hold it on ground that slopes by `ground.slope_rad` = {slope_rad:g} rad; set at least "
+                f"{min_base_friction:.3g}, leave `mass_kg` away (fixed), or lower the slope",
+                code="scene/invalid",
+            )
         max_stiffness = compute_max_stiffness_n_per_m(item, step_s)
         if item.stiffness_n_per_m is not None and item.stiffness_n_per_m > max_stiffness:
             raise ConfigError(
@@ -89,14 +101,19 @@ def validate_yielding_obstacles(placed: Sequence[PlacedObstacle], scene: str, st
             )
 
 
-def compute_spring(placed: PlacedObstacle, step_s: float) -> list[float]:
+def compute_spring(placed: PlacedObstacle, step_s: float, normal_gravity_m_s2: float) -> list[float]:
     """Return the parameters of an obstacle's spring, which are the user data of its body.
+
+    Args:
+        placed: Obstacle that yields.
+        step_s: Duration of a physics step in s.
+        normal_gravity_m_s2: Part of gravity that presses the obstacle onto the ground.
 
     Returns:
         Stiffness in N/m, damping in N·s/m, largest force in N, and mean radius of the foot in m.
     """
     mass_kg = compute_mass_kg(placed)
-    max_force_n = _compute_max_friction_n(placed)
+    max_force_n = _compute_max_friction_n(placed, normal_gravity_m_s2)
     # A rigid obstacle is as stiff as needed to hardly move, or as the physics step allows.
     stiffness = min(compute_max_stiffness_n_per_m(placed, step_s), max_force_n / RIGID_STRETCH_M)
     if placed.stiffness_n_per_m is not None:
@@ -149,8 +166,9 @@ class Yielding:
         self._passive_forces -= lengths * force * scale[:, None]
 
 
-def _compute_max_friction_n(placed: PlacedObstacle) -> float:
+def _compute_max_friction_n(placed: PlacedObstacle, normal_gravity_m_s2: float) -> float:
     """Return the force above which an obstacle slides on the ground."""
-    if placed.sliding_force_n is None:
+    sliding_force_n = placed.compute_sliding_force_n(normal_gravity_m_s2)
+    if sliding_force_n is None:
         return UNLIMITED_N
-    return placed.sliding_force_n
+    return sliding_force_n

@@ -19,8 +19,10 @@ from snakesim_hal.model.links import Link
 from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
+from snakesim_hal.model.scene import compute_gravity_w, compute_normal_gravity_m_s2
 from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.wire.messages import Axis
+from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.actuators import add_motor
 from snakesim_sim_backend.laws.chain import FREE_DOFS
 from snakesim_sim_backend.laws.flat_ground import FOOT, Feet, find_feet
@@ -160,11 +162,11 @@ def assemble_model_blueprint(
     _check_contact_time(settings, step_s)
     placed = place_obstacles(config)
     yielding = [item for item in placed if item.can_move]
-    validate_yielding_obstacles(yielding, config.scene.name, step_s)
+    validate_yielding_obstacles(yielding, config.scene.name, step_s, config.scene.ground.slope_rad)
 
     # The order decides the numbers of bodies: fixed obstacles, the robot, obstacles that yield.
     spec = mujoco.MjSpec()
-    _set_options(spec, step_s)
+    _set_options(spec, step_s, compute_gravity_w(config.scene))
     contact = make_contact_parameters(settings)
     rough_ground_geoms = add_ground(spec, config.scene.ground, contact)
     fixed = [item for item in placed if not item.can_move]
@@ -191,10 +193,11 @@ def _check_contact_time(settings: SimSettings, step_s: float) -> None:
         )
 
 
-def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
+def _set_options(spec: mujoco.MjSpec, step_s: float, gravity_w: Vector) -> None:
     spec.compiler.degree = False
     option = spec.option
     option.timestep = step_s
+    option.gravity = list(gravity_w)
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # damping of the joints is integrated implicitly
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake than the sparse one
@@ -233,6 +236,7 @@ def _add_obstacles(
             ground_relief_m=ground_relief_m,
             collide=collide,
             step_s=step_s,
+            normal_gravity_m_s2=compute_normal_gravity_m_s2(config.scene),
         )
 
 

@@ -46,6 +46,7 @@ def add_obstacle(
     ground_relief_m: float,
     collide: bool,
     step_s: float,
+    normal_gravity_m_s2: float,
 ) -> None:
     """Add an obstacle to a model. Its geom is called `obstacle:<name>`, or `step:<name>` if it is walkable.
 
@@ -57,6 +58,7 @@ def add_obstacle(
         ground_relief_m: Height of the ground's highest point above its lowest one, in m.
         collide: Whether obstacles also collide with each other, because some of them move.
         step_s: Duration of a physics step in s.
+        normal_gravity_m_s2: Part of gravity that presses the obstacle onto the ground.
     """
     name = make_geom_name(placed)
     shape = _make_obstacle_shape(placed, body_radius_m, ground_relief_m)
@@ -71,7 +73,7 @@ def add_obstacle(
     if placed.can_move:
         foot_w = np.array([*placed.obstacle.position_w[:2], 0.0])
         body = _add_yielding_body(spec, name, foot_w)
-        body.userdata = compute_spring(placed, step_s)
+        body.userdata = compute_spring(placed, step_s, normal_gravity_m_s2)
         shape["pos"] = (shape["pos"] - foot_w).tolist()
         mass_kg = compute_mass_kg(placed)
     body.add_geom(

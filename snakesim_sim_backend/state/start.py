@@ -29,7 +29,8 @@ def place_and_settle_robot(
     """Place the robot at its start pose, let it come to rest, and set the time to 0 with the motors off.
 
     The robot is placed above the highest ground under it and falls, while the motors hold its start angles. If it has
-    not come to rest after `settle_s`, it is stopped. A suspended robot hangs with its head below its tail.
+    not come to rest after `settle_s`, it is stopped. A suspended robot hangs with its head below its tail. On a slope,
+    only gravity normal to the ground acts until the run begins, so that nothing slides or rolls down before.
 
     Args:
         sim: Compiled model.
@@ -50,8 +51,11 @@ def place_and_settle_robot(
         data.qpos[2] += config.robot.length_m + CLEARANCE_M
         yaw = np.array(quaternion_from_yaw(pose.yaw_rad))
         mujoco.mju_mulQuat(data.qpos[3:FREE_QPOS], yaw, np.array(HEAD_DOWN))
+    gravity_along_ground = model.opt.gravity[:2].copy()
+    model.opt.gravity[:2] = 0.0
     physics.reset()
     _settle_robot(model, data, physics, config, motors, pose, settle_s)
+    model.opt.gravity[:2] = gravity_along_ground
 
     # The run starts without motion, and without anything that MuJoCo has stored while the robot came to rest.
     data.qvel[:] = 0.0

@@ -7,7 +7,6 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import compute_surface_friction
 from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, ForwardProgress, compute_energy_j_per_m
 from snakesim_operator.results.metrics.form_closure import compute_form_closure_margin, find_body_contacts
 from snakesim_operator.results.run_log import RunRecord
@@ -65,7 +64,7 @@ def get_body_length_m(record: RunRecord) -> float:
 
 def get_weight_n(record: RunRecord) -> float:
     """Return the weight of the body in N."""
-    return GRAVITY_M_S2 * sum(link.mass_kg for link in record.description.links)
+    return record.config.scene.gravity_m_s2 * sum(link.mass_kg for link in record.description.links)
 
 
 def compute_propulsive_efficiency(record: RunRecord, cost_of_transport: float | None) -> float | None:
@@ -78,11 +77,11 @@ def compute_propulsive_efficiency(record: RunRecord, cost_of_transport: float | 
         cost_of_transport: Energy divided by weight times advance; None if it is unknown.
 
     Returns:
-        The efficiency, or None if the cost of transport is unknown or the ground is not flat.
+        The efficiency, or None if the cost of transport is unknown or the ground is not flat and level.
     """
     ground = record.config.scene.ground
-    is_flat = ground.heightfield is None
-    if cost_of_transport is None or cost_of_transport <= 0 or not is_flat:
+    is_level = ground.heightfield is None and ground.slope_rad == 0.0
+    if cost_of_transport is None or cost_of_transport <= 0 or not is_level:
         return None
     robot = record.config.robot
     friction = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels)

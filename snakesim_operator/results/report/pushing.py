@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import compute_surface_friction
-from snakesim_hal.model.solids import GRAVITY_M_S2
+from snakesim_hal.model.scene import compute_normal_gravity_m_s2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.metrics.map_score import MapScore, score_map
 from snakesim_operator.results.metrics.motion import find_stops
@@ -122,10 +122,11 @@ def _draw_contact_forces(record: RunRecord) -> PlotlyDict:
         Line("desired at all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
         Line("measured contacts", _times_s(measured), _forward_forces_n(record, measured), "--measured"),
     ]
-    weight_n = GRAVITY_M_S2 * sum(link.mass_kg for link in record.description.links)
+    normal_gravity_m_s2 = compute_normal_gravity_m_s2(record.config.scene)
+    load_n = normal_gravity_m_s2 * sum(link.mass_kg for link in record.description.links)
     ground = record.config.scene.ground
     robot = record.config.robot
-    drag_n = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * weight_n
+    drag_n = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * load_n
     label = "Contact forces along the body over time"
     return make_line_chart(label, "force, N", drawn, get_run_end_s(record), levels=[(drag_n, "friction of the ground")])
 

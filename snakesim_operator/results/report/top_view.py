@@ -6,6 +6,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.placement import PlacedObstacle
+from snakesim_hal.model.scene import compute_normal_gravity_m_s2
 from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.page.svg import (
     draw_arrow,
@@ -78,7 +79,8 @@ def draw_top_view(record: RunRecord, snapshot: Snapshot, view: Viewport) -> str:
 
 def draw_ground(record: RunRecord, view: Viewport, labels: LabelPlacer) -> str:
     """Draw the route of the scene and all obstacles."""
-    obstacles = [_draw_obstacle(item, view, labels) for item in record.placed_obstacles]
+    normal_gravity_m_s2 = compute_normal_gravity_m_s2(record.config.scene)
+    obstacles = [_draw_obstacle(item, normal_gravity_m_s2, view, labels) for item in record.placed_obstacles]
     return _draw_route(record, view) + "".join(obstacles)
 
 
@@ -92,11 +94,12 @@ def _draw_route(record: RunRecord, view: Viewport) -> str:
     return draw_polyline(points, "route")
 
 
-def _draw_obstacle(item: PlacedObstacle, view: Viewport, labels: LabelPlacer) -> str:
+def _draw_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float, view: Viewport, labels: LabelPlacer) -> str:
     """Draw one obstacle as SVG, with a tooltip; empty if it is not in the window.
 
     Args:
         item: The obstacle with its properties, such as whether the robot can climb it or push it away.
+        normal_gravity_m_s2: Part of gravity that presses the obstacle onto the ground.
         view: Window and scale of the drawing.
         labels: Labels of the drawing, which avoid the obstacle.
     """
@@ -112,22 +115,23 @@ def _draw_obstacle(item: PlacedObstacle, view: Viewport, labels: LabelPlacer) ->
     x, y = view.to_pixels(obstacle.position_w)
     half_extent = find_half_extent_m(obstacle) * view.pixels_per_m
     labels.reserve_box((x - half_extent, y - half_extent, x + half_extent, y + half_extent), 0.15)
-    tooltip = make_tooltip(_describe_obstacle(item))
+    tooltip = make_tooltip(_describe_obstacle(item, normal_gravity_m_s2))
     if obstacle.shape == "box":
         corners = [view.to_pixels(corner) for corner in find_outline_w(obstacle)]
         return make_element("polygon", tooltip, points=format_points(corners), class_=class_)
     return make_element("circle", tooltip, cx=x, cy=y, r=obstacle.radius_m * view.pixels_per_m, class_=class_)
 
 
-def _describe_obstacle(item: PlacedObstacle) -> str:
+def _describe_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float) -> str:
     """Describe an obstacle for its tooltip: its name, and how it yields to forces."""
     words = [item.obstacle.name]
     if item.lean_rad:
         words.append(f"leans by {item.lean_rad:.2g} rad")
     if item.stiffness_n_per_m is not None:
         words.append(f"springs back with {item.stiffness_n_per_m:g} N/m")
-    if item.sliding_force_n is not None:
-        words.append(f"slides from {item.sliding_force_n:.3g} N on, and is drawn where it stood at the start")
+    sliding_force_n = item.compute_sliding_force_n(normal_gravity_m_s2)
+    if sliding_force_n is not None:
+        words.append(f"slides from {sliding_force_n:.3g} N on, and is drawn where it stood at the start")
     return ", ".join(words)
 
 

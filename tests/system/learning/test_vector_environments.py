@@ -272,6 +272,24 @@ def test_scenes_of_different_sizes_are_stepped_side_by_side() -> None:
         assert alone.step(still[0])[4]["digest"] == infos["digest"][row]
 
 
+def test_slopes_of_different_angles_are_stepped_side_by_side() -> None:
+    """Every row has the gravity of its own scene."""
+    slopes = {"scene.ground.slope_rad": (0.05, 0.3), "scene.gravity_m_s2": (1.6, 9.81)}
+    case: Case = ("slope", {"randomize": slopes, "observe": ("velocity_w_m_s",)})
+    envs = make_many(case, 3)
+    envs.reset(seed=1)
+    still = np.zeros((3, 13))
+    envs.step(still)
+    velocities_m_s = envs.step(still)[0]
+    envs.close()
+    assert len(np.unique(velocities_m_s[:, 0])) == 3
+    for row, seed in enumerate((1, 2, 3)):
+        alone = make(case)
+        alone.reset(seed=seed)
+        alone.step(still[0])
+        assert np.array_equal(alone.step(still[0])[0], velocities_m_s[row])
+
+
 def test_wrappers_of_gymnasium_accept_it() -> None:
     envs = DictInfoToList(RecordEpisodeStatistics(make_many(CASES["torques"], 2, duration=0.06)))
     envs.reset(seed=1)

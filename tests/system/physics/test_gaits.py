@@ -33,6 +33,7 @@ def find_displacement_m(record: RunRecord) -> tuple[float, float]:
     [
         ("serpenoid", "scales", (), 0.15),
         ("cpg", "scales", (), 0.12),
+        ("serpenoid", "slope", ("scene.ground.slope_rad=0.0873",), 0.3),
         ("serpenoid", "peg_row", ON_PEGS, 0.8),
         pytest.param("cpg", "peg_row", ON_PEGS, 0.8, marks=pytest.mark.slow),
     ],

@@ -49,6 +49,12 @@ SCENES: dict[str, dict[str, Any]] = {
     "one obstacle that moves": {"ground": {"friction": 0.3}, "box": MOVING[:1]},
     "obstacles that move": {"ground": {"friction": 0.3}, "box": MOVING, "cylinder": PEGS[:2]},
     "hills": {"ground": {"friction": 0.3, "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0}}},
+    "slope": {
+        "gravity_m_s2": 3.7,
+        "ground": {"friction": 0.3, "slope_rad": 0.2, "slope_towards_rad": 2.5},
+        "box": MOVING,
+        "cylinder": PEGS[:2],
+    },
     "cloth": {"ground": {"friction": 0.19, "backward_friction": 0.14}},
     "mud": {"ground": {"friction": 0.1, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 4.0}}},
     "rough hills": {

@@ -104,8 +104,8 @@ def test_scene_row_material_applies_to_all_and_keeps_places() -> None:
         scene(route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning])
     )
     assert [item.obstacle for item in loose] == [item.obstacle for item in plain]
-    assert {(item.friction, item.sliding_force_n) for item in plain} == {(0.2, None)}
-    assert {(item.friction, item.sliding_force_n) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
+    assert {(item.friction, item.compute_sliding_force_n()) for item in plain} == {(0.2, None)}
+    assert {(item.friction, item.compute_sliding_force_n()) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
     assert not any(item.can_move for item in plain)
     assert all(item.can_move for item in loose)
     assert [item.lean_rad for item in loose[:3]] == [0.3] * 3
