@@ -287,7 +287,7 @@ def test_slopes_of_different_angles_are_stepped_side_by_side() -> None:
         alone = make(case)
         alone.reset(seed=seed)
         alone.step(still[0])
-        assert np.array_equal(alone.step(still[0])[0], velocities_m_s[row])
+        assert_equal(alone.step(still[0])[0], velocities_m_s[row])
 
 
 def test_wrappers_of_gymnasium_accept_it() -> None:
