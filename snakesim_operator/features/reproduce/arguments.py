@@ -2,7 +2,7 @@
 
 import argparse
 
-from snakesim_hal.programs.arguments import add_json, add_out, make_number_parser
+from snakesim_hal.programs.arguments import add_json_argument, add_output_argument, make_number_parser
 from snakesim_hal.programs.commands import Command, Commands
 
 
@@ -14,7 +14,7 @@ def _add_reproduce(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--list", action="store_true", help="list name, year and source of each experiment, and run none"
     )
-    add_out(parser, "folder for a picture of each experiment, NAME.png (default: no pictures)")
+    add_output_argument(parser, "folder for a picture of each experiment, NAME.png (default: no pictures)")
     parser.add_argument(
         "--seeds",
         type=make_number_parser(1, 1000),
@@ -31,7 +31,7 @@ def _add_reproduce(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick", action="store_true", help="make fewer runs, to try the command; the results are rougher"
     )
-    add_json(parser)
+    add_json_argument(parser)
 
 
 def _reproduce(arguments: argparse.Namespace) -> int:
