@@ -5,13 +5,13 @@ import platform
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks.sections import SECTIONS, Section
+from benchmarks.sections import SECTIONS, ResultSection
 from benchmarks.table import replace_section
 
 RESULTS = Path(__file__).parent / "RESULTS.md"
 
 
-def measure_section(section: Section) -> str:
+def measure_section(section: ResultSection) -> str:
     """Measure a section, print every line as soon as it is known, and return the text of the section."""
     lines: list[str] = []
 

@@ -24,7 +24,7 @@ from snakesim.environments import SnakeEnv, SnakeVectorEnv
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import load_scenario
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.laws.version import choose_laws
 
 RESULTS = Path(__file__).parent / "ENVIRONMENTS.md"
@@ -81,7 +81,7 @@ def make_physics_step(scenario: str) -> Step:
     config = load_scenario(scenario).config
     backend = open_simulator(config)
     joints = config.robot.chain.modules
-    modes = [Mode.POSITION] * joints
+    modes = [JointMode.POSITION] * joints
     limits_nm = [config.robot.limits.torque_nm] * joints
     wave = TravelingWave(joints)
     steps_per_tick = backend.sim.steps_per_tick

@@ -10,11 +10,11 @@ import numpy as np
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.plugins import decode_plugin_settings
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.keys import CLOCK, JOINTS
-from snakesim_hal.wire.messages import JointCommand, Mode
+from snakesim_hal.wire.messages import JointCommand, JointMode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_testing.hal.small_robots import make_clock, make_joint_command
@@ -113,14 +113,14 @@ def record_motion(config: RunConfig) -> tuple[list[SafeSetpoints], float]:
     limits_nm = [joint.torque_limit_nm for joint in record.description.joints]
     setpoints: list[SafeSetpoints] = []
     for mode_codes, target in zip(record.mode.tolist(), record.target.tolist(), strict=True):
-        modes = [Mode(code) for code in mode_codes]
+        modes = [JointMode(code) for code in mode_codes]
         setpoints.append(SafeSetpoints(modes, target, limits_nm))
     controller_us = sum(whole_run.update_us) / len(whole_run.update_us)
     return setpoints, controller_us
 
 
 @dataclass
-class TickTimes:
+class TickCpuTimes:
     """Mean CPU times of a tick in µs, one entry for each block of ticks."""
 
     published_us: list[float] = field(default_factory=list[float])  # with all sensors published
@@ -130,16 +130,19 @@ class TickTimes:
     mujoco_us: list[float] = field(default_factory=list[float])  # of `mj_step` alone
 
 
-def measure_tick_times(config: RunConfig) -> TickTimes:
+def measure_tick_times(config: RunConfig) -> TickCpuTimes:
     """Measure the ticks of the same motion: published, physics alone, with the Python laws, and MuJoCo alone."""
     full = open_simulator(config)
     physics = BareSimulation(config)
     python = BareSimulation(config, "python")
     bare_mujoco = BareMujoco(config)
     setpoints, _ = record_motion(config)
-    times = TickTimes()
+    times = TickCpuTimes()
     endpoint = find_free_endpoint()  # published messages really go over the network
-    with open_session(Link(endpoint, "bench", True)) as session, open_session(Link(endpoint, "bench")) as other:
+    with (
+        open_session(ConnectionSettings(endpoint, "bench", True)) as session,
+        open_session(ConnectionSettings(endpoint, "bench")) as other,
+    ):
         first = full.sample(0, 0)
         readers = [
             other.declare_reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.by_key.items())

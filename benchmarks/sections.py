@@ -56,7 +56,7 @@ MAX_PLANNING_RATIO = 0.17  # 1 500 000 nodes/s instead of 250 000
 
 
 @dataclass(frozen=True)
-class Section:
+class ResultSection:
     """One section of the page."""
 
     name: str  # for the command line
@@ -200,11 +200,11 @@ def report_sizes(report: Report) -> None:
 
 
 SECTIONS = (
-    Section("physics", "Physics beside MuJoCo alone", False, report_physics),
-    Section("tick", "CPU time of a tick", False, report_tick),
-    Section("runs", "Whole runs", True, report_runs),
-    Section("latency", "Latency in real time", True, report_latency),
-    Section("planning", "Path search", False, report_planning),
-    Section("can", "CAN", True, report_bus),
-    Section("size", "Size", False, report_sizes),
+    ResultSection("physics", "Physics beside MuJoCo alone", False, report_physics),
+    ResultSection("tick", "CPU time of a tick", False, report_tick),
+    ResultSection("runs", "Whole runs", True, report_runs),
+    ResultSection("latency", "Latency in real time", True, report_latency),
+    ResultSection("planning", "Path search", False, report_planning),
+    ResultSection("can", "CAN", True, report_bus),
+    ResultSection("size", "Size", False, report_sizes),
 )

@@ -2,10 +2,10 @@
 
 import time
 
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 from snakesim_hal.controller import Controller, ControllerCommand, NoParameters, Observation
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 
 class StampedParameters(FileStruct, frozen=True, kw_only=True):
@@ -20,9 +20,9 @@ class Stamped(Controller[StampedParameters]):
 
     Parameters = StampedParameters
 
-    def __init__(self, robot: Description, parameters: StampedParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: StampedParameters) -> None:
         super().__init__(robot, parameters)
-        self._hold = Hold(robot, NoParameters())
+        self._hold = HoldPose(robot, NoParameters())
         self._file = open(parameters.path, "w", buffering=1, encoding="ascii")  # noqa: PTH123, SIM115 - open until the end
 
     def update(self, observation: Observation) -> ControllerCommand:

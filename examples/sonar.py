@@ -13,9 +13,9 @@ import numpy as np
 
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.sensor_model import SensorModel
-from snakesim_hal.wire.messages import Ranges
-from snakesim_sim_backend.sensors.mount import Mount
-from snakesim_sim_backend.sensors.rays import Rays
+from snakesim_hal.wire.messages import RangeScan
+from snakesim_sim_backend.sensors.mount import SensorMount
+from snakesim_sim_backend.sensors.rays import RayBundle
 
 RAYS = 200
 
@@ -24,16 +24,16 @@ class Sonar(SensorModel):
     class Settings(FileStruct, frozen=True):
         cone_rad: float = 0.5  # from edge to edge
 
-    message = Ranges
+    message = RangeScan
 
     def __init__(self, sensor, scope, settings):
         self._sensor, self._noise = sensor, scope.noise
-        self._mount = Mount(sensor, scope)
+        self._mount = SensorMount(sensor, scope)
         # Sunflower spiral over the cone's cap.
         off = settings.cone_rad / 2 * np.sqrt((np.arange(RAYS) + 0.5) / RAYS)
         turn = math.pi * (3 - math.sqrt(5)) * np.arange(RAYS)
         cone = np.stack([np.cos(off), np.sin(off) * np.cos(turn), np.sin(off) * np.sin(turn)], -1)
-        self._rays = Rays(self._mount, scope, cone, sensor.range_max_m)
+        self._rays = RayBundle(self._mount, scope, cone, sensor.range_max_m)
 
     def read(self, tick, timestamp_ns):
         sensor = self._sensor
@@ -42,7 +42,7 @@ class Sonar(SensorModel):
         nearest = None
         if len(echoes):
             nearest = max(float(echoes.min() + sensor.noise_m * self._noise.standard_normal()), 0.0)
-        return Ranges(
+        return RangeScan(
             tick=tick,
             timestamp_ns=timestamp_ns,
             link=self._mount.link,

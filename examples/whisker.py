@@ -47,15 +47,15 @@ class WhiskerModel(SensorModel):
 
     def __init__(self, sensor, scope, settings):
         # Only here: a robot whose driver publishes a Whisker needs this file for the message, and no simulator.
-        from snakesim_sim_backend.sensors.mount import Mount
-        from snakesim_sim_backend.sensors.rays import Rays
+        from snakesim_sim_backend.sensors.mount import SensorMount
+        from snakesim_sim_backend.sensors.rays import RayBundle
 
         self._settings, self._noise = settings, scope.noise
-        self._mount = Mount(sensor, scope)
+        self._mount = SensorMount(sensor, scope)
         step_rad = settings.bend_max_rad / STEPS
         self._bends_rad = step_rad * np.array(sorted(range(-STEPS, STEPS + 1), key=abs))  # the least bent first
         fan = np.stack([np.cos(self._bends_rad), np.sin(self._bends_rad), np.zeros(2 * STEPS + 1)], -1)
-        self._rays = Rays(self._mount, scope, fan * settings.length_m, 1.0)
+        self._rays = RayBundle(self._mount, scope, fan * settings.length_m, 1.0)
 
     def read(self, tick, timestamp_ns):
         upper_rad = self._settings.bend_max_rad

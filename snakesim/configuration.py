@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scenario import Override, RunConfig, load_scenario
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario
 from snakesim_hal.programs.preflight import validate_and_complete_config
 
 
-def make_overrides(values: Mapping[str, Any] | None, **keyword_overrides: Any) -> list[Override]:
+def make_overrides(values: Mapping[str, Any] | None, **keyword_overrides: Any) -> list[KeyOverride]:
     """Convert the arguments of a Python call to overrides of a scenario.
 
     Args:
@@ -30,15 +30,15 @@ def make_overrides(values: Mapping[str, Any] | None, **keyword_overrides: Any) -
             f"set={values!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}",
             code="python/invalid-argument",
         )
-    overrides: list[Override] = []
+    overrides: list[KeyOverride] = []
     for key, value in keyword_overrides.items():
         if value is not None:
             # The argument of the call has the name of the key without the unit, as `duration` for `duration_s`.
             source_text = f"{key.removesuffix('_s')}={value!r:.60}"
-            overrides.append(Override(key, _convert_to_plain_value(value), source_text))
+            overrides.append(KeyOverride(key, _convert_to_plain_value(value), source_text))
     for key, value in values.items():
         source_text = f"set={{{key!r}: {value!r:.60}}}"
-        overrides.append(Override(key, _convert_to_plain_value(value), source_text))
+        overrides.append(KeyOverride(key, _convert_to_plain_value(value), source_text))
     return overrides
 
 
@@ -51,7 +51,7 @@ def _convert_to_plain_value(value: Any) -> Any:
     return value
 
 
-def load_and_validate_config(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
+def load_and_validate_config(scenario: str, overrides: list[KeyOverride], *, processes: bool) -> RunConfig:
     """Load a scenario with overrides, check that all its plugins are installed, and return the configuration.
 
     Args:
@@ -65,7 +65,7 @@ def load_and_validate_config(scenario: str, overrides: list[Override], *, proces
     """
     clock_override = next((override for override in overrides if override.key == "clock_mode"), None)
     if clock_override is None and not processes:
-        overrides = [*overrides, Override("clock_mode", "lockstep", "one process")]
+        overrides = [*overrides, KeyOverride("clock_mode", "lockstep", "one process")]
     loaded = load_scenario(scenario, overrides)
     if clock_override is not None and not processes and loaded.config.clock_mode != "lockstep":
         raise ConfigError(

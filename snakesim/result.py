@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from snakesim.chart import Chart, embed_in_iframe
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.results.page.charts import Line, make_line_chart
+from snakesim_operator.results.page.charts import ChartLine, make_line_chart
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.signals import compute_signals, find_unit, make_signal_columns, select_columns
@@ -241,14 +241,14 @@ class Result:
         end_s = float(self.time_s[-1]) if len(self.time_s) else 0.0
         return make_line_chart(f"{name} over time", title, self._make_lines(name), end_s)
 
-    def _make_lines(self, name: str) -> Sequence[Line]:
+    def _make_lines(self, name: str) -> Sequence[ChartLine]:
         """Return a line for each column of a signal."""
         columns = select_columns(name, self.columns)
         if list(columns) == [name]:
-            return [Line(name, self.time_s, columns[name].astype(float), "--measured")]
+            return [ChartLine(name, self.time_s, columns[name].astype(float), "--measured")]
         color_count = len(self.joints)
-        drawn: list[Line] = []
+        drawn: list[ChartLine] = []
         for i, (column, values) in enumerate(columns.items()):
             label = column.removeprefix(f"{name}.")
-            drawn.append(Line(label, self.time_s, values.astype(float), f"--joint-{i % color_count}"))
+            drawn.append(ChartLine(label, self.time_s, values.astype(float), f"--joint-{i % color_count}"))
         return drawn

@@ -21,21 +21,21 @@ from snakesim_hal.controller import make_position_setpoints
 from snakesim_hal.network.commanding import READABLE_KEYS, CommandingClient
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.session_file import read_session
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.custom_sample import find_message_type
 from snakesim_hal.wire.messages import (
     Clock,
     Contacts,
-    Description,
     JointState,
     LifecycleRequest,
     Message,
     Pose,
-    Status,
+    RobotDescription,
+    RobotStatus,
     make_arm_request,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
@@ -44,7 +44,7 @@ from snakesim_operator.base.targets import find_robots
 from snakesim_operator.recording.recorder_process import record_to_file
 from snakesim_operator.robot_commands.command import request_while_commanding
 from snakesim_operator.robot_commands.parameters import (
-    Parameter,
+    RobotParameter,
     change_parameters,
     parse_parameters,
     read_parameters_in_force,
@@ -72,7 +72,7 @@ class Robot:
     with a fault.
     """
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: ConnectionSettings) -> None:
         """Open a session to a robot whose link is known. `connect` finds the link.
 
         Args:
@@ -86,7 +86,7 @@ class Robot:
         self._session: Session = self._exit_stack.enter_context(open_session(link, CONNECT_TIMEOUT_S))
 
         # Messages.
-        self._reader_by_key: dict[str, Reader[Any]] = {}
+        self._reader_by_key: dict[str, SampleReader[Any]] = {}
         self._newest_by_key: dict[str, Any] = {}
 
         # The right to command. The client exists from the first command on.
@@ -94,8 +94,8 @@ class Robot:
         self._is_armed_by_us = False  # whether this connection armed the robot
 
         try:
-            self.description: Description = self._require_newest(keys.DESCRIPTION, Description)
-            self._require_newest(keys.STATUS, Status)
+            self.description: RobotDescription = self._require_newest(keys.DESCRIPTION, RobotDescription)
+            self._require_newest(keys.STATUS, RobotStatus)
             # In lockstep the clock publishes nothing while a controller computes, so its first message is not required.
             self._read_newest(keys.CLOCK, Clock, 0.0)
         except NotConnectedError:
@@ -159,13 +159,13 @@ class Robot:
         return [joint.name for joint in self.description.joints]
 
     @property
-    def status(self) -> Status:
+    def status(self) -> RobotStatus:
         """The newest status: lifecycle state, its reason, faults and counters.
 
         Raises:
             NotConnectedError: The robot publishes no status.
         """
-        return self._require_newest(keys.STATUS, Status)
+        return self._require_newest(keys.STATUS, RobotStatus)
 
     @property
     def joints(self) -> JointState | None:
@@ -320,7 +320,7 @@ class Robot:
             raise RefusedError(*output, code="robot/not-confirmed")
 
     @property
-    def parameters(self) -> dict[str, Parameter]:
+    def parameters(self) -> dict[str, RobotParameter]:
         """Parameters of the running controller by name, such as "control.amplitude_rad": value, unit, range, meaning.
 
         Raises:
@@ -437,7 +437,7 @@ class Robot:
             self._newest_by_key[key] = newest
         return self._newest_by_key.get(key)
 
-    def _get_reader(self, key: str, message_type: type[Message]) -> Reader[Any]:
+    def _get_reader(self, key: str, message_type: type[Message]) -> SampleReader[Any]:
         """Return the reader of a key; the first call subscribes to it."""
         reader = self._reader_by_key.get(key)
         if reader is None:

@@ -14,7 +14,7 @@ from snakesim.controllers import ControllerArgument, resolve_controller
 from snakesim.result import Result
 from snakesim_hal.base.errors import ConfigError, ControllerError, SnakesimError, shorten
 from snakesim_hal.model.plugins import CONTROLLERS, register_plugin_temporarily
-from snakesim_hal.model.scenario import Override, RunConfig
+from snakesim_hal.model.scenario import KeyOverride, RunConfig
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from snakesim_operator.results.summary import RunSummary, summarize_run
@@ -66,7 +66,7 @@ def run(
     with contextlib.ExitStack() as opened:
         if controller is not None:
             name, plugin = resolve_controller(controller)
-            overrides.insert(0, Override("controller", name, f"controller={shorten(name)}"))
+            overrides.insert(0, KeyOverride("controller", name, f"controller={shorten(name)}"))
             if plugin is not None:
                 if processes:
                     raise ConfigError(

@@ -33,11 +33,11 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
 from snakesim_can_backend.protocol.expanded import make_expanded_dbc
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.mounting import Mounting
+from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns, discard_line, print_json, print_line
 from snakesim_hal.model.files import ConfigTable, decode_table
-from snakesim_hal.model.scenario import LoadedScenario, Override, RunConfig, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, LoadedScenario, RunConfig, parse_set_option
 from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.run_log.black_box import read_black_box
@@ -62,7 +62,7 @@ def print_load(arguments: argparse.Namespace) -> int:
     Returns:
         Exit code 0; 1 if a bus of the scenario cannot carry its load.
     """
-    overrides = [Override("backend", "can", "drive load can"), *(parse_set_option(text) for text in arguments.set)]
+    overrides = [KeyOverride("backend", "can", "drive load can"), *(parse_set_option(text) for text in arguments.set)]
     loaded = load_scenario(arguments.scenario, overrides)
     settings = load_can_settings(loaded)
     config = loaded.config
@@ -295,7 +295,9 @@ def replay_log(arguments: argparse.Namespace) -> int:
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = load_can_settings(loaded)
     replay = LogReplay(
-        Mounting(config.robot.joint_table), plan_reports(config, settings), compute_response_timeout_s(config, settings)
+        DriveMounting(config.robot.joint_table),
+        plan_reports(config, settings),
+        compute_response_timeout_s(config, settings),
     )
     log = BusLog(arguments.log)
     replay.read(log)

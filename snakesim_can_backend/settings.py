@@ -5,12 +5,12 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from snakesim_can_backend.protocol.definitions import LAST_NODE
-from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.mounted import MountedDrive
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.quantities import from_zero
 
 
-class MountedModule(Mounted, frozen=True, kw_only=True):
+class MountedModule(MountedDrive, frozen=True, kw_only=True):
     """How an emulated module is really mounted and wired, where that differs from the robot file."""
 
     id: Annotated[int, Meta(ge=1, le=LAST_NODE)] | None = None

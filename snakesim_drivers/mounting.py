@@ -14,11 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Drive, Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.model.joints import Joint, JointDrive
+from snakesim_hal.wire.messages import JointMode
 
 
-class Mounting:
+class DriveMounting:
     """How the drives of some joints are mounted, as the robot file describes it."""
 
     def __init__(self, joints: Sequence[Joint]) -> None:
@@ -50,7 +50,7 @@ class Mounting:
         """Return the torque limits at the drives' shafts in N·m for those of joints in N·m. Limits have no sign."""
         return joint_limit_nm / self.gear
 
-    def to_drive_targets(self, modes: Sequence[Mode], targets: Sequence[float]) -> Floats:
+    def to_drive_targets(self, modes: Sequence[JointMode], targets: Sequence[float]) -> Floats:
         """Convert targets of joints to targets of the drives' shafts.
 
         Args:
@@ -85,7 +85,7 @@ class Mounting:
         return drive_torque_nm * self._ratio
 
 
-def to_joint_target(drive: Drive, mode: Mode, target: float) -> float:
+def to_joint_target(drive: JointDrive, mode: JointMode, target: float) -> float:
     """Convert the target of one drive's shaft to that of its joint.
 
     Args:
@@ -98,11 +98,11 @@ def to_joint_target(drive: Drive, mode: Mode, target: float) -> float:
     """
     ratio = drive.sign * drive.gear
     match mode:
-        case Mode.POSITION:
+        case JointMode.POSITION:
             return (target - drive.zero_rad) / ratio
-        case Mode.VELOCITY:
+        case JointMode.VELOCITY:
             return target / ratio
-        case Mode.TORQUE:
+        case JointMode.TORQUE:
             return target * ratio
-        case Mode.PASSIVE:
+        case JointMode.PASSIVE:
             return 0.0

@@ -36,11 +36,19 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.joints import DriveMode
 from snakesim_hal.model.robot import RobotFile, restrict_drive_modes
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import ClockMode, Description, Fault, JointState, LifecycleState, Message, Mode
+from snakesim_hal.wire.messages import (
+    ClockMode,
+    Fault,
+    JointMode,
+    JointState,
+    LifecycleState,
+    Message,
+    RobotDescription,
+)
 
 
 @dataclass(frozen=True)
@@ -51,7 +59,7 @@ class SafeSetpoints:
     Controllers return `snakesim_hal.wire.setpoints.RequestedSetpoints` instead.
     """
 
-    mode: list[Mode]  # of each joint
+    mode: list[JointMode]  # of each joint
     target: list[float]  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: list[float]  # maximum torque of each joint's motor
     isolated: frozenset[int] = frozenset()  # indices of isolated joints, which are passive here and to be switched off
@@ -129,7 +137,7 @@ class Backend(ABC):
         del config, settings
 
     @abstractmethod
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         """Return the description of the robot: the same one at every call, at once.
 
         `snakesim_hal.model.robot.describe_robot` makes it from the robot file. It lists exactly those sensors whose
@@ -190,7 +198,7 @@ class Backend(ABC):
         """
         return []
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Begin or end an injected fault, where the backend can do so more realistically than the host.
 
         Called between two control cycles, and only if the robot is emulated or the scenario allows it.

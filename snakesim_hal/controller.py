@@ -17,14 +17,14 @@ from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.plugins import CONTROLLERS, describe_plugin, load_plugin, require_base_class
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, compute_start_pose
 from snakesim_hal.wire.messages import (
-    Description,
+    JointMode,
     JointState,
     Measurement,
     Message,
-    Mode,
+    RobotDescription,
     Trajectory,
-    World,
     WorldContact,
+    WorldModel,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
@@ -62,7 +62,7 @@ class Observation:
     time_s: float  # since arming (also across new parameters, which replace the controller in an arm session)
     period_s: float  # of the control cycle
     joints: JointState  # angles, velocities and torques, tail to head, always fresh
-    world: World | None  # pose, contacts and obstacles (None: there is none yet, or it is too old)
+    world: WorldModel | None  # pose, contacts and obstacles (None: there is none yet, or it is too old)
     trajectory: Trajectory | None  # path and speed (None: there is none yet, or it is too old)
     sensor_samples: SensorSamples | None = None  # None: the controller does not declare `uses_sensors`
 
@@ -163,7 +163,7 @@ class Controller(ABC, Generic[ParametersT]):
     and navigation.
     """
 
-    required_modes: ClassVar[tuple[Mode, ...]] = ()
+    required_modes: ClassVar[tuple[JointMode, ...]] = ()
     """Control modes that every joint must support, such as `(Mode.POSITION, Mode.TORQUE)`.
 
     A run on a robot without them is refused before it begins.
@@ -179,7 +179,7 @@ class Controller(ABC, Generic[ParametersT]):
     """Whether observations have `sensor_samples`: the newest samples of the pose and contact sensors, and the task."""
 
     @classmethod
-    def check(cls, robot: Description, parameters: ParametersT) -> None:
+    def check(cls, robot: RobotDescription, parameters: ParametersT) -> None:
         """Check before a run that this robot can be driven with these parameters. The default accepts everything.
 
         It is called before anything moves, in the process that starts the run, and possibly more than once. No object
@@ -194,7 +194,7 @@ class Controller(ABC, Generic[ParametersT]):
                 allowed.
         """
 
-    def __init__(self, robot: Description, parameters: ParametersT) -> None:
+    def __init__(self, robot: RobotDescription, parameters: ParametersT) -> None:
         """Keep the arguments as `self.robot` and `self.parameters`. A subclass with state calls this first.
 
         The robot is armed already, so a constructor must return within a few control cycles. It must not have side
@@ -273,7 +273,7 @@ def is_motion_requested(observation: Observation) -> bool:
     )
 
 
-def make_position_setpoints(robot: Description, angles_rad: Sequence[float]) -> RequestedSetpoints:
+def make_position_setpoints(robot: RobotDescription, angles_rad: Sequence[float]) -> RequestedSetpoints:
     """Return setpoints that move every joint to an angle in position mode, with its full torque.
 
     Args:
@@ -281,7 +281,7 @@ def make_position_setpoints(robot: Description, angles_rad: Sequence[float]) -> 
         angles_rad: (n_joints,) tail to head.
     """
     return RequestedSetpoints(
-        [Mode.POSITION] * len(robot.joints),
+        [JointMode.POSITION] * len(robot.joints),
         [float(angle) for angle in angles_rad],
         [joint.torque_limit_nm for joint in robot.joints],
     )

@@ -15,11 +15,11 @@ import msgspec
 from snakesim_hal.base.errors import NotConnectedError, ServiceError, SnakesimError, WireError, describe_exception
 from snakesim_hal.faults.allowed import create_service_faults
 from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.process_entries import make_own_entry, publish_process_entry
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Description, Message
+from snakesim_hal.wire.messages import Clock, Message, RobotDescription
 
 SILENCE_S = 1.0  # a clock that is silent for longer has stopped
 MAX_SHOWN_KEYS = 16  # bound of `waits_for` in a process entry
@@ -41,7 +41,7 @@ class Service(ABC):
     urgent: ClassVar[bool] = False  # True: the robot waits for this service in every tick, so it gets a high priority
     too_slow: str = ""  # evidence that it is too slow for real time (empty: none)
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Subscribe to everything that the service will read. Called before the robot is known.
 
         Args:
@@ -50,7 +50,7 @@ class Service(ABC):
         """
         del client, config
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         """Prepare for a robot. Called before the first tick, and again after a restart of the HAL host.
 
         Args:
@@ -116,7 +116,7 @@ class ServiceLoop:
         self._module = service_type.__module__
 
         # The service, which subscribes in its constructor, before the robot is known.
-        client = Client(session, name, decimation=schedule.decimation, clock_mode=config.clock_mode)
+        client = HostClient(session, name, decimation=schedule.decimation, clock_mode=config.clock_mode)
         self._client = client
         with self._name_service_in_errors("__init__"):
             self.service = service_type(client, config)
@@ -244,7 +244,7 @@ class ServiceLoop:
             raise ServiceError(f"{self._label}: {method}() {describe_exception(error, self._module)}") from error
 
 
-def _wait_for_robot(client: Client, should_retry: Callable[[], bool]) -> Description:
+def _wait_for_robot(client: HostClient, should_retry: Callable[[], bool]) -> RobotDescription:
     """Wait for the description of the robot, and return it.
 
     Raises:

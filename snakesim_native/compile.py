@@ -40,7 +40,7 @@ class CannotCompileError(Exception):
 
 
 @dataclass(frozen=True)
-class Target:
+class CompileTarget:
     """What a library is compiled for."""
 
     machine: str  # as `uname -m` prints it
@@ -52,13 +52,13 @@ class Target:
         return f"{self.machine}-linux-{self.libc}"
 
 
-def get_this_target() -> Target:
+def get_this_target() -> CompileTarget:
     """Return the target for this computer's Python."""
     host = sysconfig.get_config_var("HOST_GNU_TYPE") or ""
-    return Target(platform.machine(), "musl" if "musl" in host else "gnu")
+    return CompileTarget(platform.machine(), "musl" if "musl" in host else "gnu")
 
 
-def list_compilers(target: Target | None = None) -> list[list[str]]:
+def list_compilers(target: CompileTarget | None = None) -> list[list[str]]:
     """Return the commands of the C compilers that are installed on this computer, the first choice first.
 
     Args:
@@ -79,7 +79,7 @@ def list_compilers(target: Target | None = None) -> list[list[str]]:
 
 
 def compile_library(
-    library: NativeLibrary, folder: Path, target: Target | None = None, extra_flags: tuple[str, ...] = ()
+    library: NativeLibrary, folder: Path, target: CompileTarget | None = None, extra_flags: tuple[str, ...] = ()
 ) -> Path:
     """Compile a library into a folder, and remove older builds of it from there.
 

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.base.terminal import discard_output, print_line, print_stderr, report_error, run_tool
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.monitoring import watching
 from snakesim_operator.playback import arguments as playback
 from snakesim_operator.robot_commands import commanding
@@ -189,14 +189,14 @@ class MainParser(CommandParser):
             siblings = self._subparsers_by_noun[noun]
             if word in siblings.choices:
                 continue
-            if isinstance(entry, Noun):
+            if isinstance(entry, CommandGroup):
                 self._add_noun(entry, siblings, word)
             else:
                 _add_command(entry, siblings, word)
             if not noun:
                 self._actions_by_heading.setdefault(entry.heading, []).append(siblings._choices_actions[-1])
 
-    def _add_noun(self, noun: Noun, siblings: Any, word: str) -> None:
+    def _add_noun(self, noun: CommandGroup, siblings: Any, word: str) -> None:
         parser = siblings.add_parser(word, help=_format_list_entry(noun.help), description=noun.help)
         parser.epilog = f"`{parser.prog} COMMAND --help` explains a command."
         self._subparsers_by_noun[noun.name] = parser.add_subparsers(

@@ -26,16 +26,16 @@ def _add_emulation(parser: argparse.ArgumentParser) -> None:
 
 def _scan(arguments: argparse.Namespace) -> int:
     from snakesim_serial_backend.dynamixel.scan import COLUMNS, scan
-    from snakesim_serial_backend.serial_command import Scan, scan_ports
+    from snakesim_serial_backend.serial_command import PortScan, scan_ports
 
-    return scan_ports(arguments, Scan(COLUMNS, list(RATE), scan))
+    return scan_ports(arguments, PortScan(COLUMNS, list(RATE), scan))
 
 
 def _scan_feetech(arguments: argparse.Namespace) -> int:
     from snakesim_serial_backend.feetech.scan import COLUMNS, scan
-    from snakesim_serial_backend.serial_command import Scan, scan_ports
+    from snakesim_serial_backend.serial_command import PortScan, scan_ports
 
-    return scan_ports(arguments, Scan(COLUMNS, list(FEETECH_RATE), scan))
+    return scan_ports(arguments, PortScan(COLUMNS, list(FEETECH_RATE), scan))
 
 
 def _emulate(arguments: argparse.Namespace) -> int:

@@ -18,11 +18,11 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import set_parent_death_signal
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.model.scenario import Override, load_scenario, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, load_scenario, parse_set_option
 from snakesim_hal.programs.preflight import apply_backend_modes, decode_backend_settings
 from snakesim_serial_backend.port_load import PortLoad
 from snakesim_serial_backend.servo_backend import ServoBackend
-from snakesim_serial_backend.wire import Pty
+from snakesim_serial_backend.wire import PseudoTerminal
 
 TABLE_SERVOS = (1, 4, 8, 13, 18, 24)  # numbers of servos on a port in the load table
 
@@ -43,7 +43,7 @@ def emulate_servos(arguments: argparse.Namespace, backend: type[ServoBackend[Any
     if arguments.parent is not None:
         set_parent_death_signal(arguments.parent)
     overrides = [
-        Override("backend", backend.name, f"drive emulate {backend.name}"),
+        KeyOverride("backend", backend.name, f"drive emulate {backend.name}"),
         *map(parse_set_option, arguments.set),
     ]
     loaded = load_scenario(arguments.scenario, overrides)
@@ -107,7 +107,7 @@ def _format_baud(baud: int) -> str:
 
 
 @contextlib.contextmanager
-def create_named_ptys(link_paths: Sequence[Path]) -> Iterator[list[Pty]]:
+def create_named_ptys(link_paths: Sequence[Path]) -> Iterator[list[PseudoTerminal]]:
     """Create pseudo terminals and symbolic links to them; close and remove them at the end of the context.
 
     Args:
@@ -119,7 +119,7 @@ def create_named_ptys(link_paths: Sequence[Path]) -> Iterator[list[Pty]]:
     Raises:
         ConfigError: A link cannot be created.
     """
-    ptys = [Pty() for _ in link_paths]
+    ptys = [PseudoTerminal() for _ in link_paths]
     created_links: list[Path] = []
     try:
         for link, pty in zip(link_paths, ptys, strict=True):

@@ -23,7 +23,7 @@ ATTEMPTS = 3  # to read or write registers before the control cycle runs
 MAX_RESPONSE_DELAY_S = 2.0  # after which an answer does not arrive any more
 
 
-class Status(Protocol):
+class ServoStatus(Protocol):
     """A packet in which a servo answers."""
 
     @property
@@ -37,8 +37,8 @@ class Status(Protocol):
         ...
 
 
-StatusT = TypeVar("StatusT", bound=Status)
-StatusT_co = TypeVar("StatusT_co", bound=Status, covariant=True)
+StatusT = TypeVar("StatusT", bound=ServoStatus)
+StatusT_co = TypeVar("StatusT_co", bound=ServoStatus, covariant=True)
 
 
 class StatusDecoder(Protocol[StatusT_co]):
@@ -54,7 +54,7 @@ class StatusDecoder(Protocol[StatusT_co]):
         ...
 
 
-class Answers(NamedTuple, Generic[StatusT]):
+class RequestResponses(NamedTuple, Generic[StatusT]):
     """Everything that arrived after one request to one servo."""
 
     statuses: list[StatusT]  # of that servo: answers to this request
@@ -86,7 +86,7 @@ class RequestPort(ABC, Generic[StatusT]):
         """Return a decoder that has received no bytes yet."""
 
     @abstractmethod
-    def read_alone(self, id_: int, address: int, size: int) -> Answers[StatusT]:
+    def read_alone(self, id_: int, address: int, size: int) -> RequestResponses[StatusT]:
         """Read registers of a servo, and wait for a second answer, too."""
 
     @abstractmethod
@@ -153,7 +153,9 @@ class RequestPort(ABC, Generic[StatusT]):
             return None
         return responses.statuses[0]
 
-    def _request_all_responses(self, id_: int, request: bytes, size: int, max_responses: int) -> Answers[StatusT]:
+    def _request_all_responses(
+        self, id_: int, request: bytes, size: int, max_responses: int
+    ) -> RequestResponses[StatusT]:
         """Send a request to one servo, and return all responses that arrive until the bus is silent.
 
         Args:
@@ -176,7 +178,7 @@ class RequestPort(ABC, Generic[StatusT]):
                 statuses.append(status)
             if len(statuses) >= max_responses:
                 break
-        return Answers(statuses, surplus_count, decoder.garbled)
+        return RequestResponses(statuses, surplus_count, decoder.garbled)
 
     def _sync_read(self, ids: Collection[int], request: bytes, size: int) -> list[StatusT]:
         """Send a sync read, and return the answers, of which each servo sends one.

@@ -13,7 +13,7 @@ FAILED = 1
 
 
 @dataclass(frozen=True)
-class Scan:
+class PortScan:
     """How to scan a port for the servos of one protocol."""
 
     columns: tuple[str, ...]  # of the table
@@ -21,7 +21,7 @@ class Scan:
     find_servos: Callable[[SerialWire], Iterable[dict[str, str]]]  # rows of text, by `columns`
 
 
-def scan_ports(arguments: argparse.Namespace, scan: Scan) -> int:
+def scan_ports(arguments: argparse.Namespace, scan: PortScan) -> int:
     """Run `snakesim drive scan` for a protocol: list the servos that respond on some ports at any of its baud rates.
 
     Args:

@@ -19,7 +19,7 @@ from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.port_load import PortLoad
-from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated, open_log
+from snakesim_serial_backend.wire import PseudoTerminal, SerialWire, is_emulated, open_log
 
 # A silence of this length ends an answer, whichever is longer.
 MIN_GAP_S = 0.002
@@ -27,7 +27,7 @@ GAP_PER_PERIOD = 0.2
 EMULATED_GAP_PER_PERIOD = 0.5  # of servos in another process, which a busy computer delays
 
 
-class ServoEmulator(DriveEmulator[Pty]):
+class ServoEmulator(DriveEmulator[PseudoTerminal]):
     """Emulated servos at the end of pseudo terminals."""
 
     @abstractmethod
@@ -68,7 +68,12 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
     @classmethod
     @abstractmethod
     def make_emulator(
-        cls, joints: Sequence[Joint], settings: Any, body: EmulatedBody, ptys: Sequence[Pty], clock: DriverClock
+        cls,
+        joints: Sequence[Joint],
+        settings: Any,
+        body: EmulatedBody,
+        ptys: Sequence[PseudoTerminal],
+        clock: DriverClock,
     ) -> EmulatorT:
         """Make emulated servos for joints.
 
@@ -82,7 +87,7 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
 
     @classmethod
     def make_robot_emulator(
-        cls, config: RunConfig, settings: Any, ptys: list[Pty], clock: DriverClock, pose_address: str | None
+        cls, config: RunConfig, settings: Any, ptys: list[PseudoTerminal], clock: DriverClock, pose_address: str | None
     ) -> EmulatorT:
         """Make emulated servos for a whole robot.
 
@@ -138,7 +143,7 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
             if body is None:
                 wire = SerialWire(port_name, settings.baud, log)
             else:
-                pty = Pty()
+                pty = PseudoTerminal()
                 emulator = cls.make_emulator(list(joints.values()), settings, body, [pty] * len(joints), clock)
                 wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
             gap_per_period = EMULATED_GAP_PER_PERIOD if is_emulated(wire.port) else GAP_PER_PERIOD

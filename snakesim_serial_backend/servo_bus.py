@@ -12,11 +12,11 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import FAULTS
 from snakesim_drivers.kit.drives import Drives
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_serial_backend.request_port import RequestPort, StatusT
-from snakesim_serial_backend.wire import Pty, is_emulated
+from snakesim_serial_backend.wire import PseudoTerminal, is_emulated
 
 BOOT_NS = 2_000_000_000  # in which the silence of a servo that restarts is no fault
 INJECTABLE = {("bus", "cut"), *(("joint", kind) for kind in FAULTS)}
@@ -67,7 +67,7 @@ class SerialServo(Generic[PortT]):
         self.enabled = False  # until it reports otherwise
 
 
-class Registers(NamedTuple):
+class RegisterRange(NamedTuple):
     """Registers that are read at once."""
 
     address: int
@@ -84,7 +84,7 @@ class ServoBusContext(Generic[ServoT, StatusT]):
     servos: Sequence[ServoT]  # of this port, from tail to head
     port: RequestPort[StatusT]  # sends and receives packets
     readings: DriveReadings
-    emulator: DriveEmulator[Pty] | None  # the servos, if they are emulated in this process
+    emulator: DriveEmulator[PseudoTerminal] | None  # the servos, if they are emulated in this process
     response_timeout_s: float  # time that a reading waits for answers
     clock_ns: Callable[[], int]
 
@@ -92,9 +92,9 @@ class ServoBusContext(Generic[ServoT, StatusT]):
 class SerialServos(Drives, Generic[ServoT, StatusT]):
     """All servos of a port, tail to head."""
 
-    motion: ClassVar[Registers]  # of all servos in every cycle
-    state: ClassVar[Registers]  # of servos that may have stopped by themselves
-    health: ClassVar[Registers]  # of one servo in every cycle
+    motion: ClassVar[RegisterRange]  # of all servos in every cycle
+    state: ClassVar[RegisterRange]  # of servos that may have stopped by themselves
+    health: ClassVar[RegisterRange]  # of one servo in every cycle
     torque_enable: ClassVar[int]  # address of the register that switches the torque
 
     def __init__(self, context: ServoBusContext[ServoT, StatusT]) -> None:
@@ -126,7 +126,7 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
         """Store whether a servo's torque is on, and what has switched it off, of the registers `state`."""
 
     @abstractmethod
-    def _find_stop_reason(self, i: int) -> Finding | None:
+    def _find_stop_reason(self, i: int) -> FaultFinding | None:
         """Return what has switched a servo's torque off, if anything."""
 
     # --- reading ----------------------------------------------------------------------------------------------
@@ -210,19 +210,19 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
 
     # --- faults -----------------------------------------------------------------------------------------------
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return what is wrong now with the port and its servos."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         error = self._port.wire.error()
         if error:
-            findings.append(Finding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
+            findings.append(FaultFinding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
         for i, servo in enumerate(self.servos):
             for finding in (_find_response_problem(i, servo), self._find_stop_reason(i)):
                 if finding is not None:
                     findings.append(finding)
         return findings
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end a fault of emulated servos here, or of their bus. Returns whether it is possible."""
         if self._emulator is None or (injection.target_type, injection.kind) not in INJECTABLE:
             return False
@@ -244,11 +244,11 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
             self._emulator.close()
 
 
-def _find_response_problem(i: int, servo: SerialServo[Any]) -> Finding | None:
+def _find_response_problem(i: int, servo: SerialServo[Any]) -> FaultFinding | None:
     """Return what is wrong with a servo's answers, if anything."""
     if servo.answered_twice >= MAX_BAD_RESPONSES:
         # It concerns the whole robot: which of the two servos is where is unknown.
-        return Finding("duplicate_node", f"{servo.label} {RESPONDS_TWICE}", i)
+        return FaultFinding("duplicate_node", f"{servo.label} {RESPONDS_TWICE}", i)
     if servo.garbled >= MAX_BAD_RESPONSES:
-        return Finding("drive_silent", f"{servo.label} sends garbled bytes: {GARBLED}", i, affects_only_joint=True)
+        return FaultFinding("drive_silent", f"{servo.label} sends garbled bytes: {GARBLED}", i, affects_only_joint=True)
     return None

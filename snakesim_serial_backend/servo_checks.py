@@ -2,14 +2,14 @@
 
 from typing import Any
 
-from snakesim_serial_backend.servo_bus import GARBLED, RESPONDS_TWICE, Registers, SerialServo
+from snakesim_serial_backend.servo_bus import GARBLED, RESPONDS_TWICE, RegisterRange, SerialServo
 
 MAX_READS = 3  # to distinguish a second servo from a single disturbance
 MIN_DOUBLED = 2  # reads with an answer too many that show a second servo
 NO_ANSWER = "does not answer: it is off, or has another id or baud rate"
 
 
-def find_shared_id(servo: SerialServo[Any], registers: Registers) -> str:
+def find_shared_id(servo: SerialServo[Any], registers: RegisterRange) -> str:
     """Detect a second servo with the same id by reading registers several times.
 
     A ping does not show a second servo: two servos of one model respond with the same bytes at the same time. Late

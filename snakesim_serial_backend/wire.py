@@ -31,7 +31,7 @@ IO_ERRORS = (OSError, termios.error, ValueError)  # of pyserial and of `select`,
 RunDrives = Callable[[], None]
 
 
-class Pty:
+class PseudoTerminal:
     """A pseudo terminal. Emulated drives are at its one end; at the other is the program that opens `path`.
 
     Attributes:
@@ -95,7 +95,7 @@ class SerialWire:
         port: str,
         baud: int,
         log: TextIO | None = None,
-        pty: Pty | None = None,
+        pty: PseudoTerminal | None = None,
         run_drives: RunDrives | None = None,
     ) -> None:
         """Open a serial port.

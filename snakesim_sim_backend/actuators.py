@@ -21,21 +21,26 @@ from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import Module, RobotFile
+from snakesim_hal.model.robot import ModuleBody, RobotFile
 from snakesim_hal.physics.motor import compute_torque_roll_off
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
-# Indices of a dcmotor's parameters in actuator_gainprm; checked against the compiled model in `Motors`.
+# Indices of a dcmotor's parameters in actuator_gainprm; checked against the compiled model in `ModelMotors`.
 KP = 4
 KD = 6
 MAX_VOLTS = 7
 # Inputs of a motor in `ctrl`: position, velocity, feed-forward torque.
 INPUTS_PER_MOTOR = 3
 TORQUE_INPUT = 2
-INPUT_INDEX_BY_MODE = {Mode.PASSIVE: TORQUE_INPUT, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: TORQUE_INPUT}
+INPUT_INDEX_BY_MODE = {
+    JointMode.PASSIVE: TORQUE_INPUT,
+    JointMode.POSITION: 0,
+    JointMode.VELOCITY: 1,
+    JointMode.TORQUE: TORQUE_INPUT,
+}
 
 
-def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) -> None:
+def add_motor(spec: mujoco.MjSpec, joint: Joint, module: ModuleBody, step_s: float) -> None:
     """Add the motor of one joint to a model. The motor starts in passive mode."""
     limits = joint.limits
     # With motor constant 1, volts are rad/s, and the torque at rest under full volts is speed limit / resistance.
@@ -52,7 +57,7 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) 
     )
 
 
-def _make_gains_by_mode(joint: Joint, scale: float) -> dict[Mode, tuple[float, float, float]]:
+def _make_gains_by_mode(joint: Joint, scale: float) -> dict[JointMode, tuple[float, float, float]]:
     """Return kp, kd and maximum volts of each mode that the joint's drive has. 0 V means no limit.
 
     Args:
@@ -62,10 +67,10 @@ def _make_gains_by_mode(joint: Joint, scale: float) -> dict[Mode, tuple[float, f
     motor = joint.motor
     max_volts = joint.limits.speed_rad_s
     gains = {
-        Mode.PASSIVE: (0.0, 0.0, 0.0),
-        Mode.POSITION: (scale * motor.stiffness_nm_per_rad, scale * motor.damping_nm_s_per_rad, max_volts),
-        Mode.VELOCITY: (0.0, scale * motor.velocity_gain_nm_s_per_rad, max_volts),
-        Mode.TORQUE: (0.0, 0.0, max_volts),
+        JointMode.PASSIVE: (0.0, 0.0, 0.0),
+        JointMode.POSITION: (scale * motor.stiffness_nm_per_rad, scale * motor.damping_nm_s_per_rad, max_volts),
+        JointMode.VELOCITY: (0.0, scale * motor.velocity_gain_nm_s_per_rad, max_volts),
+        JointMode.TORQUE: (0.0, 0.0, max_volts),
     }
     mode_names = ("passive", *joint.drive.modes)
     return {mode: values for mode, values in gains.items() if mode.name.lower() in mode_names}
@@ -82,7 +87,7 @@ class MotorData(Protocol):
     def ctrl(self) -> Floats: ...
 
 
-class Motors:
+class ModelMotors:
     """All motors of a compiled model, tail to head.
 
     Attributes:
@@ -129,7 +134,7 @@ class Motors:
         )
 
         # Current modes, and the indices of their inputs in `ctrl`.
-        self._modes: list[Mode] = []
+        self._modes: list[JointMode] = []
         self._input_indices = np.empty(0, dtype=np.intp)
         self._passive_indices: list[int] = []
         # The gains of `add_motor` must be where the indices of this module say.
@@ -151,7 +156,7 @@ class Motors:
         """
         self.set_inputs(setpoints.mode, setpoints.target, setpoints.torque_limit_nm)
 
-    def set_inputs(self, modes: list[Mode], targets: list[float], limits_nm: list[float]) -> None:
+    def set_inputs(self, modes: list[JointMode], targets: list[float], limits_nm: list[float]) -> None:
         """Drive the simulated motors, as `enact` does; also before a run begins, when no limiter is there yet."""
         if modes != self._modes:
             self._change_modes(modes)
@@ -170,7 +175,7 @@ class Motors:
     def switch_off(self) -> None:
         """Make all joints passive."""
         zeros = [0.0] * self.count
-        self.set_inputs([Mode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist())
+        self.set_inputs([JointMode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist())
 
     def apply_pending_torque_limits(self) -> None:
         """Lower the torque limits as fast as the motors can follow, and end wind-up above them.
@@ -211,7 +216,7 @@ class Motors:
         self._max_torque_nm[:] = limit_nm
         self._min_torque_nm[:] = -limit_nm
 
-    def _change_modes(self, modes: list[Mode]) -> None:
+    def _change_modes(self, modes: list[JointMode]) -> None:
         """Set the gains of new modes, and find their inputs.
 
         Raises:
@@ -227,7 +232,7 @@ class Motors:
         indices = [INPUTS_PER_MOTOR * i + INPUT_INDEX_BY_MODE[mode] for i, mode in enumerate(modes)]
         self._input_indices = np.array(indices, dtype=np.intp)
         self._passive_indices = [
-            INPUTS_PER_MOTOR * i + TORQUE_INPUT for i, mode in enumerate(modes) if mode == Mode.PASSIVE
+            INPUTS_PER_MOTOR * i + TORQUE_INPUT for i, mode in enumerate(modes) if mode == JointMode.PASSIVE
         ]
         self._inputs[:] = 0.0
 

@@ -8,20 +8,20 @@ import numpy as np
 
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.fault_plan import validate_faults_for_backend
 from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, compute_config_hash
 from snakesim_hal.physics.motor import validate_position_gains
-from snakesim_hal.physics.thermal import Thermal
-from snakesim_hal.wire.messages import ClockMode, Description, Fault, LifecycleState
-from snakesim_sim_backend.actuators import Motors
+from snakesim_hal.physics.thermal import ThermalModel
+from snakesim_hal.wire.messages import ClockMode, Fault, LifecycleState, RobotDescription
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, build_sim_model, view_joint_states
 from snakesim_sim_backend.model.tether import TetherRope
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.sensors.registry import check_sensor_models
-from snakesim_sim_backend.sensors.suite import Sensors
+from snakesim_sim_backend.sensors.suite import SensorSuite
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.state.contacts import ObstacleContactReader
 from snakesim_sim_backend.state.divergence import MAX_SPEED, DivergenceWatch, log_mujoco_warnings
@@ -96,8 +96,8 @@ class SimBackend(Backend):
         self._description = msgspec.structs.replace(description, laws=self._sim.laws)
         model = self._sim.model
         self._data = mujoco.MjData(model)
-        self._physics = Physics(self._sim, self._data)
-        self._motors = Motors(model, self._data, config.robot, self._period_s, settings.motor_gain_scale)
+        self._physics = PhysicsStepper(self._sim, self._data)
+        self._motors = ModelMotors(model, self._data, config.robot, self._period_s, settings.motor_gain_scale)
         place_and_settle_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
         self._tether_rope: TetherRope | None = None
         if settings.tether is not None:
@@ -106,8 +106,8 @@ class SimBackend(Backend):
 
         # Heat and sensors.
         self._simulates_heat = config.robot.sensors.power is not None
-        self._windings = Thermal(config.robot.joint_table)
-        self._sensors = Sensors(self._sim, self._data, config, self._motors, self._physics, self._windings)
+        self._windings = ThermalModel(config.robot.joint_table)
+        self._sensors = SensorSuite(self._sim, self._data, config, self._motors, self._physics, self._windings)
         self._divergence_watch = DivergenceWatch(model, self._data, self._physics, self._sim.steps_per_tick)
 
         # IMUs cost time, and only their values in the last step of a tick are read.
@@ -119,7 +119,7 @@ class SimBackend(Backend):
         self._steps_with_sensors = self._sim.steps_per_tick - self._steps_without_sensors
         self._option = model.opt
 
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         """Return the robot of the robot file."""
         return self._description
 
@@ -179,7 +179,7 @@ class SimBackend(Backend):
             for cause in self._sensors.describe_dropped_samples()
         ]
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Begin or end an injected fault; return False for a fault that the simulator does not have.
 
         `diverge` makes the base impossibly fast, as in a divergence. `overheat` heats a winding.
@@ -211,7 +211,7 @@ class SimBackend(Backend):
         return self._sim
 
     @property
-    def physics(self) -> Physics:
+    def physics(self) -> PhysicsStepper:
         """The physics steps, and the forces that MuJoCo does not compute."""
         return self._physics
 

@@ -1,6 +1,7 @@
 """Renders pictures of a motion with MuJoCo: the snake at given poses in its scene, without any physics.
 
-`Film` is the object of an entry point in the group `snakesim.films`, which `snakesim recording video` finds by name.
+`FollowCamera` is the object of an entry point in the group `snakesim.films`, which `snakesim recording video` finds by
+name.
 """
 
 from collections.abc import Sequence
@@ -51,7 +52,7 @@ SUN_SPECULAR = 0.1
 SAMPLES_PER_PIXEL = 4
 
 
-class Film:
+class FollowCamera:
     """A camera that follows the snake. It must be made and used in one thread."""
 
     Settings = SimSettings  # of the backend, which the scene is built with
@@ -68,7 +69,7 @@ class Film:
             ConfigError: The scene cannot be built, or there is no OpenGL.
         """
         section = config.backends.get("sim", {})
-        settings = decode_plugin_settings(Film, section, f"run {config.name!r}", "backends.sim")
+        settings = decode_plugin_settings(FollowCamera, section, f"run {config.name!r}", "backends.sim")
         self._sim = build_sim_model(config, settings)
         self._model = self._sim.model
         self._data = mujoco.MjData(self._model)

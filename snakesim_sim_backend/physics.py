@@ -2,13 +2,13 @@
 
 import mujoco
 
-from snakesim_sim_backend.laws.laws import Laws, MeasuredContactForce
+from snakesim_sim_backend.laws.laws import MeasuredContactForce, PhysicsLaws
 from snakesim_sim_backend.laws.native_laws import NativeLaws
 from snakesim_sim_backend.laws.python_laws import PythonLaws
 from snakesim_sim_backend.model.build import SimModel
 
 
-def create_laws(sim: SimModel, data: mujoco.MjData) -> Laws:
+def create_laws(sim: SimModel, data: mujoco.MjData) -> PhysicsLaws:
     """Return the laws of a simulation, in the version that its model was built for."""
     match sim.laws:
         case "c":
@@ -17,7 +17,7 @@ def create_laws(sim: SimModel, data: mujoco.MjData) -> Laws:
             return PythonLaws(sim, data)
 
 
-class Physics:
+class PhysicsStepper:
     """Advances one simulation.
 
     Attributes:

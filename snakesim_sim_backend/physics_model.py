@@ -14,10 +14,10 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu, Pose
-from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import FREE_DOFS, SimModel, build_sim_model, view_joint_states
 from snakesim_sim_backend.model.tether import TetherRope
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
@@ -57,7 +57,7 @@ class MujocoPhysicsModel(PhysicsModel):
         self._data = mujoco.MjData(self._model)
         self.step_s: float = self._model.opt.timestep
         self._data.qpos[:] = _compute_rest_coordinates(config, settings, yields=bool(self._sim.yielding))
-        self._physics = Physics(self._sim, self._data)
+        self._physics = PhysicsStepper(self._sim, self._data)
         self._physics.reset()
         if settings.tether is not None:
             TetherRope(self._model, self._data, settings.tether).tighten()
@@ -201,7 +201,7 @@ class MujocoPhysicsModel(PhysicsModel):
         return self._sim
 
     @property
-    def physics(self) -> Physics:
+    def physics(self) -> PhysicsStepper:
         """The physics steps, and the forces that MuJoCo does not compute."""
         return self._physics
 
@@ -222,6 +222,6 @@ def _compute_rest_coordinates(config: RunConfig, settings: PhysicsModelSettings,
         step_s = min(step_s, settings.timestep_s)
     sim = build_sim_model(config, msgspec.structs.replace(settings, timestep_s=step_s))
     data = mujoco.MjData(sim.model)
-    motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9)
-    place_and_settle_robot(sim, data, Physics(sim, data), config, motors, settings.settle_s)
+    motors = ModelMotors(sim.model, data, config.robot, config.period_ns * 1e-9)
+    place_and_settle_robot(sim, data, PhysicsStepper(sim, data), config, motors, settings.settle_s)
     return data.qpos

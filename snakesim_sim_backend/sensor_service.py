@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Description, JointState, Message, Pose
+from snakesim_hal.wire.messages import Clock, JointState, Message, Pose, RobotDescription
 from snakesim_sim_backend.model.build import FREE_QPOS, build_sim_model, view_joint_states
 from snakesim_sim_backend.sensors.registry import make_mounted_reader, make_sensor_rng
-from snakesim_sim_backend.sensors.scope import Reader, Scope
+from snakesim_sim_backend.sensors.scope import SensorReader, SensorScope
 from snakesim_sim_backend.settings import SimSettings
 
 
@@ -24,7 +24,7 @@ class SensorService(Service):
 
     name = "sensor"
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Build the scene.
 
         Raises:
@@ -36,15 +36,15 @@ class SensorService(Service):
         self._pose = client.subscribe(keys.POSE, Pose)
         self._sim = build_sim_model(config, SimSettings(), motors=False)
         self._data = mujoco.MjData(self._sim.model)
-        self._readers: list[tuple[str, Reader]] = []
+        self._readers: list[tuple[str, SensorReader]] = []
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         """Make a reader for each sensor of the robot file that the robot's HAL does not have."""
         published = {sensor.key for sensor in robot.sensors}
         self._readers = []
         for key, sensor in self._config.robot.sensors.iterate_mounted():
             if key not in published:
-                scope = Scope(self._config, self._sim, self._data, make_sensor_rng(key, self._config.seed))
+                scope = SensorScope(self._config, self._sim, self._data, make_sensor_rng(key, self._config.seed))
                 self._readers.append((key, make_mounted_reader(key, sensor, scope)))
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:

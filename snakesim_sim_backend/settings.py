@@ -8,7 +8,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.quantities import MAX_JOINTS, bounded, from_zero
 
 
-class Tether(FileStruct, frozen=True, kw_only=True):
+class TetherSettings(FileStruct, frozen=True, kw_only=True):
     """A rope from a point of the snake to an anchor far away on the ground's plane.
 
     It can only pull towards `direction_w`: the point cannot move against that direction, and moves almost freely
@@ -57,7 +57,7 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     `snakesim robot identify` needs it.
     """
 
-    tether: Tether | None = None
+    tether: TetherSettings | None = None
     """Rope to an anchor. None: there is no rope."""
 
 

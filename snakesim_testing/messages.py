@@ -38,7 +38,7 @@ VARYING = (  # parts of texts that differ from run to run
 )
 
 
-class Messages:
+class StoredMessages:
     """The messages of one test. Each is compared with the stored one, in order."""
 
     def __init__(self, item: pytest.Item, stored: Sequence[str], *, updating: bool) -> None:
@@ -86,7 +86,7 @@ class Messages:
         return text
 
 
-class Plugin:
+class MessagesPlugin:
     """Hands out the messages of each test, and writes the file at the end if that is requested."""
 
     def __init__(self, config: pytest.Config) -> None:
@@ -96,7 +96,7 @@ class Plugin:
         self._is_partial = bool(config.getoption("keyword")) or any("::" in argument for argument in config.args)
         self._stored: dict[str, list[str]] | None = None
         self._new: dict[str, list[str]] = {}
-        self.current: Messages | None = None
+        self.current: StoredMessages | None = None
 
     def read_stored(self) -> dict[str, list[str]]:
         """Return the content of the file, which is read once."""
@@ -114,7 +114,7 @@ class Plugin:
         if item.get_closest_marker("hypothesis") is not None:  # it runs many examples, with as many texts
             return
         stored = self.read_stored().get(make_key(item.nodeid), [])
-        self.current = Messages(item, stored, updating=self._updating)
+        self.current = StoredMessages(item, stored, updating=self._updating)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None]:
@@ -161,12 +161,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(OPTION, action="store_true", help=f"write the messages of the tests that run into {FILE}")
 
 
-_plugins: list[Plugin] = []  # of the pytest sessions of this process, the inner one last
+_plugins: list[MessagesPlugin] = []  # of the pytest sessions of this process, the inner one last
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Make the plugin of this session."""
-    plugin = Plugin(config)
+    plugin = MessagesPlugin(config)
     config.pluginmanager.register(plugin, "snakesim_messages")
     _plugins.append(plugin)
 
@@ -176,13 +176,13 @@ def pytest_unconfigure() -> None:
     _plugins.pop()
 
 
-def find_messages() -> Messages | None:
+def find_messages() -> StoredMessages | None:
     """Return the messages of the test that runs, if this plugin is loaded."""
     return _plugins[-1].current if _plugins else None
 
 
 @pytest.fixture
-def messages() -> Messages:
+def messages() -> StoredMessages:
     """The messages of this test: `messages.check(text)` compares a text with the stored one."""
     found = find_messages()
     assert found is not None
@@ -206,7 +206,7 @@ def raises_error(
         code: Its code, or the possible ones.
         field: What the message must name: a key, an option, a file, a joint. Several are possible.
         value: The value that the message must name.
-        mask: As for `Messages.check`.
+        mask: As for `StoredMessages.check`.
         stored: False: the text is not compared, because it differs too much from run to run.
 
     Yields:

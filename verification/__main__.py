@@ -19,7 +19,7 @@ PYTEST = ("pytest", "-q", "--timeout", "1800")
 
 
 @dataclass(frozen=True)
-class Part:
+class CampaignPart:
     """One part of the campaign: Python's arguments behind `-m`, or a script of the repository."""
 
     about: str
@@ -29,14 +29,16 @@ class Part:
 
 
 PARTS = {
-    "lease": Part(
+    "lease": CampaignPart(
         "mutants of lease and lifecycle",
         2,
         ("verification.mutation", "--files", "lease.py", "lifecycle.py", "stop_ramp.py"),
     ),
-    "decoders": Part("100,000 damaged payloads into every decoder", 1, ("verification.fuzz", "--payloads", "100000")),
-    "sanitizers": Part("physics tests with a C library that checks itself", 6, ("verification.sanitize",)),
-    "contracts": Part(
+    "decoders": CampaignPart(
+        "100,000 damaged payloads into every decoder", 1, ("verification.fuzz", "--payloads", "100000")
+    ),
+    "sanitizers": CampaignPart("physics tests with a C library that checks itself", 6, ("verification.sanitize",)),
+    "contracts": CampaignPart(
         "tools of the campaign, and the rules of who may import whom",
         1,
         (
@@ -49,41 +51,45 @@ PARTS = {
             "verification/fuzz",
         ),
     ),
-    "quiet": Part(
+    "quiet": CampaignPart(
         "robots in real time, one test after the other",
         4,
         (*PYTEST, "tests", "--ignore", "tests/system/can", "-m", "quiet"),
     ),
-    "slow": Part(
+    "slow": CampaignPart(
         "the long forms of the tests",
         16,
         (*PYTEST, "tests", "--ignore", "tests/system/can", "-n", "3", "-m", "slow and not quiet"),
     ),
-    "can": Part(
+    "can": CampaignPart(
         "all CAN tests and the contract on a kernel's bus",
         7,
         (*WITH_VCAN, *PYTEST, "tests/system/can", "tests/contract", "-m", ""),
         script=True,
     ),
-    "documents": Part("every command that the documentation prints", 10, (*PYTEST, "verification/documents", "-m", "")),
-    "installation": Part("wheels, extras and left-out packages", 5, (*PYTEST, "verification/installation", "-m", "")),
-    "computers": Part(
+    "documents": CampaignPart(
+        "every command that the documentation prints", 10, (*PYTEST, "verification/documents", "-m", "")
+    ),
+    "installation": CampaignPart(
+        "wheels, extras and left-out packages", 5, (*PYTEST, "verification/installation", "-m", "")
+    ),
+    "computers": CampaignPart(
         "the digests under the code of other processors", 4, (*PYTEST, "verification/computers", "-m", "")
     ),
-    "commissioning": Part(
+    "commissioning": CampaignPart(
         "hidden faults of joints", 3, (*PYTEST, "verification/test_commissioning_trials.py", "-m", "")
     ),
-    "attack": Part("every attack of an unauthorized client, once", 5, (*PYTEST, "verification/attack")),
-    "links": Part("bad links between machines (root)", 4, (*PYTEST, "verification/links", "-m", "")),
-    "faults": Part("the fault table, two trials of each row", 6, ("verification.faults", "--trials", "2")),
-    "fuzz": Part(
+    "attack": CampaignPart("every attack of an unauthorized client, once", 5, (*PYTEST, "verification/attack")),
+    "links": CampaignPart("bad links between machines (root)", 4, (*PYTEST, "verification/links", "-m", "")),
+    "faults": CampaignPart("the fault table, two trials of each row", 6, ("verification.faults", "--trials", "2")),
+    "fuzz": CampaignPart(
         "damaged payloads into a running robot",
         3,
         ("verification.fuzz", "--network", "--payloads", "200000"),
     ),
-    "kills": Part("processes killed and frozen at random", 3, ("verification.soak.kills", "--trials", "20")),
-    "soak": Part("random faults for three minutes", 4, ("verification.soak", "--minutes", "3")),
-    "mutation": Part(
+    "kills": CampaignPart("processes killed and frozen at random", 3, ("verification.soak.kills", "--trials", "20")),
+    "soak": CampaignPart("random faults for three minutes", 4, ("verification.soak", "--minutes", "3")),
+    "mutation": CampaignPart(
         "mutants of the rest of the safety core",
         12,
         ("verification.mutation", "--files", *sorted(TRIED_BY.keys() - {"lease.py", "lifecycle.py", "stop_ramp.py"})),

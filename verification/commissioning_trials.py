@@ -18,10 +18,10 @@ import msgspec
 import numpy as np
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.mounted import MountedDrive
 from snakesim_drivers.emulation.shared_physics import SharedPhysics, make_physics_model
 from snakesim_drivers.kit.drive_settings import BodySettings
-from snakesim_gnc.control.identify import Identify, IdentifyParameters
+from snakesim_gnc.control.identify import Identification, IdentifyParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.model.checked import JointProperty
@@ -29,7 +29,7 @@ from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Imu, JointState, Mode
+from snakesim_hal.wire.messages import Imu, JointMode, JointState
 from snakesim_operator.features.commissioning.identification import JointIdentification, identify_joints
 from snakesim_operator.features.commissioning.judge import JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import collect_measurements
@@ -168,7 +168,7 @@ class IdentifyTrial:
     """One robot, and what was found of it."""
 
     loose: int | None  # joint with backlash
-    truth: Mapping[str, Mounted]
+    truth: Mapping[str, MountedDrive]
     found: Sequence[JointIdentification]
     written: int = field(init=False, default=0)  # values
     covered: int = field(init=False, default=0)  # values that are written, and whose interval covers the truth
@@ -201,7 +201,7 @@ def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTr
     pick = random.Random(number)
     texts = (*IDENTIFY_ROBOT, f"seed={number + 1}", *sets)
     config = load_scenario("identify", [parse_set_option(text) for text in texts]).config
-    truth: dict[str, Mounted] = {}
+    truth: dict[str, MountedDrive] = {}
     latency_s: list[float] = []
     loose = pick.randrange(IDENTIFY_MODULES)
     backlash_rad = pick.choice(BACKLASHES_RAD)
@@ -209,7 +209,7 @@ def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTr
         values = {name: getattr(one.motor, name) * pick.uniform(1 - DRAWN, 1 + DRAWN) for name in FIELDS}
         if backlash and joint == loose:
             values["backlash_rad"] = backlash_rad
-        truth[one.name] = Mounted(**values)
+        truth[one.name] = MountedDrive(**values)
         latency_s.append(round(LATENCY_S * pick.uniform(1 - DRAWN, 1 + DRAWN), 3))
     columns, link_rates = _shaken(config, truth, latency_s)
     with_imus, without = (
@@ -220,7 +220,7 @@ def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTr
 
 
 def _shaken(
-    config: RunConfig, truth: Mapping[str, Mounted], latency_s: Sequence[float]
+    config: RunConfig, truth: Mapping[str, MountedDrive], latency_s: Sequence[float]
 ) -> tuple[dict[str, Floats], Floats]:
     """Return the columns of a record of the controller on emulated drives, and what the gyros of the links measured.
 
@@ -235,7 +235,7 @@ def _shaken(
     robot = describe_robot(
         config.robot, backend="emulator", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
     )
-    controller = Identify(robot, msgspec.convert(config.controller_parameters, IdentifyParameters))
+    controller = Identification(robot, msgspec.convert(config.controller_parameters, IdentifyParameters))
     noise = np.random.default_rng(config.seed).standard_normal
     sensor = config.robot.sensors.joints
     sigma = np.array([sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm])
@@ -279,7 +279,7 @@ def _shaken(
             for i, target_rad in waiting.pop(step, ()):
                 motor, limits = joints[i].motor, joints[i].limits
                 gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, limits.speed_rad_s
-                body.drive_motor(i, Mode.POSITION, target_rad, limits.torque_nm, *gains)
+                body.drive_motor(i, JointMode.POSITION, target_rad, limits.torque_nm, *gains)
             body.advance_to((step + 1) * physics_model.step_s * 1e6)
     return {name: np.array(values) for name, values in rows.items()}, link_rates
 

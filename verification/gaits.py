@@ -22,7 +22,7 @@ HEADER = "| gait | scenario | distance in 10 s, m | speed, body lengths/s | ener
 
 
 @dataclass(frozen=True)
-class Row:
+class GaitRow:
     """A gait on a scene where it works."""
 
     gait: str
@@ -31,25 +31,25 @@ class Row:
 
 
 ROWS = (
-    Row("serpenoid", "scales"),
-    Row("serpenoid", "peg_row", ("control.wavelength=0.31", "control.winding_angle_rad=0.45")),
-    Row("cpg", "scales"),
-    Row("cpg", "peg_row", ("control.wavelength=0.31", "control.winding_angle_rad=0.45")),
-    Row("backbone_sidewinding", "mamba_flat"),
-    Row("backbone_rolling", "mamba_flat"),
-    Row("sinus_lifting", "mamba_flat"),
-    Row("rectilinear", "mamba_flat"),
-    Row("concertina", "corridor"),
+    GaitRow("serpenoid", "scales"),
+    GaitRow("serpenoid", "peg_row", ("control.wavelength=0.31", "control.winding_angle_rad=0.45")),
+    GaitRow("cpg", "scales"),
+    GaitRow("cpg", "peg_row", ("control.wavelength=0.31", "control.winding_angle_rad=0.45")),
+    GaitRow("backbone_sidewinding", "mamba_flat"),
+    GaitRow("backbone_rolling", "mamba_flat"),
+    GaitRow("sinus_lifting", "mamba_flat"),
+    GaitRow("rectilinear", "mamba_flat"),
+    GaitRow("concertina", "corridor"),
 )
 
 
-def run_row(row: Row, seed: int) -> RunSummary:
+def run_row(row: GaitRow, seed: int) -> RunSummary:
     """Run one trial, and return its summary."""
     sets = (f"controller={row.gait}", f"duration_s={DURATION_S}", f"seed={seed}", *row.sets)
     return simulate(load_scenario(row.scenario, [parse_set_option(text) for text in sets]).config).summary
 
 
-def format_row(row: Row, summaries: Sequence[RunSummary]) -> str:
+def format_row(row: GaitRow, summaries: Sequence[RunSummary]) -> str:
     """Return a line of the table: means over the trials, and the lowest and highest value in brackets."""
     settings = "".join(f", `{text}`" for text in row.sets)
     distances_m = [summary.net_displacement_m or 0.0 for summary in summaries]

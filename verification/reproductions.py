@@ -19,7 +19,12 @@ from snakesim_operator.features.reproduce.comparison_text import (
     format_unit,
     format_value,
 )
-from snakesim_operator.features.reproduce.experiment import Comparison, Experiment, Findings, Picture
+from snakesim_operator.features.reproduce.experiment import (
+    Experiment,
+    ExperimentFindings,
+    ExperimentPicture,
+    PublishedComparison,
+)
 from snakesim_operator.features.reproduce.experiments import EXPERIMENTS
 from snakesim_operator.features.reproduce.picture import write_picture
 
@@ -76,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=5, help="seeds where the result depends on noise (5)")
     parser.add_argument("--workers", type=int, default=2, help="runs side by side (2)")
     asked = parser.parse_args(arguments)
-    found: list[tuple[Experiment, Findings]] = []
+    found: list[tuple[Experiment, ExperimentFindings]] = []
     for experiment, findings in run_experiments(list(EXPERIMENTS.values()), seeds=asked.seeds, workers=asked.workers):
         print(f"{experiment.name}: done", file=sys.stderr, flush=True)
         found.append((experiment, findings))
@@ -90,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def make_page(found: Sequence[tuple[Experiment, Findings]], seeds: int) -> str:
+def make_page(found: Sequence[tuple[Experiment, ExperimentFindings]], seeds: int) -> str:
     """Return the page."""
     comparisons = [comparison for _, findings in found for comparison in findings.comparisons]
     return TEMPLATE.format(
@@ -102,7 +107,7 @@ def make_page(found: Sequence[tuple[Experiment, Findings]], seeds: int) -> str:
     )
 
 
-def _conclude(comparisons: Sequence[Comparison]) -> str:
+def _conclude(comparisons: Sequence[PublishedComparison]) -> str:
     """Return how many values agree, and what differs most."""
     numbers = [comparison for comparison in comparisons if comparison.difference is not None]
     texts = [comparison for comparison in comparisons if comparison.difference is None]
@@ -118,7 +123,7 @@ def _conclude(comparisons: Sequence[Comparison]) -> str:
     return sentence
 
 
-def _make_table(found: Sequence[tuple[Experiment, Findings]]) -> Iterator[str]:
+def _make_table(found: Sequence[tuple[Experiment, ExperimentFindings]]) -> Iterator[str]:
     yield "| Experiment | Quantity | Published | Kind | Ours | Difference |"
     yield "|---|---|---|---|---|---|"
     for experiment, findings in found:
@@ -130,7 +135,7 @@ def _make_table(found: Sequence[tuple[Experiment, Findings]]) -> Iterator[str]:
             )
 
 
-def _make_section(experiment: Experiment, findings: Findings) -> str:
+def _make_section(experiment: Experiment, findings: ExperimentFindings) -> str:
     source = experiment.source
     lines = [
         "",
@@ -155,7 +160,7 @@ def _make_section(experiment: Experiment, findings: Findings) -> str:
     return "\n".join(lines)
 
 
-def _describe_picture(picture: Picture) -> str:
+def _describe_picture(picture: ExperimentPicture) -> str:
     """Return the text of a picture: its curves, without units."""
     y_text, _, _ = picture.y_label.partition(" [")
     x_text, _, _ = picture.x_label.partition(" [")

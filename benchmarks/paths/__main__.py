@@ -23,7 +23,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from benchmarks.paths.ways import Lab, Way
+from benchmarks.paths.ways import CabledMachines, ConnectionWay
 from benchmarks.physics import encode_tick, load_config
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.run_log.host_record import HostRecord
@@ -51,7 +51,7 @@ EXPLAINED = (
 Percentiles = tuple[float, float]  # p50, p99 in microseconds
 
 
-def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(LOOP),)) -> Percentiles:
+def ours(way: ConnectionWay, seconds: float, folder: Path, scenario: Sequence[str] = (str(LOOP),)) -> Percentiles:
     """One run of host and controller."""
     with ExitStack() as stack:
         routers(way, stack, folder)
@@ -99,7 +99,7 @@ def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> N
     channel.close()
 
 
-def raw(way: Way, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
+def raw(way: ConnectionWay, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
     """The same with bare Zenoh."""
     with ExitStack() as stack:
         routers(way, stack, folder)
@@ -121,7 +121,7 @@ def raw(way: Way, seconds: float, folder: Path, state: bytes, command: bytes) ->
 _RAW = "benchmarks.paths.raw"
 
 
-def routers(way: Way, stack: ExitStack, folder: Path) -> None:
+def routers(way: ConnectionWay, stack: ExitStack, folder: Path) -> None:
     """Start the routers of a way."""
     for machine, path in way.routers:
         router = machine.start_module(_RAW, "router", str(path), log=folder / "router.log")
@@ -159,7 +159,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
         os.environ["XDG_STATE_HOME"] = name
-        lab = Lab(folder, stack)
+        lab = CabledMachines(folder, stack)
         for way in () if arguments.only_slow else lab.ways():
             pairs = [
                 (ours(way, arguments.seconds, folder), raw(way, arguments.seconds, folder, state, command))
@@ -181,7 +181,9 @@ def main() -> None:
         RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def slow_link(lab: Lab, seconds: float, repeats: int, folder: Path, state: bytes, command: bytes) -> list[str]:
+def slow_link(
+    lab: CabledMachines, seconds: float, repeats: int, folder: Path, state: bytes, command: bytes
+) -> list[str]:
     """The loop over a slow link while a client behind it watches the camera, against quiet: lines of a table."""
     lab.robot.run(*f"tc qdisc add dev robot root handle 1: tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split())
     rows: list[str] = []
@@ -213,7 +215,7 @@ def slow_link(lab: Lab, seconds: float, repeats: int, folder: Path, state: bytes
     return rows
 
 
-def watched(way: Way, seconds: float, folder: Path) -> tuple[Percentiles, float]:
+def watched(way: ConnectionWay, seconds: float, folder: Path) -> tuple[Percentiles, float]:
     """The loop while a client reads the images, and how much of them comes through, in Mbit/s."""
     seen = folder / "seen.json"
     with ExitStack() as stack:
@@ -225,7 +227,7 @@ def watched(way: Way, seconds: float, folder: Path) -> tuple[Percentiles, float]
     return busy, size * 8e-6 / seconds
 
 
-def beside_images(way: Way, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
+def beside_images(way: ConnectionWay, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
     """Raw Zenoh while a client reads the images of a robot that runs on the same way."""
     with ThreadPoolExecutor(1) as other:
         images = other.submit(watched, way, seconds + 2 * IMAGES_FIRST_S, folder)

@@ -7,39 +7,39 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from snakesim_testing.lab.machines import Machine, connect_by_cable
+from snakesim_testing.lab.machines import NamespaceMachine, connect_by_cable
 
 PORT = 7447
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
 
 
 @dataclass
-class Way:
+class ConnectionWay:
     """How host and controller reach each other, and two raw sessions on the same machines."""
 
     name: str
-    robot: Machine
-    workstation: Machine
+    robot: NamespaceMachine
+    workstation: NamespaceMachine
     host: list[str]  # arguments
     service: list[str]
     robot_file: Path
     workstation_file: Path
-    routers: list[tuple[Machine, Path]] = field(default_factory=list)
+    routers: list[tuple[NamespaceMachine, Path]] = field(default_factory=list)
 
 
-class Lab:
+class CabledMachines:
     """The machines, cabled, and files for each way."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
-        self.robot, self.first, self.second, self.workstation = (Machine(stack) for _ in range(4))
+        self.robot, self.first, self.second, self.workstation = (NamespaceMachine(stack) for _ in range(4))
         connect_by_cable(self.first, self.robot, "robot", "10.78.1")
         connect_by_cable(self.first, self.workstation, "desk", "10.78.2")
         connect_by_cable(self.first, self.second, "trunk", "10.78.3")
         connect_by_cable(self.second, self.workstation, "desk2", "10.78.4")
         connect_by_cable(self.robot, self.workstation, "direct", "10.78.5")
 
-    def ways(self) -> list[Way]:
+    def ways(self) -> list[ConnectionWay]:
         """All of them."""
         two = [
             (self.first, self._file("first", "router", listen=["tcp/0.0.0.0:7447"])),
@@ -53,25 +53,30 @@ class Lab:
             self._by("two routers", two, "tcp/10.78.1.1:7447", "tcp/10.78.4.1:7447"),
         ]
 
-    def one_router(self) -> Way:
+    def one_router(self) -> ConnectionWay:
         """Host and controller at one router."""
         return self.ways()[1]
 
-    def _direct(self) -> Way:
+    def _direct(self) -> ConnectionWay:
         endpoint = "tcp/10.78.5.1:7447"
         own = self._file("direct-robot", "router", listen=[endpoint])
         other = self._file("direct-desk", "client", connect=[endpoint])
         host = ["--endpoint", endpoint, "--insecure"]
-        return Way("direct", self.robot, self.workstation, host, ["--endpoint", endpoint], own, other)
+        return ConnectionWay("direct", self.robot, self.workstation, host, ["--endpoint", endpoint], own, other)
 
     def _by(
-        self, name: str, routers: list[tuple[Machine, Path]], robot: str, desk: str, tls: dict[str, Any] | None = None
-    ) -> Way:
+        self,
+        name: str,
+        routers: list[tuple[NamespaceMachine, Path]],
+        robot: str,
+        desk: str,
+        tls: dict[str, Any] | None = None,
+    ) -> ConnectionWay:
         stem = name.replace(" ", "-").replace(",", "")
         own = self._file(f"{stem}-robot", "client", connect=[robot], tls=tls)
         other = self._file(f"{stem}-desk", "client", connect=[desk], tls=tls)
         host, service = ["--session", str(own)], ["--session", str(other)]
-        return Way(name, self.robot, self.workstation, host, service, own, other, routers)
+        return ConnectionWay(name, self.robot, self.workstation, host, service, own, other, routers)
 
     def _file(self, stem: str, mode: str, *, tls: dict[str, Any] | None = None, **ends: list[str]) -> Path:
         path = self.folder / f"{stem}.json5"

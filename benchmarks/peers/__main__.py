@@ -22,7 +22,7 @@ from benchmarks.physics import encode_tick, load_config
 from benchmarks.whole import run
 from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.programs.single_process import InProcessRun
-from snakesim_hal.safety.authority import Authority
+from snakesim_hal.safety.authority import CommandAuthority
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "PEERS.md"
@@ -145,7 +145,7 @@ def _deciding_us() -> float:
             return wrapped
 
         for name in ("offer", "expire", "decide"):
-            setattr(authority, name, timed(getattr(Authority, name).__get__(authority)))
+            setattr(authority, name, timed(getattr(CommandAuthority, name).__get__(authority)))
         for _ in ran.iterate_ticks():
             pass
         return spent / max(ran.host.statistics.ticks, 1) * 1e6

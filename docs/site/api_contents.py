@@ -94,7 +94,7 @@ from typing import Annotated
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.wire.messages import CustomSample
 from snakesim_hal.wire.quantities import about, bounded
-from snakesim_sim_backend.sensors.mount import Mount
+from snakesim_sim_backend.sensors.mount import SensorMount
 
 
 class Height(CustomSample, frozen=True, kw_only=True):
@@ -105,7 +105,7 @@ class HeightModel(SensorModel):
     message = Height
 
     def __init__(self, sensor, scope, settings):
-        self.mount = Mount(sensor, scope)
+        self.mount = SensorMount(sensor, scope)
 
     def read(self, tick, timestamp_ns):
         position_w, _ = self.mount.place()
@@ -164,7 +164,7 @@ PAGES = (
         {
             "snakesim": ("run", "load", "Result", "Robot", "compute_body_points_w", "use_common_arithmetic"),
             "snakesim.chart": ("Chart",),
-            "snakesim_operator.robot_commands.parameters": ("Parameter",),
+            "snakesim_operator.robot_commands.parameters": ("RobotParameter",),
         },
     ),
     Page(
@@ -216,7 +216,7 @@ PAGES = (
             ),
             "snakesim_hal.controller": ("SensorSamples", "Task"),
             "snakesim_hal.wire.setpoints": ("RequestedSetpoints",),
-            "snakesim_hal.wire.messages": ("Mode", "JointState", "World", "WorldContact", "Trajectory"),
+            "snakesim_hal.wire.messages": ("JointMode", "JointState", "WorldModel", "WorldContact", "Trajectory"),
         },
     ),
     Page(
@@ -240,7 +240,7 @@ PAGES = (
         SERVICE_EXAMPLE,
         {
             "snakesim_hal.service": ("Service",),
-            "snakesim_hal.network.client": ("Client",),
+            "snakesim_hal.network.client": ("HostClient",),
         },
     ),
     Page(
@@ -253,9 +253,9 @@ PAGES = (
             "snakesim_hal.model.sensor_model": ("SensorModel",),
             "snakesim_hal.wire.messages": ("CustomSample",),
             "snakesim_hal.wire.quantities": ("bounded", "above", "from_zero", "about"),
-            "snakesim_sim_backend.sensors.scope": ("Scope",),
-            "snakesim_sim_backend.sensors.mount": ("Mount",),
-            "snakesim_sim_backend.sensors.rays": ("Rays",),
+            "snakesim_sim_backend.sensors.scope": ("SensorScope",),
+            "snakesim_sim_backend.sensors.mount": ("SensorMount",),
+            "snakesim_sim_backend.sensors.rays": ("RayBundle",),
         },
     ),
     Page(
@@ -272,7 +272,7 @@ PAGES = (
             "snakesim_drivers.kit.start_up": ("StartUp", "StartUpStep", "StepFailedError"),
             "snakesim_drivers.kit.holding_brakes": ("HoldingBrakes", "BrakePlan"),
             "snakesim_drivers.kit.limit_switches": ("LimitSwitches",),
-            "snakesim_drivers.kit.findings": ("Finding",),
+            "snakesim_drivers.kit.findings": ("FaultFinding",),
             "snakesim_drivers.kit.readings": ("DriveReadings",),
             "snakesim_drivers.kit.drive_states": ("DriveStates",),
             "snakesim_drivers.emulation.drive_emulator": ("DriveEmulator",),

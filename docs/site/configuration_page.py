@@ -16,7 +16,7 @@ from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, PHYSICS_MODELS
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scene import SceneFile
-from snakesim_operator.features.evaluate.suite import Suite
+from snakesim_operator.features.evaluate.suite import EvaluationSuite
 from snakesim_operator.features.lab.lab_file import LabFile
 from snakesim_operator.this_computer.plugin_sections import find_bundled_plugins, get_section_type
 
@@ -48,7 +48,7 @@ FILES: dict[str, tuple[type[msgspec.Struct], str]] = {
     "Scene file": (SceneFile, EXTENDS.format(kind="scene")),
     "Scenario file": (RunConfig, SCENARIO),
     "Suite file": (
-        Suite,
+        EvaluationSuite,
         "A suite is described in [evaluation](../how-to/evaluate-controllers.md#a-suite-of-your-own).",
     ),
     "Lab file": (LabFile, "A lab is described in [a lab](../how-to/lab.md)."),

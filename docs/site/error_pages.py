@@ -20,14 +20,14 @@ Made by `make schemas`. Edit `snakesim_hal/base/error_codes.py` and `fault_codes
 FAULTS = """
 ## Faults
 
-`Status.faults` names each fault by one of these words in `what`, with its cause as a text. The row explains what to do
-before you clear the fault.
+`RobotStatus.faults` names each fault by one of these words in `what`, with its cause as a text. The row explains what
+to do before you clear the fault.
 """
 REFUSALS = """
 ## Refusals
 
 The host answers a refused request with one of these words in `Answer.refusal`, and counts rejected commands by them
-in `Status.commands_rejected`.
+in `RobotStatus.commands_rejected`.
 """
 
 

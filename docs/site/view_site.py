@@ -22,7 +22,7 @@ from urllib.parse import unquote, urlparse
 
 from PIL import Image, ImageDraw
 
-from snakesim_testing.operator.browser import Tab, open_chromium
+from snakesim_testing.operator.browser import BrowserTab, open_chromium
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = ROOT / "build" / "docs"
@@ -141,7 +141,7 @@ def find_broken_links(page: Path) -> Iterator[str]:
                 yield f"broken anchor: {link}"
 
 
-def view(tab: Tab, page: Path, sheets: dict[tuple[int, str], "Sheets"], max_tiles: int) -> Iterator[str]:
+def view(tab: BrowserTab, page: Path, sheets: dict[tuple[int, str], "Sheets"], max_tiles: int) -> Iterator[str]:
     """Yield the problems of a page in every view, and put its pictures on the sheets."""
     open_page(tab, page)
     for (width, scheme), sheet in sheets.items():
@@ -158,7 +158,7 @@ def view(tab: Tab, page: Path, sheets: dict[tuple[int, str], "Sheets"], max_tile
     tab.errors.clear()
 
 
-def show(tab: Tab, width: int, scheme: str, tiles: int = 1) -> None:
+def show(tab: BrowserTab, width: int, scheme: str, tiles: int = 1) -> None:
     """Give the window a width and the height of some tiles, and the page a color scheme."""
     tab.size(width, tiles * WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
     attribute = json.dumps("slate" if scheme == "dark" else "default")
@@ -166,7 +166,7 @@ def show(tab: Tab, width: int, scheme: str, tiles: int = 1) -> None:
     time.sleep(0.2)  # until it is laid out
 
 
-def open_page(tab: Tab, page: Path) -> None:
+def open_page(tab: BrowserTab, page: Path) -> None:
     """Show a page, with the pictures that a reader would have to scroll to."""
     tab.send("Page.navigate", url=f"file://{COPY / page}")
     deadline = time.monotonic() + LOAD_LIMIT_S

@@ -8,29 +8,29 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, suggest_word
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.messages import JointMode, RobotDescription
 
 RESIDUAL_PREFIX = "residual:"
 MODE_AND_UNIT_BY_KIND = {
-    "position": (Mode.POSITION, "rad"),
-    "velocity": (Mode.VELOCITY, "rad/s"),
-    "torque": (Mode.TORQUE, "N·m"),
+    "position": (JointMode.POSITION, "rad"),
+    "velocity": (JointMode.VELOCITY, "rad/s"),
+    "torque": (JointMode.TORQUE, "N·m"),
 }
 
 
 @dataclass(frozen=True)
-class Commands:
+class ActionTargets:
     """What an action of an environment commands, joint by joint, tail to head."""
 
     kind: str
-    mode: Mode
+    mode: JointMode
     unit: str
     names: Sequence[str]  # of the joints
     low: Sequence[float]
     high: Sequence[float]
 
     @staticmethod
-    def for_robot(robot: Description, kind: str, residual_rad: float) -> "Commands":
+    def for_robot(robot: RobotDescription, kind: str, residual_rad: float) -> "ActionTargets":
         """Return what actions of a kind command on a robot, with the bounds of every joint.
 
         Args:
@@ -42,19 +42,19 @@ class Commands:
         names = [joint.name for joint in joints]
         if kind.startswith(RESIDUAL_PREFIX):
             high = [residual_rad] * len(joints)
-            return Commands(kind, Mode.POSITION, "rad", names, [-value for value in high], high)
+            return ActionTargets(kind, JointMode.POSITION, "rad", names, [-value for value in high], high)
         mode, unit = MODE_AND_UNIT_BY_KIND[kind]
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 low = [joint.angle_min_rad for joint in joints]
                 high = [joint.angle_max_rad for joint in joints]
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 high = [joint.speed_limit_rad_s for joint in joints]
                 low = [-value for value in high]
             case _:
                 high = [joint.torque_limit_nm for joint in joints]
                 low = [-value for value in high]
-        return Commands(kind, mode, unit, names, low, high)
+        return ActionTargets(kind, mode, unit, names, low, high)
 
     def convert_action(self, action: Any) -> Floats:
         """Convert the action of one environment to targets.

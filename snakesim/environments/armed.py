@@ -30,7 +30,7 @@ from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.safety.authority import MAX_REASON_LENGTH
 from snakesim_hal.safety.joint_limits import AppliedSetpoints
 from snakesim_hal.safety.plausibility import ANGLE_NOISE_MARGIN_RAD, SPEED_MARGIN
-from snakesim_hal.wire.messages import Description, Fault, Mode
+from snakesim_hal.wire.messages import Fault, JointMode, RobotDescription
 from snakesim_sim_backend.batch.robots import SimulatedRobots
 
 Mask = NDArray[np.bool_]  # (robots,)
@@ -51,7 +51,7 @@ class _LimiterDecision(NamedTuple):
     """What the array limiter decided in the last tick, and what the decisions are based on."""
 
     robots: Mask  # which robots the array limiter has limited
-    mode: Mode
+    mode: JointMode
     requested: Floats  # (robots, joints), targets of the commands
     target: Floats  # (robots, joints), limited targets
     torque_limit_nm: Floats  # (robots, joints)
@@ -73,7 +73,9 @@ class ArmedRobots:
         is_limited: (robots, joints), whose target was limited in the last tick.
     """
 
-    def __init__(self, robots: int, config: RunConfig, description: Description, *, safe: bool, threads: int) -> None:
+    def __init__(
+        self, robots: int, config: RunConfig, description: RobotDescription, *, safe: bool, threads: int
+    ) -> None:
         """Allocate the arrays for a number of robots. `start` adds each robot.
 
         Args:
@@ -144,7 +146,7 @@ class ArmedRobots:
         )
         return can_arm(config) and has_equal_schedule and self.simulation.can_simulate(config)
 
-    def start(self, robot: int, config: RunConfig, description: Description) -> bool:
+    def start(self, robot: int, config: RunConfig, description: RobotDescription) -> bool:
         """Start an episode of a robot: place it in its scene, and arm it.
 
         Args:
@@ -166,7 +168,7 @@ class ArmedRobots:
         self._load_limits(robot)
         self.ticks = _copy_with_row(self.ticks, robot, 0)
         self.joints = _copy_with_row(self.joints, robot, self.simulation.sensors.joints[robot])
-        self._modes = _copy_with_row(self._modes, robot, int(Mode.PASSIVE))
+        self._modes = _copy_with_row(self._modes, robot, int(JointMode.PASSIVE))
         self._target = _copy_with_row(self._target, robot, 0.0)
         self._torque_limit_nm = _copy_with_row(self._torque_limit_nm, robot, self._limits.torque_nm[robot])
         self._torque_fraction = _copy_with_row(self._torque_fraction, robot, 1.0)
@@ -192,7 +194,7 @@ class ArmedRobots:
         self.is_armed = _copy_with_row(self.is_armed, robot, False)
         self._is_vectorized = _copy_with_row(self._is_vectorized, robot, False)
 
-    def step(self, mode: Mode, target: Floats, active: Mask) -> None:
+    def step(self, mode: JointMode, target: Floats, active: Mask) -> None:
         """Run one tick: limit the commands, step the physics, and read the sensors.
 
         Commands are computed from the latest samples, without delay, as in lockstep.
@@ -245,7 +247,7 @@ class ArmedRobots:
 
     # --- decisions ---------------------------------------------------------------------------------------------
 
-    def _limit_vectorized(self, mode: Mode, robots: Mask) -> None:
+    def _limit_vectorized(self, mode: JointMode, robots: Mask) -> None:
         """Limit the commands of some robots with the array limiter, and store their setpoints.
 
         The setpoints of all other robots stay as they are.
@@ -304,7 +306,7 @@ class ArmedRobots:
         self._has_full_torque = np.array_equal(torque_limit_nm, full_nm)
         return torque_limit_nm
 
-    def _limit_individually(self, robot: int, mode: Mode, target: list[float]) -> None:
+    def _limit_individually(self, robot: int, mode: JointMode, target: list[float]) -> None:
         """Limit the command of one robot with its own limiter, and pass the setpoints to its motors.
 
         Args:
@@ -361,7 +363,7 @@ class ArmedRobots:
             self.reasons[robot] = client.reason
         self.is_armed = _copy_with_row(self.is_armed, robot, False)
 
-    def _observe(self, mode: Mode, moved: Mask) -> None:
+    def _observe(self, mode: JointMode, moved: Mask) -> None:
         """Check the newest samples of the robots that have moved, and choose a limiter for each robot.
 
         A robot with an unusual sample gets a limiter of its own. A robot that is ordinary again moves back to the array
@@ -443,7 +445,7 @@ class ArmedRobots:
             assert power is not None, "a sample has just been delivered"
             client.core.observe_power(power, now_ns)
 
-    def _follows_mode(self, robot: int, mode: Mode) -> bool:
+    def _follows_mode(self, robot: int, mode: JointMode) -> bool:
         """Return whether all joints of a robot follow commands in this mode now, and will do so in the next tick."""
         has_commands = self.ticks[robot] + 1 >= self._schedule.latency_ticks
         return bool(self.is_armed[robot] and has_commands and (self._modes[robot] == int(mode)).all())
@@ -454,7 +456,7 @@ class ArmedRobots:
             del self._limiter_client_by_robot[robot]
             self._is_vectorized = _copy_with_row(self._is_vectorized, robot, True)
 
-    def _move_to_own_client(self, robot: int, joints_before: Floats, mode: Mode) -> None:
+    def _move_to_own_client(self, robot: int, joints_before: Floats, mode: JointMode) -> None:
         """Move a robot from the array limiter to a limiter of its own, and pass the newest samples to that limiter.
 
         The new limiter is put into the state that it would have if it had limited the robot before.

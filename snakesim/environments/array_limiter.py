@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.limiter import MIN_SPEED_LIMIT_RAD_S, REACTION_PERIODS
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.messages import JointMode, RobotDescription
 
 Masks = NDArray[np.bool_]  # (robots, joints)
 # Names of limits, as `limit_names.find_active_limits` gives them. An array of limits holds indices of this list.
@@ -41,7 +41,7 @@ class LimitArrays:
         """Return arrays of placeholder limits, which `set_robot` fills in."""
         return LimitArrays(period_s, *(np.ones((robots, joints)) for _ in range(9)))
 
-    def set_robot(self, robot: int, description: Description) -> None:
+    def set_robot(self, robot: int, description: RobotDescription) -> None:
         """Fill in the limits of one robot."""
         for i, joint in enumerate(description.joints):
             max_speed = max(joint.speed_limit_rad_s, MIN_SPEED_LIMIT_RAD_S)
@@ -80,7 +80,7 @@ def limit_torque_limits(last_limit_nm: Floats, torque_fraction: Floats, limits: 
 
 
 def limit_targets(
-    mode: Mode,
+    mode: JointMode,
     requested: Floats,
     last_target: Floats,
     torque_limit_nm: Floats,
@@ -101,27 +101,27 @@ def limit_targets(
         ValueError: The mode is PASSIVE.
     """
     match mode:
-        case Mode.POSITION:
+        case JointMode.POSITION:
             low = _clamp(measured.angle_rad - limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
             high = _clamp(measured.angle_rad + limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
             max_change = limits.angle_rate_rad
-        case Mode.VELOCITY:
+        case JointMode.VELOCITY:
             low, high = _compute_velocity_bounds(measured, limits)
             low = _clamp(low, -limits.speed_rad_s, limits.speed_rad_s)
             high = _clamp(high, -limits.speed_rad_s, limits.speed_rad_s)
             max_change = limits.acceleration_rad_s2 * limits.period_s
-        case Mode.TORQUE:
+        case JointMode.TORQUE:
             low, high = _compute_torque_bounds(measured, limits)
             low = _clamp(low, -torque_limit_nm, torque_limit_nm)
             high = _clamp(high, -torque_limit_nm, torque_limit_nm)
             max_change = limits.torque_rate_nm_s * limits.period_s
-        case Mode.PASSIVE:
+        case JointMode.PASSIVE:
             raise ValueError("passive joints have no targets")
     return _clamp(_clamp(requested, last_target - max_change, last_target + max_change), low, high)
 
 
 def find_active_limit_indices(
-    mode: Mode,
+    mode: JointMode,
     requested: Floats,
     target: Floats,
     torque_limit_nm: Floats,
@@ -140,11 +140,11 @@ def find_active_limit_indices(
         measured: Joint states that the limiter used.
         limits: Limits of the robots.
     """
-    if mode is Mode.POSITION:
+    if mode is JointMode.POSITION:
         is_within_ends = (limits.angle_min_rad <= requested) & (requested <= limits.angle_max_rad)
         limit_indices = np.where(is_within_ends, ANGLE_RATE, ANGLE)
     else:
-        if mode is Mode.VELOCITY:
+        if mode is JointMode.VELOCITY:
             low, high = _compute_velocity_bounds(measured, limits)
             max_magnitude = limits.speed_rad_s
             magnitude_index = SPEED

@@ -21,11 +21,11 @@ from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     AppliedCommand,
-    Description,
+    JointMode,
     JointState,
     LifecycleState,
     Message,
-    Mode,
+    RobotDescription,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
@@ -68,7 +68,7 @@ class AssistedRobot:
             self._open_readers(opening)
             self._tick_iterator = self._run.iterate_ticks(before_services=True)
             opening.callback(self._tick_iterator.close)
-            self.description: Description = self._run.host.description
+            self.description: RobotDescription = self._run.host.description
             self._joint_index_by_name = {joint.name: i for i, joint in enumerate(self.description.joints)}
             self.newest_samples: dict[str, Message] = {}  # the newest sample of every sensor besides the joints, by key
             self.limit_by_joint: dict[int, str] = {}  # joint index -> which limit changed its target in the last tick
@@ -100,7 +100,7 @@ class AssistedRobot:
         """The digest of all setpoints, as the `command_digest` of a run."""
         return self._run.host.black_box.command_digest
 
-    def step(self, mode: Mode, target: list[float]) -> None:
+    def step(self, mode: JointMode, target: list[float]) -> None:
         """Run one tick. Joints that the controller commands in position mode get its target plus a correction.
 
         Args:
@@ -180,7 +180,7 @@ def _make_correcting_class(
             target = list(setpoints.target)
             for i, correction_rad in enumerate(corrections_rad):
                 # A correction of 0 is not added, so that the target stays the same to the bit.
-                if correction_rad and setpoints.mode[i] is Mode.POSITION:
+                if correction_rad and setpoints.mode[i] is JointMode.POSITION:
                     target[i] = setpoints.target[i] + correction_rad
             corrected_setpoints = RequestedSetpoints(setpoints.mode, target, setpoints.torque_limit_nm)
             return ControllerCommand(corrected_setpoints, command.telemetry)

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim.environments.episodes import Episodes, StepResult
+from snakesim.environments.episodes import BatchStepResult, EpisodeBatch
 from snakesim.environments.setup import RENDER_MODES, EnvironmentSetup
 from snakesim_hal.model.scenario import RunConfig
 
@@ -73,7 +73,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         self._arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         setup = EnvironmentSetup(**self._arguments)
         self.setup = setup  # the same for all environments with these arguments
-        self._episodes = Episodes(setup, 1, threads=1)
+        self._episodes = EpisodeBatch(setup, 1, threads=1)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": setup.render_fps}
 
@@ -187,7 +187,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             info["reason"] = robots.read_reason(ONLY_ROW)
         return info
 
-    def _make_step_info(self, result: StepResult) -> dict[str, Any]:
+    def _make_step_info(self, result: BatchStepResult) -> dict[str, Any]:
         """Return the info dict of a step."""
         terms = {name: float(term[ONLY_ROW]) for name, term in result.terms.items()}
         info = {**self._make_robot_info(), "energy_j": float(result.energy_j[ONLY_ROW]), "reward_terms": terms}

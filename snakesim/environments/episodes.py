@@ -2,7 +2,7 @@
 
 A step of all environments is, in this order:
 
-1. `Robots.step` once in each tick: commands, limiters, motors, physics, heat, sensors
+1. `EnvironmentRobots.step` once in each tick: commands, limiters, motors, physics, heat, sensors
 2. `BatchObserver.observe`: observations and advance, once
 3. the terms of the reward and the ends of episodes, from arrays that were collected in the ticks
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from snakesim.environments.armed import Mask
 from snakesim.environments.array_limiter import Masks
 from snakesim.environments.observing import BatchObserver
-from snakesim.environments.robots import Robots
+from snakesim.environments.robots import EnvironmentRobots
 from snakesim.environments.setup import MAX_SEED, EnvironmentSetup
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
@@ -32,7 +32,7 @@ MAX_FIELD_ATTEMPTS = 20  # a reset gives up after so many random fields without 
 
 
 @dataclass(frozen=True)
-class StepResult:
+class BatchStepResult:
     """The result of a step, a row for each environment; rows of environments that took no step mean nothing."""
 
     observations: NDArray[np.float32]
@@ -44,7 +44,7 @@ class StepResult:
     endings: dict[int, str]  # how episodes ended in this step, by environment
 
 
-class Episodes:
+class EpisodeBatch:
     """The current episodes of a number of environments.
 
     Attributes:
@@ -65,7 +65,9 @@ class Episodes:
         self._setup = setup
         self._count = count
         joint_count = len(setup.action_names)
-        self.robots = Robots(count, joint_count, assisted=setup.is_assisted, safe=setup.is_safe, threads=threads)
+        self.robots = EnvironmentRobots(
+            count, joint_count, assisted=setup.is_assisted, safe=setup.is_safe, threads=threads
+        )
         self._observer = BatchObserver(count, setup.description, setup.parts)
         self.configs: list[RunConfig] = [setup.config] * count
         self._period_ns: NDArray[np.int64] = np.full(count, setup.config.period_ns)
@@ -117,7 +119,7 @@ class Episodes:
         """Return the observations of this tick, (environments, n). Only the rows of these environments are valid."""
         return self._observer.observe(self.robots, self.time_s, environments)
 
-    def step(self, actions: Floats, environments: Mask) -> StepResult:
+    def step(self, actions: Floats, environments: Mask) -> BatchStepResult:
         """Take a step: command the same targets for `frame_skip` ticks, and compute observations and rewards.
 
         A robot that is stopped by a fault, or whose time is over, takes part in no further tick of the step.
@@ -177,7 +179,7 @@ class Episodes:
             endings[environment] = _describe_ending(
                 is_stopped=bool(is_stopped[environment]), is_goal_reached=bool(is_goal_reached[environment])
             )
-        return StepResult(observations, sum_terms(terms), terminated, truncated, energy_j, terms, endings)
+        return BatchStepResult(observations, sum_terms(terms), terminated, truncated, energy_j, terms, endings)
 
     def render(self, environment: int) -> NDArray[np.uint8]:
         """Return a picture of a robot in its scene, (height, width, 3), drawn as by `snakesim recording video`."""

@@ -5,17 +5,17 @@ from collections.abc import Iterable
 from snakesim.environments.no_limiter import NoLimiter
 from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.safety.authority import Authority
+from snakesim_hal.safety.authority import CommandAuthority
 from snakesim_hal.safety.joint_limits import AppliedSetpoints
-from snakesim_hal.safety.lease import Lease
+from snakesim_hal.safety.lease import CommandLease
 from snakesim_hal.wire.messages import (
-    Description,
     JointCommand,
+    JointMode,
     JointState,
     LeaseRequest,
     LifecycleState,
-    Mode,
     Power,
+    RobotDescription,
     make_arm_request,
 )
 
@@ -31,7 +31,7 @@ class LimiterClient:
             setpoints.
     """
 
-    def __init__(self, description: Description, *, safe: bool) -> None:
+    def __init__(self, description: RobotDescription, *, safe: bool) -> None:
         """Create the safety core of a robot, which is not armed yet.
 
         Args:
@@ -42,11 +42,11 @@ class LimiterClient:
         self._description = description
         self._max_torque_nm = [joint.torque_limit_nm for joint in description.joints]
         self._sequence = 0
-        self._authority: Authority | None = None
+        self._authority: CommandAuthority | None = None
         self._no_limiter: NoLimiter | None = None
         if safe:
-            self._authority = Authority(description)
-            self.core: Authority | NoLimiter = self._authority
+            self._authority = CommandAuthority(description)
+            self.core: CommandAuthority | NoLimiter = self._authority
         else:
             self._no_limiter = NoLimiter(description)
             self.core = self._no_limiter
@@ -83,12 +83,14 @@ class LimiterClient:
         if self._authority is None:
             return
         self._authority.handle_lease_request(LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0)
-        self._send_command(self._authority, 0, 0, [Mode.POSITION] * len(self._max_torque_nm), list(joints.angle_rad))
+        self._send_command(
+            self._authority, 0, 0, [JointMode.POSITION] * len(self._max_torque_nm), list(joints.angle_rad)
+        )
         answer = self._authority.handle_lifecycle_request(make_arm_request(self._description, REQUESTER), 0)
         if not answer.ok:
             raise RefusedError(f"not ready to arm: {answer.reason}", code="robot/not-ready")
 
-    def command(self, tick: int, now_ns: int, modes: list[Mode], target: list[float]) -> None:
+    def command(self, tick: int, now_ns: int, modes: list[JointMode], target: list[float]) -> None:
         """Send a command that answers the samples of a tick. A robot that is not armed gets none.
 
         Args:
@@ -109,7 +111,7 @@ class LimiterClient:
         *,
         applied: tuple[AppliedSetpoints, AppliedSetpoints],
         commands: Iterable[tuple[int, list[float]]],
-        mode: Mode,
+        mode: JointMode,
     ) -> None:
         """Take over a robot that has been armed and limited by the array limiter until now.
 
@@ -132,7 +134,7 @@ class LimiterClient:
             self._send_command(authority, tick, joints.timestamp_ns, [mode] * len(target), target)
 
     def _send_command(
-        self, authority: Authority, tick: int, now_ns: int, modes: list[Mode], target: list[float]
+        self, authority: CommandAuthority, tick: int, now_ns: int, modes: list[JointMode], target: list[float]
     ) -> None:
         """Send a command that answers the samples of a tick."""
         self._sequence += 1
@@ -152,7 +154,7 @@ class LimiterClient:
         authority.process_command(command, now_ns=now_ns, tick=tick, age_ns=0)
 
 
-class _ResumedAuthority(Authority):
+class _ResumedAuthority(CommandAuthority):
     """The authority of a robot that the array limiter has limited until now, in the state that it would be in.
 
     After an ordinary joint state, the plausibility check depends on that state alone, see
@@ -161,7 +163,7 @@ class _ResumedAuthority(Authority):
 
     def __init__(
         self,
-        description: Description,
+        description: RobotDescription,
         joints: JointState,
         power: Power | None,
         applied: tuple[AppliedSetpoints, AppliedSetpoints],
@@ -181,7 +183,7 @@ class _ResumedAuthority(Authority):
         self.arm_session = 1
         self._is_stop_sent = True
         expires_ns = joints.timestamp_ns + description.lease_ns
-        self.lease = Lease(holder=CONTROL, epoch=1, priority=LEASE_PRIORITY, expires_ns=expires_ns)
+        self.lease = CommandLease(holder=CONTROL, epoch=1, priority=LEASE_PRIORITY, expires_ns=expires_ns)
         # `joints` were measured under the last setpoints but one, and the state that follows under the last ones.
         previous_setpoints, last_setpoints = applied
         self._last_setpoints = previous_setpoints

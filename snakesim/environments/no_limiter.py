@@ -2,7 +2,7 @@
 
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.safety.authority import TickOutput
-from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Mode, Power
+from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleState, Power, RobotDescription
 
 
 class NoLimiter:
@@ -11,9 +11,9 @@ class NoLimiter:
     It is the one place outside of the limiter that declares setpoints safe, so it must never drive a real robot.
     """
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         self._full_torque_nm = [joint.torque_limit_nm for joint in description.joints]
-        self._modes = [Mode.PASSIVE] * len(description.joints)
+        self._modes = [JointMode.PASSIVE] * len(description.joints)
         self._target = [0.0] * len(description.joints)
         self._failure = ""
 
@@ -27,7 +27,7 @@ class NoLimiter:
         """Why it is in this state."""
         return self._failure or "no limiter"
 
-    def command(self, modes: list[Mode], target: list[float]) -> None:
+    def command(self, modes: list[JointMode], target: list[float]) -> None:
         """Set the modes and targets of the next period."""
         self._modes = modes
         self._target = target

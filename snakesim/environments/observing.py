@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim.environments.armed import Mask
-from snakesim.environments.robots import Robots
+from snakesim.environments.robots import EnvironmentRobots
 from snakesim_gnc.control.goal_progress import BodyLocator, GoalProgress
 from snakesim_gnc.control.observations import ObservationPart
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Task
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class BatchState:
     joints: Floats  # (robots, 3 * joints): angles, velocities, torques
     poses: Floats  # (robots, 7): positions, quaternions wxyz
     progress: Sequence[GoalProgress]
-    robots: Robots  # read only by the parts that few environments observe
+    robots: EnvironmentRobots  # read only by the parts that few environments observe
 
 
 class BatchObserver:
@@ -37,7 +37,7 @@ class BatchObserver:
         progress: Advance of each robot towards its goal.
     """
 
-    def __init__(self, robots: int, description: Description, parts: Mapping[str, ObservationPart]) -> None:
+    def __init__(self, robots: int, description: RobotDescription, parts: Mapping[str, ObservationPart]) -> None:
         """Allocate the arrays for a number of robots, without tasks. `restart` sets the task of each robot.
 
         Args:
@@ -56,7 +56,7 @@ class BatchObserver:
         no_task = Task((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), None)
         self.progress = [GoalProgress(description, no_task) for _ in range(robots)]
 
-    def restart(self, robot: int, description: Description, task: Task) -> None:
+    def restart(self, robot: int, description: RobotDescription, task: Task) -> None:
         """Start an episode of a robot with a new task. The advance counts from the first observation on."""
         self._descriptions[robot] = description
         first_description = self._descriptions[0]
@@ -65,7 +65,7 @@ class BatchObserver:
         self._start_poses[robot] = [*task.start_position_w, *task.start_wxyz]
         self.progress[robot] = GoalProgress(description, task)
 
-    def observe(self, robots: Robots, time_s: Floats, rows: Mask) -> NDArray[np.float32]:
+    def observe(self, robots: EnvironmentRobots, time_s: Floats, rows: Mask) -> NDArray[np.float32]:
         """Measure the advance of some robots, and return the observations of all robots, (robots, n).
 
         Args:
@@ -99,7 +99,7 @@ class BatchObserver:
                 progress.update_from_body(nodes_w[i], centers_w[i])
 
 
-def _has_equal_links(first: Description, second: Description) -> bool:
+def _has_equal_links(first: RobotDescription, second: RobotDescription) -> bool:
     """Return whether two robots have the same links and axes, so that their bodies are located together."""
     if first is second:
         return True

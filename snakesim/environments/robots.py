@@ -17,13 +17,13 @@ from snakesim_gnc.control.observations import sum_contact_forces_n
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contacts, Description, LifecycleState, Mode, Pose
+from snakesim_hal.wire.messages import Contacts, JointMode, LifecycleState, Pose, RobotDescription
 from snakesim_sim_backend.batch.sensors import NUMBERS_OF_POSE, NUMBERS_OF_VELOCITY
 
 NAMES_OR_NONE = np.array([name or None for name in LIMIT_NAMES], dtype=object)
 
 
-class Robots:
+class EnvironmentRobots:
     """The robots of environments; each is started on its own, and all are stepped together.
 
     Attributes:
@@ -55,7 +55,7 @@ class Robots:
         self.is_armed: Mask = np.zeros(robots, dtype=np.bool_)
         self.is_limited: Masks = np.zeros((robots, joints), dtype=np.bool_)
 
-    def start(self, row: int, config: RunConfig, description: Description) -> None:
+    def start(self, row: int, config: RunConfig, description: RobotDescription) -> None:
         """Start an episode: stop the robot in a row of the arrays, and replace it by a new robot that obeys commands.
 
         The robot is stepped together with the others if it has the same joints, sensors, rates and model; otherwise it
@@ -85,7 +85,7 @@ class Robots:
         if self._batch is not None:
             self._batch.stop(row)
 
-    def step(self, mode: Mode, target: Floats, active: Mask) -> None:
+    def step(self, mode: JointMode, target: Floats, active: Mask) -> None:
         """Run one tick of some robots, and update the arrays.
 
         Args:
@@ -183,7 +183,7 @@ class Robots:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def _start_in_batch(self, robot: int, config: RunConfig, description: Description) -> bool:
+    def _start_in_batch(self, robot: int, config: RunConfig, description: RobotDescription) -> bool:
         """Start a robot among those that are stepped together. Return False if it cannot be stepped with them."""
         if not can_arm(config):
             return False

@@ -9,13 +9,13 @@ import numpy as np
 from gymnasium import spaces
 
 from snakesim.configuration import load_and_validate_config, make_overrides
-from snakesim.environments.actions import Commands, parse_corrected_controller
+from snakesim.environments.actions import ActionTargets, parse_corrected_controller
 from snakesim.environments.rewards import fill_reward_weights
 from snakesim_gnc.control.observations import ObservationBuilder, select_observation_parts
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.randomization import parse_randomizations
-from snakesim_hal.model.scenario import Override, RunConfig, describe_run_robot
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, describe_run_robot
+from snakesim_hal.wire.messages import RobotDescription
 
 RENDER_MODES = ["rgb_array"]
 MAX_SEED = 2**31
@@ -67,7 +67,7 @@ class EnvironmentSetup:
                     f"action={action!r}: a controller commands through the limiter; leave safe=False out",
                     code="python/invalid-argument",
                 )
-            overrides.insert(0, Override("controller", controller, f"action={action}"))
+            overrides.insert(0, KeyOverride("controller", controller, f"action={action}"))
 
         # The scenario, and what each seed changes in it.
         self._scenario = os.fspath(scenario)
@@ -86,7 +86,7 @@ class EnvironmentSetup:
         self.picture_size = (width, height)
 
         self.description = describe_run_robot(self.config)
-        self.commands = Commands.for_robot(self.description, action, residual_rad)
+        self.commands = ActionTargets.for_robot(self.description, action, residual_rad)
         self._declare_spaces(observe, flat)
 
     def _declare_spaces(self, observe: Sequence[str] | None, flat: bool) -> None:
@@ -137,7 +137,7 @@ class EnvironmentSetup:
         field_keys = [f"scene.random_field.{i}.seed" for i in range(self.new_fields)]
         return self._load_config(seed, ["seed", *field_keys])
 
-    def describe(self, config: RunConfig) -> Description:
+    def describe(self, config: RunConfig) -> RobotDescription:
         """Return the description of the robot of an episode.
 
         The hash of the configuration in it may be that of another seed. Nothing reads this hash here.
@@ -172,7 +172,7 @@ class EnvironmentSetup:
             ConfigError: The scenario or a randomized value is wrong.
         """
         overrides = [*self._overrides]
-        overrides += [Override(key, seed, "seed") for key in seed_keys]
+        overrides += [KeyOverride(key, seed, "seed") for key in seed_keys]
         for randomization in self._randomizations:
             overrides += randomization.sample_overrides(seed, "randomize")
         return load_and_validate_config(self._scenario, overrides, processes=False)

@@ -9,7 +9,7 @@ import msgspec
 from snakesim.environments.limiter_client import LimiterClient
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.base.errors import BackendError, ConfigError, RefusedError
-from snakesim_hal.faults.allowed import Faults, create_host_faults
+from snakesim_hal.faults.allowed import InjectedFaults, create_host_faults
 from snakesim_hal.host.control_cycle import ControlCycle
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.model.fault_kinds import CONTROL
@@ -19,7 +19,7 @@ from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.preflight import decode_backend_settings, load_backend_class
 from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.safety.authority import MAX_REASON_LENGTH
-from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Message, Mode
+from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleState, Message, RobotDescription
 
 SUPPORTED_FAULT_TARGETS = ("joint", "bus", "simulator")  # faults of these need neither services nor processes
 
@@ -42,8 +42,8 @@ class SteppedRobot:
         _validate_planned_faults(config)
         config = _remove_cameras_and_lidars(config)
         backend = _open_simulated_backend(config)
-        self.description: Description = backend.describe()
-        self._faults: Faults | None = None
+        self.description: RobotDescription = backend.describe()
+        self._faults: InjectedFaults | None = None
         if config.faults:
             session = LocalNetwork().create_session()
             backend, self._faults = create_host_faults(config, GuardedBackend(backend), session)
@@ -84,7 +84,7 @@ class SteppedRobot:
         """The digest of all setpoints, as the `command_digest` of a run."""
         return self._black_box.command_digest
 
-    def step(self, mode: Mode, target: list[float]) -> None:
+    def step(self, mode: JointMode, target: list[float]) -> None:
         """Run one tick: limit the command, step the backend, and read the sensors.
 
         The command answers the current samples, as in a host in lockstep. If the backend fails, the robot is stopped by

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from snakesim.environments.armed import Mask
 from snakesim.environments.environment import SnakeEnv
-from snakesim.environments.episodes import Episodes, StepResult
+from snakesim.environments.episodes import BatchStepResult, EpisodeBatch
 from snakesim.environments.infos import InfoArrays
 from snakesim.environments.setup import RENDER_MODES
 from snakesim_hal.base.errors import ConfigError
@@ -71,7 +71,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         }
         setup = SnakeEnv(**arguments).setup
         self._setup = setup
-        self._episodes = Episodes(setup, num_envs, threads or len(os.sched_getaffinity(0)))
+        self._episodes = EpisodeBatch(setup, num_envs, threads or len(os.sched_getaffinity(0)))
         if setup.config.backend == "sim" and num_envs > 1 and (cost := describe_loop_cost()):
             logger.warn(cost)
         self._rngs: list[Generator] = [np_random(None)[0] for _ in range(num_envs)]
@@ -216,7 +216,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         self._add_robot_infos(infos, environments)
         return infos
 
-    def _make_step_infos(self, result: StepResult, environments: Mask) -> InfoArrays:
+    def _make_step_infos(self, result: BatchStepResult, environments: Mask) -> InfoArrays:
         """Return the merged info dicts of environments that have taken a step."""
         infos = InfoArrays(self.num_envs)
         self._add_robot_infos(infos, environments)

@@ -15,7 +15,7 @@ from snakesim_hal.programs.arguments import (
     add_workers_argument,
     make_number_parser,
 )
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 
 
 def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +89,7 @@ def _run_train(arguments: argparse.Namespace) -> int:
 
     for extra in ("train", "gym", "report", "policy"):
         extras.require_extra(extra, "`snakesim policy train`")
-    from snakesim.training.search import Effort
+    from snakesim.training.search import SearchEffort
     from snakesim.training.trained import train_policy
     from snakesim_hal.model.randomization import parse_randomize_option
     from snakesim_hal.model.scenario import parse_set_option
@@ -102,7 +102,7 @@ def _run_train(arguments: argparse.Namespace) -> int:
         "randomize": dict(map(parse_randomize_option, arguments.randomize)),
     }
     # Every field of Effort is the `dest` of an option.
-    effort = Effort(**{field.name: getattr(arguments, field.name) for field in dataclasses.fields(Effort)})
+    effort = SearchEffort(**{field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchEffort)})
     return train_policy(
         environment,
         arguments.form,
@@ -135,7 +135,9 @@ def _list_search_options(arguments: argparse.Namespace) -> list[str]:
 
 
 COMMANDS: Commands = (
-    Noun(name="policy", heading="runs and studies", help="Train policies, and show what a policy file describes."),
+    CommandGroup(
+        name="policy", heading="runs and studies", help="Train policies, and show what a policy file describes."
+    ),
     Command(
         name="policy train",
         help="Search a policy for a scenario on random fields. An ONNX file for --controller policy:FILE.",

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from snakesim.training.search import Generation
+from snakesim.training.search import SearchGeneration
 from snakesim_hal.model.textfiles import export_atomically
 from snakesim_operator.features.figures.inherited import PLAIN_TEXT_STYLE, import_matplotlib
 
 
-def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
+def write_curve(folder: Path, generations: Sequence[SearchGeneration]) -> None:
     """Write `curve.csv` and `curve.png` into a folder."""
     with export_atomically(folder / "curve.csv") as partial, partial.open("x", newline="") as file:
         table = csv.DictWriter(file, list(asdict(generations[0])))
@@ -19,7 +19,7 @@ def write_curve(folder: Path, generations: Sequence[Generation]) -> None:
     _write_figure(folder / "curve.png", generations)
 
 
-def _write_figure(path: Path, generations: Sequence[Generation]) -> None:
+def _write_figure(path: Path, generations: Sequence[SearchGeneration]) -> None:
     """Draw the learning curve into a file, with the text style of all figures."""
     import_matplotlib()
     from matplotlib import rc_context
@@ -28,7 +28,7 @@ def _write_figure(path: Path, generations: Sequence[Generation]) -> None:
         _draw_curve(path, generations)
 
 
-def _draw_curve(path: Path, generations: Sequence[Generation]) -> None:
+def _draw_curve(path: Path, generations: Sequence[SearchGeneration]) -> None:
     """Draw the learning curve into a file: rewards over the number of episodes.
 
     The curves are the mean and the best reward of each generation, and the rewards of the mean policy on check fields.

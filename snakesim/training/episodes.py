@@ -12,9 +12,9 @@ from typing import Any, Self
 import numpy as np
 
 from snakesim.environments import SnakeEnv
-from snakesim.environments.episodes import Episodes as Environments
+from snakesim.environments.episodes import EpisodeBatch as Environments
 from snakesim.environments.setup import EnvironmentSetup
-from snakesim.training.form import OBSERVE, Policy
+from snakesim.training.form import OBSERVE, PolicyArrays
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.base.worker_pool import WorkerPool
 
@@ -23,7 +23,7 @@ Values = Mapping[str, float]  # parameters of a policy, by name
 Arguments = Mapping[str, Any]  # of `SnakeEnv`
 MapFunction = Callable[[Callable[..., Any], Sequence[Sequence[Any]]], list[Any]]
 """Calls a function with each of several argument lists, and returns the results in their order."""
-Job = tuple[Policy, int]  # an episode: what acts, and the seed of its field
+Job = tuple[PolicyArrays, int]  # an episode: what acts, and the seed of its field
 MAX_BATCH_SIZE = 32  # episodes that a process steps together; a worker that dies loses no more
 
 
@@ -40,7 +40,7 @@ _ENVIRONMENT_CACHE: list[_CachedEnvironments] = []  # at most one
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeResult:
     """The result of one episode."""
 
     total_reward: float  # sum of rewards
@@ -50,7 +50,7 @@ class Episode:
     goal: bool  # whether the goal was reached
 
 
-class Episodes:
+class EpisodeRunner:
     """Runs episodes, within a `with` block.
 
     The same policies and fields give the same numbers with any number of processes.
@@ -86,7 +86,7 @@ class Episodes:
     def __exit__(self, *_: object) -> None:
         self._exit_stack.close()
 
-    def run(self, policies: Sequence[Values], fields: Sequence[int]) -> list[list[Episode]]:
+    def run(self, policies: Sequence[Values], fields: Sequence[int]) -> list[list[EpisodeResult]]:
         """Run every policy on every field.
 
         Args:
@@ -98,13 +98,13 @@ class Episodes:
         """
         jobs: list[Job] = []
         for values in policies:
-            policy = Policy.make_from_parameters(values, self.axes, self.sizes)
+            policy = PolicyArrays.make_from_parameters(values, self.axes, self.sizes)
             jobs += [(policy, field) for field in fields]
         batch_size = min(max(math.ceil(len(jobs) / self._batch_count), 1), MAX_BATCH_SIZE)
         batches = [jobs[start : start + batch_size] for start in range(0, len(jobs), batch_size)]
         results = self._map_jobs(_run_batch, [(self._arguments, batch) for batch in batches])
         all_episodes = [episode for batch_episodes in results for episode in batch_episodes]
-        episodes_by_policy: list[list[Episode]] = []
+        episodes_by_policy: list[list[EpisodeResult]] = []
         for start in range(0, len(all_episodes), len(fields)):
             policy_episodes = all_episodes[start : start + len(fields)]
             episodes_by_policy.append([episode for episode in policy_episodes if episode is not None])
@@ -140,7 +140,7 @@ def _get_cached_environments(arguments: Arguments) -> tuple[EnvironmentSetup, En
     return _ENVIRONMENT_CACHE[-1].setup, _ENVIRONMENT_CACHE[-1].environments
 
 
-def _run_batch(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | None]:
+def _run_batch(arguments: Arguments, jobs: Sequence[Job]) -> list[EpisodeResult | None]:
     """Run a batch of episodes in this process, stepped together.
 
     Args:
@@ -175,14 +175,14 @@ def _run_batch(arguments: Arguments, jobs: Sequence[Job]) -> list[Episode | None
         ending_by_row |= result.endings
     advance_m = environments.advance_m.tolist()
     time_s = environments.time_s.tolist()
-    episodes: list[Episode | None] = []
+    episodes: list[EpisodeResult | None] = []
     for row in range(len(jobs)):
         if not can_run[row]:
             episodes.append(None)
             continue
         is_goal_reached = ending_by_row[row] == "goal"
         episodes.append(
-            Episode(float(total_reward[row]), advance_m[row], float(energy_j[row]), time_s[row], is_goal_reached)
+            EpisodeResult(float(total_reward[row]), advance_m[row], float(energy_j[row]), time_s[row], is_goal_reached)
         )
     for row in range(row_count):
         environments.close(row)

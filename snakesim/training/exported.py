@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from snakesim.training.form import MAX_REACTION_RAD, OBSERVE, RAMP_PER_S, Policy
+from snakesim.training.form import MAX_REACTION_RAD, OBSERVE, RAMP_PER_S, PolicyArrays
 from snakesim_gnc.control.policy import ACTION_KEY, FRAME_SKIP_KEY, JOINTS_KEY, OBSERVATIONS_KEY, load_model
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import export_atomically
@@ -17,7 +17,7 @@ from snakesim_hal.model.textfiles import export_atomically
 LEARNED_PARAMETERS_KEY = "snakesim.learned"
 OPSET_VERSION = 17  # the newest ones that onnxruntime 1.20 reads
 IR_VERSION = 10
-GRAPH_NODES = (  # operator, inputs, output; together they compute `Policy.compute_targets`
+GRAPH_NODES = (  # operator, inputs, output; together they compute `PolicyArrays.compute_targets`
     ("MatMul", ("seen", "time"), "time_s"),
     ("Mul", ("time_s", "omega"), "turned"),
     ("Sub", ("turned", "lag"), "phase"),
@@ -57,7 +57,7 @@ def read_learned_parameters(policy: str) -> dict[str, float]:
 
 
 def write_onnx_file(
-    path: Path, policy: Policy, values: Mapping[str, float], frame_skip: int, again: Sequence[str]
+    path: Path, policy: PolicyArrays, values: Mapping[str, float], frame_skip: int, again: Sequence[str]
 ) -> None:
     """Write a policy into an ONNX file.
 

@@ -23,7 +23,7 @@ Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class LearnedParameter:
     """One number that is learned: where the search begins, and how far it looks at first."""
 
     start: float
@@ -32,26 +32,26 @@ class Parameter:
 
 
 WAVE = {
-    "amplitude": Parameter(0.4, 0.1, "rad, at the head"),
-    "growth": Parameter(0.0, 0.1, "rad, of the amplitude at the tail"),
-    "omega": Parameter(3.5, 0.7, "rad/s"),
-    "lag": Parameter(0.9, 0.1, "rad, of a joint behind the one ahead of it"),
-    "steering": Parameter(0.06, 0.03, "rad of every joint, times the sine of the goal's bearing"),
-    "head_steering": Parameter(0.0, 0.05, "the same, growing towards the head"),
+    "amplitude": LearnedParameter(0.4, 0.1, "rad, at the head"),
+    "growth": LearnedParameter(0.0, 0.1, "rad, of the amplitude at the tail"),
+    "omega": LearnedParameter(3.5, 0.7, "rad/s"),
+    "lag": LearnedParameter(0.9, 0.1, "rad, of a joint behind the one ahead of it"),
+    "steering": LearnedParameter(0.06, 0.03, "rad of every joint, times the sine of the goal's bearing"),
+    "head_steering": LearnedParameter(0.0, 0.05, "the same, growing towards the head"),
 }
 FEELING = {
-    f"{part}_{where}": Parameter(0.0, 0.15, f"gain of {part} of the joint {where}")
+    f"{part}_{where}": LearnedParameter(0.0, 0.15, f"gain of {part} of the joint {where}")
     for part in REACTION_PARTS
     for where in NEIGHBOR_STEPS
 } | {
-    "contact_behind": Parameter(0.0, 0.05, "rad of amplitude for each 50 N on the link behind"),
-    "contact_ahead": Parameter(0.0, 0.05, "rad of amplitude for each 50 N on the link ahead"),
+    "contact_behind": LearnedParameter(0.0, 0.05, "rad of amplitude for each 50 N on the link behind"),
+    "contact_ahead": LearnedParameter(0.0, 0.05, "rad of amplitude for each 50 N on the link ahead"),
 }
 FORMS = {"wave": WAVE, "feeling": WAVE | FEELING}
 
 
 @dataclass(frozen=True)
-class Policy:
+class PolicyArrays:
     """The arrays of one policy. Each matrix is (observation, joints); vectors are (joints,)."""
 
     time: Array
@@ -63,7 +63,9 @@ class Policy:
     feeling: Array
 
     @staticmethod
-    def make_from_parameters(values: Mapping[str, float], axes: Sequence[str], sizes: Mapping[str, int]) -> "Policy":
+    def make_from_parameters(
+        values: Mapping[str, float], axes: Sequence[str], sizes: Mapping[str, int]
+    ) -> "PolicyArrays":
         """Return the policy for a set of parameters and a robot.
 
         Args:
@@ -108,7 +110,7 @@ class Policy:
         omega = np.full(joint_count, parameters["omega"])
         lag = parameters["lag"] * yaw_joints_ahead
         amplitude = is_yaw * (parameters["amplitude"] + parameters["growth"] * tail_fraction)
-        return Policy(
+        return PolicyArrays(
             time=time.astype(np.float32),
             omega=omega.astype(np.float32),
             lag=lag.astype(np.float32),

@@ -18,7 +18,7 @@ from snakesim_hal.base.errors import ConfigError
 SEARCH_FILENAME = "search.jsonl"
 
 
-class Check(msgspec.Struct, frozen=True):
+class SearchCheck(msgspec.Struct, frozen=True):
     """How the mean of the search did on the fields that it is checked on: means of the episodes."""
 
     reward: float
@@ -30,7 +30,7 @@ class KeptGeneration(msgspec.Struct, frozen=True):
     """What the simulations of one generation gave."""
 
     rewards: list[float]  # of each policy, in the order of the search; empty in the last generation
-    check: Check | None  # None: not checked in this generation
+    check: SearchCheck | None  # None: not checked in this generation
 
 
 class _SearchHeader(msgspec.Struct, frozen=True):

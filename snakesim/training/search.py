@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import cmaes
 import numpy as np
 
-from snakesim.training.episodes import Episode, Episodes
+from snakesim.training.episodes import EpisodeResult, EpisodeRunner
 from snakesim.training.form import FORMS
-from snakesim.training.kept_search import Check, KeptGeneration
+from snakesim.training.kept_search import KeptGeneration, SearchCheck
 
 CHECK_INTERVAL = 5  # generations
 FIRST_TRAINING_SEED = 1_000_001  # seed of the first field that is searched on; evaluations use fields from 1 on
@@ -17,7 +17,7 @@ RETRY_SEED_STEP = 10_000_000  # step to other seeds when no field of a generatio
 
 
 @dataclass(frozen=True)
-class Generation:
+class SearchGeneration:
     """A row of the learning curve."""
 
     generation: int
@@ -30,7 +30,7 @@ class Generation:
 
 
 @dataclass(frozen=True)
-class Effort:
+class SearchEffort:
     """How long to search."""
 
     generations: int
@@ -42,22 +42,22 @@ class Effort:
 
 
 @dataclass(frozen=True)
-class Step:
+class SearchStep:
     """The search after one generation."""
 
-    row: Generation
+    row: SearchGeneration
     kept: KeptGeneration  # what the search needs to go on after it
     best: dict[str, float]  # the best policy of all that were checked
     best_reward: float  # of that policy, on the fields that it was checked on
 
 
 def run_search(
-    episodes: Episodes,
+    episodes: EpisodeRunner,
     form: str,
-    effort: Effort,
+    effort: SearchEffort,
     start_values: Mapping[str, float],
     known_generations: Sequence[KeptGeneration] = (),
-) -> Iterator[Step]:
+) -> Iterator[SearchStep]:
     """Search for a policy by CMA-ES, and yield the state of the search after each generation.
 
     Args:
@@ -98,14 +98,14 @@ def run_search(
         if not is_last:
             losses = [-reward for reward in result.rewards]
             optimizer.tell(list(zip(points, losses, strict=True)))
-        yield Step(_make_curve_row(number, result, effort), result, best_policy, best_reward)
+        yield SearchStep(_make_curve_row(number, result, effort), result, best_policy, best_reward)
 
 
-def _run_check(episodes: Episodes, policy: Mapping[str, float], effort: Effort) -> Check:
+def _run_check(episodes: EpisodeRunner, policy: Mapping[str, float], effort: SearchEffort) -> SearchCheck:
     """Run a policy on the check fields, which the search does not use, and return the means over these episodes."""
     fields = range(FIRST_CHECK_SEED, FIRST_CHECK_SEED + effort.check_fields)
     check_episodes = episodes.run([policy], fields)[0]
-    return Check(
+    return SearchCheck(
         reward=compute_mean(check_episodes, "total_reward"),
         advance_m=compute_mean(check_episodes, "advance_m"),
         goals=compute_mean(check_episodes, "goal"),
@@ -113,7 +113,7 @@ def _run_check(episodes: Episodes, policy: Mapping[str, float], effort: Effort) 
 
 
 def _run_generation(
-    episodes: Episodes, policies: Sequence[Mapping[str, float]], number: int, effort: Effort
+    episodes: EpisodeRunner, policies: Sequence[Mapping[str, float]], number: int, effort: SearchEffort
 ) -> list[float]:
     """Run the policies of a generation on the fields of the generation, and return the mean reward of each policy."""
     if not policies:
@@ -126,11 +126,11 @@ def _run_generation(
     return [compute_mean(policy_episodes, "total_reward") for policy_episodes in episodes_by_policy]
 
 
-def _make_curve_row(number: int, result: KeptGeneration, effort: Effort) -> Generation:
+def _make_curve_row(number: int, result: KeptGeneration, effort: SearchEffort) -> SearchGeneration:
     """Return the row of the learning curve for a generation. Its rewards are NaN if no policies were run."""
     rewards = result.rewards or [np.nan]
     check = result.check
-    return Generation(
+    return SearchGeneration(
         generation=number,
         episodes=min(number + 1, effort.generations) * effort.population * effort.fields,
         mean_reward=float(np.mean(rewards)),
@@ -141,6 +141,6 @@ def _make_curve_row(number: int, result: KeptGeneration, effort: Effort) -> Gene
     )
 
 
-def compute_mean(episodes: Sequence[Episode], name: str) -> float:
+def compute_mean(episodes: Sequence[EpisodeResult], name: str) -> float:
     """Return the mean of an attribute over episodes."""
     return float(np.mean([getattr(episode, name) for episode in episodes]))

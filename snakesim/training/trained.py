@@ -9,10 +9,10 @@ from typing import Any
 
 from snakesim.training import kept_search
 from snakesim.training.curve import write_curve
-from snakesim.training.episodes import Episodes
+from snakesim.training.episodes import EpisodeRunner
 from snakesim.training.exported import read_learned_parameters, write_onnx_file
-from snakesim.training.form import Policy
-from snakesim.training.search import Effort, Generation, Step, run_search
+from snakesim.training.form import PolicyArrays
+from snakesim.training.search import SearchEffort, SearchGeneration, SearchStep, run_search
 from snakesim_hal.base.process import raise_on_stop_signals
 from snakesim_hal.base.terminal import print_line
 from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
@@ -25,7 +25,7 @@ def train_policy(
     arguments: Mapping[str, Any],
     form: str,
     begin: str | None,
-    effort: Effort,
+    effort: SearchEffort,
     folder: Path,
     *,
     workers: int | None,
@@ -55,12 +55,12 @@ def train_policy(
     """
     start_time_s = time.monotonic()
     start_values = {} if begin is None else read_learned_parameters(begin)
-    curve: list[Generation] = []
-    newest: Step | None = None  # of those that are kept
+    curve: list[SearchGeneration] = []
+    newest: SearchStep | None = None  # of those that are kept
     with raise_on_stop_signals():
         try:
             with (
-                Episodes({**arguments, "frame_skip": FRAME_SKIP}, workers, cluster) as episodes,
+                EpisodeRunner({**arguments, "frame_skip": FRAME_SKIP}, workers, cluster) as episodes,
                 kept_search.open_search_file(folder, again, resume=resume) as kept,
             ):
                 known_count = len(kept.generations)
@@ -70,7 +70,7 @@ def train_policy(
                     curve.append(step.row)
                     if len(curve) > known_count:
                         print_line(_format_generation(step.row))
-                        policy = Policy.make_from_parameters(step.best, episodes.axes, episodes.sizes)
+                        policy = PolicyArrays.make_from_parameters(step.best, episodes.axes, episodes.sizes)
                         write_onnx_file(folder / POLICY_FILE, policy, step.best, FRAME_SKIP, again)
                         write_curve(folder, curve)
                         kept.add(step.kept)
@@ -88,7 +88,7 @@ def train_policy(
     return 0
 
 
-def _print_stopped(newest: Step | None, folder: Path) -> None:
+def _print_stopped(newest: SearchStep | None, folder: Path) -> None:
     """Print what is kept of a search that was stopped, and how to continue it."""
     if newest is None:
         print_line("stopped before the first generation was done; nothing is kept")
@@ -99,7 +99,7 @@ def _print_stopped(newest: Step | None, folder: Path) -> None:
     )
 
 
-def _format_generation(row: Generation) -> str:
+def _format_generation(row: SearchGeneration) -> str:
     """Return a line about a generation for the terminal."""
     line = f"generation {row.generation}: {row.episodes} episodes"
     if not math.isnan(row.mean_reward):  # the last generation is only checked

@@ -20,7 +20,7 @@ import can
 from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, to_python_can, validate_interface
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
-from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError, suggest_word
 
 INTERFACES_WITHOUT_ADAPTER = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
@@ -233,10 +233,10 @@ class AdapterWire:
         self._bus = open_bus(channel, bit_rate, data_bit_rate)
         self._descriptor = self._find_file_descriptor()
         # UDP multicast returns the frames that this end sends: how many of each are still to come back.
-        self._pending_echo_counts: Counter[Frame] | None = Counter() if _is_multicast(channel) else None
+        self._pending_echo_counts: Counter[CanFrame] | None = Counter() if _is_multicast(channel) else None
         self._errors: list[BusError] = []
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         """Send a frame; return False if the adapter did not accept it."""
         try:
             self._bus.send(to_python_can(frame, fd=self._uses_fd), timeout=0)
@@ -249,9 +249,9 @@ class AdapterWire:
             self._pending_echo_counts[frame] += 1
         return True
 
-    def receive(self) -> list[Frame]:
+    def receive(self) -> list[CanFrame]:
         """Return all received frames, in order."""
-        frames: list[Frame] = []
+        frames: list[CanFrame] = []
         try:
             for _ in range(MAX_AT_ONCE):
                 message = self._bus.recv(0)
@@ -260,7 +260,7 @@ class AdapterWire:
                 if message.is_error_frame:
                     self._errors += self._decode_errors(message)
                     continue
-                frame = Frame(message.arbitration_id, bytes(message.data))
+                frame = CanFrame(message.arbitration_id, bytes(message.data))
                 if self._should_receive(message, frame):
                     frames.append(frame)
         except IO_ERRORS as error:
@@ -302,7 +302,7 @@ class AdapterWire:
             return decode_error_frame(message.arbitration_id, data, self.channel)
         return [BusError("error_frames", self.channel, "an error frame")]
 
-    def _should_receive(self, message: can.Message, frame: Frame) -> bool:
+    def _should_receive(self, message: can.Message, frame: CanFrame) -> bool:
         """Return whether to receive a frame; an echo of a frame that this end sent is removed once."""
         if message.is_remote_frame:
             return False

@@ -24,9 +24,9 @@ from can.interfaces.virtual import VirtualBus
 
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.bus_faults import SendOutcome, VirtualFaults, inject_into_interface
-from snakesim_can_backend.protocol.definitions import NODE_BITS, NODE_MASK, Frame, Opcode
+from snakesim_can_backend.protocol.definitions import NODE_BITS, NODE_MASK, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 
 # Flags in the id of a frame on a raw socket: linux/can.h.
 EXTENDED = 0x80000000
@@ -55,7 +55,7 @@ class Wire(Protocol):
 
     channel: str
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         """Send a frame.
 
         Returns:
@@ -63,7 +63,7 @@ class Wire(Protocol):
         """
         ...
 
-    def receive(self) -> list[Frame]:
+    def receive(self) -> list[CanFrame]:
         """Return all received frames, in order. Never waits."""
         ...
 
@@ -125,7 +125,7 @@ class SocketCanWire:
         self._is_unplugged = False  # whether the adapter of the interface was unplugged
         self._reported_drop_count = 0  # received frames that the kernel had dropped at the last call of `errors`
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         """Send a frame; return False if the queue is full or the interface is down."""
         try:
             self._socket.send(_RAW_FRAME_FORMAT.pack(frame.id, len(frame.data), frame.data))
@@ -136,9 +136,9 @@ class SocketCanWire:
             self._record_interface_up()
         return True
 
-    def receive(self) -> list[Frame]:
+    def receive(self) -> list[CanFrame]:
         """Return all received frames, in order."""
-        frames: list[Frame] = []
+        frames: list[CanFrame] = []
         try:
             drain_socket(self._socket, self._buffer, frames, self._record_error_frame)
         except OSError as error:
@@ -230,7 +230,7 @@ class SocketCanWire:
         return MEMINFO_FORMAT.unpack(raw)[MEMINFO_DROPS]
 
 
-def to_python_can(frame: Frame, *, fd: bool = False) -> can.Message:
+def to_python_can(frame: CanFrame, *, fd: bool = False) -> can.Message:
     """Return a frame as a message of python-can. An id that does not fit 11 bits has 29."""
     return can.Message(
         arbitration_id=frame.id,
@@ -252,7 +252,7 @@ class VirtualPeer(Protocol):
         """
         ...
 
-    def inject(self, injection: Injection, *, begins: bool) -> None:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> None:
         """Start or end a fault of a module there."""
         ...
 
@@ -287,7 +287,7 @@ class VirtualWire:
         self._bus = VirtualBus(channel=channel, protocol=protocol)
         self._faults = VirtualFaults(channel)
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         """Send a frame, and return whether the bus accepted it. It always does, unless a fault is active."""
         if self._faults.active:
             match self._faults.simulate_send():
@@ -303,12 +303,12 @@ class VirtualWire:
             raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
         return True
 
-    def receive(self) -> list[Frame]:
+    def receive(self) -> list[CanFrame]:
         """Return all received frames, in order."""
-        frames: list[Frame] = []
+        frames: list[CanFrame] = []
         try:
             while (message := self._bus.recv(0)) is not None:
-                frames.append(Frame(message.arbitration_id, bytes(message.data)))
+                frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot receive: {error}", code="bus/io-failed") from error
         if self._faults.active:
@@ -343,7 +343,7 @@ class VirtualWire:
 
 
 def drain_socket(
-    source: socket.socket, buffer: bytearray, frames: list[Frame], on_error: Callable[[int, bytes], None]
+    source: socket.socket, buffer: bytearray, frames: list[CanFrame], on_error: Callable[[int, bytes], None]
 ) -> None:
     """Read frames from a non-blocking raw CAN socket until it is empty, at most MAX_AT_ONCE.
 
@@ -365,7 +365,7 @@ def drain_socket(
             if identifier & ERROR:
                 on_error(identifier, data)
             else:
-                append(new_tuple(Frame, (identifier, data[:length])))
+                append(new_tuple(CanFrame, (identifier, data[:length])))
 
 
 def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
@@ -401,7 +401,7 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     return True
 
 
-def receive_frames(wires: Sequence[Wire], timeout_s: float = MAX_WAIT_S) -> Iterator[tuple[Wire, Frame]]:
+def receive_frames(wires: Sequence[Wire], timeout_s: float = MAX_WAIT_S) -> Iterator[tuple[Wire, CanFrame]]:
     """Wait for at most MAX_WAIT_S and yield what has arrived. For the time before control cycles begin."""
     if not wait(wires, min(timeout_s, MAX_WAIT_S)):
         time.sleep(PAUSE_S)
@@ -410,7 +410,7 @@ def receive_frames(wires: Sequence[Wire], timeout_s: float = MAX_WAIT_S) -> Iter
             yield wire, frame
 
 
-def inject_into(wires: Sequence[Wire], injection: Injection, *, begins: bool) -> bool:
+def inject_into(wires: Sequence[Wire], injection: FaultInjection, *, begins: bool) -> bool:
     """Start or end an injected fault if its target is a bus.
 
     Returns:

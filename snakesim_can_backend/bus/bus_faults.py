@@ -11,7 +11,7 @@ import subprocess
 from enum import Enum, auto
 
 from snakesim_can_backend.bus.bus_errors import BusError, Kind
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.errors import ConfigError
 
 VIRTUAL = "vcan"
@@ -88,7 +88,7 @@ class VirtualFaults:
             return SendOutcome.REJECTED
         return SendOutcome.SENT
 
-    def filter_received(self, frames: list[Frame]) -> list[Frame]:
+    def filter_received(self, frames: list[CanFrame]) -> list[CanFrame]:
         """Return those of the frames on the bus that this end receives."""
         if "cut" in self.active or "bus_off" in self.active:
             return []

@@ -75,7 +75,7 @@ class ReportSchedule:
 
 
 @dataclass(frozen=True)
-class Stream:
+class FrameStream:
     """One kind of frame on one bus."""
 
     opcode: Opcode
@@ -87,7 +87,7 @@ class Stream:
         return self.frames_per_s * compute_max_frame_bits(load_layouts()[self.opcode].length)
 
 
-def list_streams(joints: int, reports: ReportSchedule) -> list[Stream]:
+def list_streams(joints: int, reports: ReportSchedule) -> list[FrameStream]:
     """Return all kinds of frames on one bus while the robot runs, each with its mean rate.
 
     Args:
@@ -99,16 +99,16 @@ def list_streams(joints: int, reports: ReportSchedule) -> list[Stream]:
     imu_hz = rate_hz / reports.imu_every if reports.imu_every else 0.0
     tail_contact_hz = contact_hz if reports.tail else 0.0
     return [
-        Stream(Opcode.SYNC, rate_hz),
-        Stream(Opcode.SET_POINT, joints * rate_hz),
-        Stream(Opcode.JOINT_STATE, joints * rate_hz),
-        Stream(Opcode.CONTACT, joints * contact_hz),
-        Stream(Opcode.TAIL_CONTACT, tail_contact_hz),
-        Stream(Opcode.GYRO, joints * imu_hz),
-        Stream(Opcode.ACCELEROMETER, joints * imu_hz),
-        Stream(Opcode.SHAFT_LOAD, joints * imu_hz),
-        Stream(Opcode.HEARTBEAT, joints / HEARTBEAT_PERIOD_S),
-        Stream(Opcode.HEALTH, joints / HEALTH_PERIOD_S),
+        FrameStream(Opcode.SYNC, rate_hz),
+        FrameStream(Opcode.SET_POINT, joints * rate_hz),
+        FrameStream(Opcode.JOINT_STATE, joints * rate_hz),
+        FrameStream(Opcode.CONTACT, joints * contact_hz),
+        FrameStream(Opcode.TAIL_CONTACT, tail_contact_hz),
+        FrameStream(Opcode.GYRO, joints * imu_hz),
+        FrameStream(Opcode.ACCELEROMETER, joints * imu_hz),
+        FrameStream(Opcode.SHAFT_LOAD, joints * imu_hz),
+        FrameStream(Opcode.HEARTBEAT, joints / HEARTBEAT_PERIOD_S),
+        FrameStream(Opcode.HEALTH, joints / HEALTH_PERIOD_S),
     ]
 
 

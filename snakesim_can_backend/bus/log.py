@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TextIO
 
 from snakesim_can_backend.bus.bus import LAST_STANDARD_ID, Wire
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.errors import ConfigError
 
 FLUSH_BYTES = 1 << 16
@@ -54,14 +54,14 @@ class LoggedWire:
         self.idle = wire.idle
         self.inject = wire.inject
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         """Send a frame, log it if the bus accepted it, and return whether it did."""
         accepted = self._wire.send(frame)
         if accepted:
             self._write([frame], "T")
         return accepted
 
-    def receive(self) -> list[Frame]:
+    def receive(self) -> list[CanFrame]:
         """Return all received frames, and log them."""
         frames = self._wire.receive()
         if frames:
@@ -74,7 +74,7 @@ class LoggedWire:
             self._log.flush()
         self._wire.close()
 
-    def _write(self, frames: list[Frame], direction: str) -> None:
+    def _write(self, frames: list[CanFrame], direction: str) -> None:
         if self._is_full:
             return
         prefix = f"({time.time():.6f}) {self.channel}"

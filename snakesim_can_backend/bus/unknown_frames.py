@@ -14,7 +14,7 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     WITH_CHECKSUM,
-    Frame,
+    CanFrame,
     Opcode,
     has_valid_checksum,
     parse_node,
@@ -92,7 +92,7 @@ def is_joint_module_frame(message: can.Message) -> bool:
     """Return whether id, length and, where there is one, checksum are those of the joint modules' protocol."""
     if message.is_extended_id or message.is_remote_frame or message.is_fd:
         return False
-    frame = Frame(message.arbitration_id, bytes(message.data))
+    frame = CanFrame(message.arbitration_id, bytes(message.data))
     opcode = parse_opcode(frame.id)
     layouts = load_layouts()
     if opcode not in layouts or parse_node(frame.id) > LAST_NODE:

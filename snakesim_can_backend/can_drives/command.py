@@ -17,7 +17,7 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import set_parent_death_signal
 from snakesim_hal.base.terminal import print_json, print_line
-from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, parse_set_option
 from snakesim_hal.programs.preflight import decode_backend_settings
 
 
@@ -101,7 +101,10 @@ def _load_settings(
     Returns:
         The configuration of the run and the settings of the backend.
     """
-    overrides = [Override("backend", backend.name, f"{command} {backend.name}"), *map(parse_set_option, arguments.set)]
+    overrides = [
+        KeyOverride("backend", backend.name, f"{command} {backend.name}"),
+        *map(parse_set_option, arguments.set),
+    ]
     loaded = load_scenario(arguments.scenario, overrides)
     settings = decode_backend_settings(loaded.config, backend, loaded.table)
     channels = arguments.channel or settings.channels or [DEFAULT_CHANNEL]

@@ -14,16 +14,16 @@ from typing import Any
 
 from snakesim_can_backend.bus.bus import VirtualPeer, Wire, inject_into, receive_frames, wait
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.emulation.emulated_body import FAULTS
 from snakesim_drivers.kit.drive_states import DriveCommand, DriveStates
 from snakesim_drivers.kit.drives import BusCommand, Drives
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 REQUEST_PERIOD_S = 0.1  # from one request to the next one to the same drive in bring-up
 DUPLICATE_WAIT_S = 0.06  # after the last drive has responded: a second drive with its id may respond later
@@ -96,7 +96,7 @@ class CanDrives(Drives):
     # --- the protocol of a driver type: frames that arrive ----------------------------------------------------
 
     @abstractmethod
-    def find_sender(self, frame: Frame) -> int | None:
+    def find_sender(self, frame: CanFrame) -> int | None:
         """Return the id of the node that sent a frame.
 
         Returns:
@@ -104,7 +104,7 @@ class CanDrives(Drives):
         """
 
     @abstractmethod
-    def handle_response(self, i: int, frame: Frame) -> None:
+    def handle_response(self, i: int, frame: CanFrame) -> None:
         """Store what a drive reports in `readings`, `states` and `firmware`.
 
         Raises:
@@ -174,7 +174,7 @@ class CanDrives(Drives):
         """Request supply, temperatures and errors."""
 
     @abstractmethod
-    def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+    def send_setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """Send a setpoint to a drive.
 
         Args:
@@ -291,7 +291,7 @@ class CanDrives(Drives):
         wait([self.wire], 0.0)
         self._receive()
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end a fault of the bus or of a drive that is emulated here; return False for any other fault."""
         if inject_into([self.wire], injection, begins=begins):
             return True
@@ -300,7 +300,7 @@ class CanDrives(Drives):
         self._emulator.inject(injection, begins=begins)
         return True
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return what is wrong with the bus, with other nodes on it, and with its drives."""
         return [
             *self._find_bus_errors(),
@@ -309,7 +309,7 @@ class CanDrives(Drives):
             *self.states.findings(),
         ]
 
-    def handle_frame(self, frame: Frame) -> None:
+    def handle_frame(self, frame: CanFrame) -> None:
         """Handle a received frame by its sender: store a drive's report, note another host or an unknown node."""
         sender = self.find_sender(frame)
         if sender is None:
@@ -327,35 +327,39 @@ class CanDrives(Drives):
 
     # --- inside: findings -------------------------------------------------------------------------------------
 
-    def _find_bus_errors(self) -> list[Finding]:
-        findings: list[Finding] = []
+    def _find_bus_errors(self) -> list[FaultFinding]:
+        findings: list[FaultFinding] = []
         for error in self.wire.errors():
             if error.kind in BUS_FAULTS:
                 cause = f"{error.channel}: {error.detail}; {BUS_FAULTS[error.kind]}"
-                findings.append(Finding(error.kind, cause))
+                findings.append(FaultFinding(error.kind, cause))
         return findings
 
-    def _find_unauthorized_nodes(self) -> list[Finding]:
+    def _find_unauthorized_nodes(self) -> list[FaultFinding]:
         """Return findings for another host and for unknown nodes."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         if self._other_controller_seen:
-            findings.append(Finding("second_host", "another program commands drives on this bus; end one of the two"))
+            findings.append(
+                FaultFinding("second_host", "another program commands drives on this bus; end one of the two")
+            )
             self._other_controller_seen = False
         for node, frame_count in self._frame_count_by_unknown_node.items():
             if frame_count >= MIN_UNKNOWN_NODE_FRAMES:
-                findings.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
+                findings.append(
+                    FaultFinding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot")
+                )
         return findings
 
-    def _find_duplicates(self) -> list[Finding]:
+    def _find_duplicates(self) -> list[FaultFinding]:
         """Return a finding for each id that two drives have. It affects all joints: their readings may be mixed up."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for i, serials in enumerate(self._serials):
             if len(serials) > 1:
                 cause = (
                     f"{self.states.drives[i].label} is duplicated: serial numbers {' and '.join(serials)} answer; "
                     "give each drive its own id"
                 )
-                findings.append(Finding("duplicate_node", cause, i))
+                findings.append(FaultFinding("duplicate_node", cause, i))
         return findings
 
     def _find_identity_problems(self, i: int) -> list[str]:

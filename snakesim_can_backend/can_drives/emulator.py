@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from snakesim_can_backend.bus.bus import Wire
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_hal.model.joints import Joint
@@ -47,11 +47,11 @@ class CanEmulator(DriveEmulator[Wire]):
         super().__init__(body, self.wires, context.clock_ns)
 
     @abstractmethod
-    def find_destination_node(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: CanFrame) -> int:
         """Return the node that a frame is for."""
 
     @abstractmethod
-    def handle_frame(self, i: int, frame: Frame) -> None:
+    def handle_frame(self, i: int, frame: CanFrame) -> None:
         """Handle a frame that a drive receives.
 
         Raises:
@@ -59,7 +59,7 @@ class CanEmulator(DriveEmulator[Wire]):
         """
 
     @abstractmethod
-    def duplicate_frame(self, frame: Frame) -> Frame:
+    def duplicate_frame(self, frame: CanFrame) -> CanFrame:
         """Return the frame that a second drive with the same id sends together with a frame of the first one.
 
         It gets the same commands, so that only its serial number differs.
@@ -71,7 +71,7 @@ class CanEmulator(DriveEmulator[Wire]):
             self._handle_received_frames()
         return None
 
-    def send_frame(self, i: int, frame: Frame) -> None:
+    def send_frame(self, i: int, frame: CanFrame) -> None:
         """Send a frame of a drive, unless the drive is silent; twice if an injected fault duplicates the drive."""
         if self.body.is_silent(i):
             return
@@ -90,7 +90,7 @@ class CanEmulator(DriveEmulator[Wire]):
                         self.handle_frame(i, frame)
         self.simulate_to_now()
 
-    def _find_receiving_drives(self, wire: Wire, frame: Frame) -> list[int]:
+    def _find_receiving_drives(self, wire: Wire, frame: CanFrame) -> list[int]:
         """Return the indices of the drives on a bus that a frame is for: one drive, all after a broadcast, or none."""
         node = self.find_destination_node(frame)
         if node == self.broadcast_id:

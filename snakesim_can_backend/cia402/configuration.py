@@ -34,13 +34,13 @@ from snakesim_can_backend.cia402.objects import (
     SUPPORTED_MODES,
     UNUSED_PDOS,
     VENDOR_ID,
-    Entry,
+    ObjectEntry,
     Pdo,
     encode_mapping,
 )
-from snakesim_can_backend.cia402.sdo import Nmt, Read, Step, Write
+from snakesim_can_backend.cia402.sdo import NmtStep, ReadStep, Step, WriteStep
 from snakesim_can_backend.cia402.settings import Cia402Settings
-from snakesim_can_backend.cia402.state_machine import Control
+from snakesim_can_backend.cia402.state_machine import ControlwordCommand
 
 FAULT_ON_ABORT = 1  # 6007h
 TORQUE_OFF_ON_FAULT = 0  # 605Eh
@@ -56,24 +56,24 @@ OPTIONAL_ENTRIES = (
 )
 
 
-def list_identification_steps() -> list[Read]:
+def list_identification_steps() -> list[ReadStep]:
     """Return the steps that read identity, limits and units of a drive, and change nothing."""
-    required = [Read(entry) for entry in REQUIRED_ENTRIES]
-    optional = [Read(entry, optional=True) for entry in OPTIONAL_ENTRIES]
+    required = [ReadStep(entry) for entry in REQUIRED_ENTRIES]
+    optional = [ReadStep(entry, optional=True) for entry in OPTIONAL_ENTRIES]
     return required + optional
 
 
 def list_switch_off_steps() -> list[Step]:
     """Return the steps that switch a drive off which has no PDOs yet."""
-    return [Write(CONTROLWORD, Control.DISABLE_VOLTAGE)]
+    return [WriteStep(CONTROLWORD, ControlwordCommand.DISABLE_VOLTAGE)]
 
 
 def list_fault_reset_steps() -> list[Step]:
     """Return the steps of a fault reset: it works when its bit changes from 0 to 1."""
     return [
-        Write(CONTROLWORD, Control.DISABLE_VOLTAGE),
-        Write(CONTROLWORD, Control.FAULT_RESET),
-        Write(CONTROLWORD, Control.DISABLE_VOLTAGE),
+        WriteStep(CONTROLWORD, ControlwordCommand.DISABLE_VOLTAGE),
+        WriteStep(CONTROLWORD, ControlwordCommand.FAULT_RESET),
+        WriteStep(CONTROLWORD, ControlwordCommand.DISABLE_VOLTAGE),
     ]
 
 
@@ -87,22 +87,22 @@ def list_configuration_steps(node: int, settings: Cia402Settings, period_s: floa
         settings: Settings of the driver type.
         period_s: Duration from one setpoint to the next.
     """
-    steps: list[Step] = [Nmt(NmtCommand.ENTER_PRE_OPERATIONAL)]
+    steps: list[Step] = [NmtStep(NmtCommand.ENTER_PRE_OPERATIONAL)]
     steps += _write_and_check(CONSUMER_HEARTBEAT, encode_consumer_heartbeat(settings))
     steps += _write_and_check(PRODUCER_HEARTBEAT, round(settings.heartbeat_s * 1000))
     steps += _write_and_check(ERROR_BEHAVIOR, NO_NMT_STATE_CHANGE, optional=True)
     steps += _write_and_check(ABORT_CONNECTION_OPTION_CODE, FAULT_ON_ABORT, optional=settings.allow_unverified_watchdog)
     # Many drives have one reaction only, so a refusal is no failure.
-    steps.append(Write(FAULT_REACTION, TORQUE_OFF_ON_FAULT, optional=True))
-    steps.append(Write(QUICK_STOP_OPTION, QUICK_STOP_OPTION_CODES[settings.quick_stop], optional=True))
+    steps.append(WriteStep(FAULT_REACTION, TORQUE_OFF_ON_FAULT, optional=True))
+    steps.append(WriteStep(QUICK_STOP_OPTION, QUICK_STOP_OPTION_CODES[settings.quick_stop], optional=True))
     value, exponent = encode_cycle_period(period_s)
-    steps.append(Write(CYCLE_VALUE, value, optional=True))
-    steps.append(Write(CYCLE_INDEX, exponent, optional=True))
+    steps.append(WriteStep(CYCLE_VALUE, value, optional=True))
+    steps.append(WriteStep(CYCLE_INDEX, exponent, optional=True))
     for pdo in PDOS:
         steps += _list_pdo_steps(pdo, node)
     for pdo in UNUSED_PDOS:
-        steps.append(Write(pdo.cob_id_entry(), PDO_OFF | pdo.base | node, optional=True))
-    steps.append(Nmt(NmtCommand.START))
+        steps.append(WriteStep(pdo.cob_id_entry(), PDO_OFF | pdo.base | node, optional=True))
+    steps.append(NmtStep(NmtCommand.START))
     return steps
 
 
@@ -129,23 +129,23 @@ def encode_cycle_period(period_s: float) -> tuple[int, int]:
     return best
 
 
-def _write_and_check(entry: Entry, value: int, *, optional: bool = False) -> Iterator[Step]:
-    yield Write(entry, value, optional=optional)
-    yield Read(entry, expected=value, optional=optional)
+def _write_and_check(entry: ObjectEntry, value: int, *, optional: bool = False) -> Iterator[Step]:
+    yield WriteStep(entry, value, optional=optional)
+    yield ReadStep(entry, expected=value, optional=optional)
 
 
 def _list_pdo_steps(pdo: Pdo, node: int) -> Iterator[Step]:
     """Yield the steps that map a PDO: a drive allows it only while the PDO is off and its number of entries is 0."""
     cob_id = pdo.base | node
-    yield Write(pdo.cob_id_entry(), PDO_OFF | cob_id)
-    yield Write(pdo.mapping_entry(0), 0)
+    yield WriteStep(pdo.cob_id_entry(), PDO_OFF | cob_id)
+    yield WriteStep(pdo.mapping_entry(0), 0)
     for sub, entry in enumerate(pdo.entries, start=1):
-        yield Write(pdo.mapping_entry(sub), encode_mapping(entry))
-    yield Write(pdo.mapping_entry(0), len(pdo.entries))
-    yield Write(pdo.transmission_entry(), pdo.transmission_type)
-    yield Write(pdo.cob_id_entry(), cob_id)
+        yield WriteStep(pdo.mapping_entry(sub), encode_mapping(entry))
+    yield WriteStep(pdo.mapping_entry(0), len(pdo.entries))
+    yield WriteStep(pdo.transmission_entry(), pdo.transmission_type)
+    yield WriteStep(pdo.cob_id_entry(), cob_id)
     for sub, entry in enumerate(pdo.entries, start=1):
-        yield Read(pdo.mapping_entry(sub), expected=encode_mapping(entry))
-    yield Read(pdo.mapping_entry(0), expected=len(pdo.entries))
-    yield Read(pdo.transmission_entry(), expected=pdo.transmission_type)
-    yield Read(pdo.cob_id_entry(), expected=cob_id, mask=COB_ID_MASK)
+        yield ReadStep(pdo.mapping_entry(sub), expected=encode_mapping(entry))
+    yield ReadStep(pdo.mapping_entry(0), expected=len(pdo.entries))
+    yield ReadStep(pdo.transmission_entry(), expected=pdo.transmission_type)
+    yield ReadStep(pdo.cob_id_entry(), expected=cob_id, mask=COB_ID_MASK)

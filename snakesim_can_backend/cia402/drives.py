@@ -23,8 +23,8 @@ from snakesim_can_backend.cia402.frames import (
     SYNC_ID,
     TRANSMIT_PDOS,
     UPLOAD_RESPONSE,
-    Emergency,
-    Function,
+    EmergencyMessage,
+    FunctionCode,
     NmtCommand,
     NmtState,
     SdoFrame,
@@ -56,14 +56,14 @@ from snakesim_can_backend.cia402.objects import (
     VENDOR_ID,
     Pdo,
 )
-from snakesim_can_backend.cia402.sdo import Read, SdoQueue, StepResult
-from snakesim_can_backend.cia402.servo import Phase, Servo, make_health_objects
-from snakesim_can_backend.cia402.state_machine import FAULT_STATES, Control, PowerState, decode_statusword
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.cia402.sdo import ReadStep, SdoQueue, SdoStepResult
+from snakesim_can_backend.cia402.servo import Cia402Drive, Phase, make_health_objects
+from snakesim_can_backend.cia402.state_machine import FAULT_STATES, ControlwordCommand, PowerState, decode_statusword
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_drivers.kit.drives import BusCommand
-from snakesim_drivers.kit.findings import Finding
-from snakesim_hal.wire.messages import Mode
+from snakesim_drivers.kit.findings import FaultFinding
+from snakesim_hal.wire.messages import JointMode
 
 MAX_MISSED_HEARTBEATS = 5  # of a drive that still answers SYNC
 MIN_PRE_OPERATIONAL_HEARTBEATS = 2  # one may be from before the start of the drive
@@ -106,7 +106,7 @@ class Cia402Drives(CanDrives):
 
     # --- frames that arrive -----------------------------------------------------------------------------------
 
-    def find_sender(self, frame: Frame) -> int | None:
+    def find_sender(self, frame: CanFrame) -> int | None:
         """Return the node id of the drive that sent a frame.
 
         Returns:
@@ -115,24 +115,24 @@ class Cia402Drives(CanDrives):
         """
         function_code, node = split_id(frame)
         if node == 0:  # a broadcast
-            return HOST if frame.id in (Function.NMT, SYNC_ID) else None
+            return HOST if frame.id in (FunctionCode.NMT, SYNC_ID) else None
         if function_code in RECEIVE_PDOS:  # received by the drive (RPDO), so sent by a host
             return HOST
         if function_code in TRANSMIT_PDOS:  # transmitted by the drive (TPDO)
             return node
         match function_code:
-            case Function.EMERGENCY | Function.SDO_RESPONSE:
+            case FunctionCode.EMERGENCY | FunctionCode.SDO_RESPONSE:
                 return node
-            case Function.SDO_REQUEST:
+            case FunctionCode.SDO_REQUEST:
                 # The upper three bits are the command specifier. Every write starts with an initiate download.
                 is_write = bool(frame.data) and frame.data[0] >> 5 == DOWNLOAD_REQUEST
                 return HOST if is_write else None
-            case Function.HEARTBEAT:
+            case FunctionCode.HEARTBEAT:
                 return HOST if node == self._settings.host_id else node
             case _:
                 return None
 
-    def handle_response(self, i: int, frame: Frame) -> None:
+    def handle_response(self, i: int, frame: CanFrame) -> None:
         """Store what a drive reports in a PDO, an SDO response, an emergency message or a heartbeat."""
         function, _ = split_id(frame)
         match function:
@@ -140,11 +140,11 @@ class Cia402Drives(CanDrives):
                 self._handle_state(i, *STATE_PDO.layout.unpack(frame.data))
             case MOTION_PDO.base:
                 self._handle_motion(i, *MOTION_PDO.layout.unpack(frame.data))
-            case Function.SDO_RESPONSE:
+            case FunctionCode.SDO_RESPONSE:
                 self._handle_sdo(i, decode_sdo(frame.data))
-            case Function.EMERGENCY:
+            case FunctionCode.EMERGENCY:
                 self._handle_emergency(i, decode_emergency(frame.data))
-            case Function.HEARTBEAT:
+            case FunctionCode.HEARTBEAT:
                 self._handle_heartbeat(i, frame.data[0] & 0x7F)
             case _:
                 pass
@@ -200,9 +200,9 @@ class Cia402Drives(CanDrives):
         if servo.quick_stop_start_ns is None:
             servo.quick_stop_start_ns = now_ns
         elif now_ns - servo.quick_stop_start_ns > self._watchdog_ns:
-            self._send_disable(i, Control.DISABLE_VOLTAGE)
+            self._send_disable(i, ControlwordCommand.DISABLE_VOLTAGE)
 
-    def _handle_emergency(self, i: int, emergency: Emergency) -> None:
+    def _handle_emergency(self, i: int, emergency: EmergencyMessage) -> None:
         servo = self.servos[i]
         if emergency.code >> 8 == 0:  # the error is gone
             servo.emergency = None
@@ -229,17 +229,17 @@ class Cia402Drives(CanDrives):
 
     # --- SDO --------------------------------------------------------------------------------------------------
 
-    def _make_servo(self, i: int) -> Servo:
+    def _make_servo(self, i: int) -> Cia402Drive:
         queue = SdoQueue(
             send_request=partial(self._send_sdo, i),
             send_nmt=partial(self._send_nmt, i),
             on_result=partial(self._store_result, i),
             now_ns=self._now_ns,
         )
-        return Servo(queue)
+        return Cia402Drive(queue)
 
     def _send_sdo(self, i: int, data: bytes) -> None:
-        self.wire.send(Frame(Function.SDO_REQUEST | self.node_ids[i], data))
+        self.wire.send(CanFrame(FunctionCode.SDO_REQUEST | self.node_ids[i], data))
 
     def _send_nmt(self, i: int, command: NmtCommand) -> None:
         self.wire.send(encode_nmt(command, self.node_ids[i]))
@@ -265,7 +265,7 @@ class Cia402Drives(CanDrives):
         if serial and VENDOR_ID in values:
             self.record_serial(i, f"{values[VENDOR_ID]:08X}-{values.get(PRODUCT_CODE, 0):08X}-{serial:08X}")
 
-    def _store_result(self, i: int, result: StepResult) -> None:
+    def _store_result(self, i: int, result: SdoStepResult) -> None:
         servo = self.servos[i]
         match servo.phase:
             case "unknown":
@@ -279,7 +279,7 @@ class Cia402Drives(CanDrives):
             case _:
                 pass
 
-    def _store_identity(self, i: int, result: StepResult) -> None:
+    def _store_identity(self, i: int, result: SdoStepResult) -> None:
         servo = self.servos[i]
         servo.failure = servo.failure or result.failure
         servo.unread_entries.discard(result.step.entry)
@@ -290,7 +290,7 @@ class Cia402Drives(CanDrives):
             self.firmware[i] = (revision >> 16, revision & 0xFFFF)
             self.readings.set_identity(i, firmware=f"{revision >> 16}.{revision & 0xFFFF}")
 
-    def _store_health(self, i: int, result: StepResult) -> None:
+    def _store_health(self, i: int, result: SdoStepResult) -> None:
         """Store a value of a drive's health; after the last one, store all values in the readings."""
         servo = self.servos[i]
         entry = result.step.entry
@@ -407,7 +407,7 @@ class Cia402Drives(CanDrives):
         servo.queue.add(list_configuration_steps(self.node_ids[i], self._settings, self._period_s))
         servo.should_reset_fault = False
 
-    def _enter_phase(self, servo: Servo, phase: Phase) -> None:
+    def _enter_phase(self, servo: Cia402Drive, phase: Phase) -> None:
         servo.phase = phase
         servo.phase_start_ns = self._now_ns()
 
@@ -436,7 +436,7 @@ class Cia402Drives(CanDrives):
         servo = self.servos[i]
         if servo.phase == "ready" and servo.queue.is_idle:
             entries = [SERIAL, *self._health.entries]
-            servo.queue.add(Read(entry, optional=True) for entry in entries)
+            servo.queue.add(ReadStep(entry, optional=True) for entry in entries)
 
     def send_setpoints(self, command: BusCommand) -> None:
         """Send setpoints and commands, and with them the heartbeat that the drives watch."""
@@ -446,7 +446,7 @@ class Cia402Drives(CanDrives):
             self.wire.send(encode_heartbeat(self._settings.host_id, NmtState.OPERATIONAL))
         super().send_setpoints(command)
 
-    def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+    def send_setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """Send a setpoint, with the controlword that leads the drive one step towards Operation enabled.
 
         Nothing is sent to a drive that is not configured. A drive that has left Operation enabled by itself gets the
@@ -466,11 +466,11 @@ class Cia402Drives(CanDrives):
         control = servo.choose_controlword(target_mode)
         max_torque = min(scaling.to_max_torque(limit_nm), servo.values[MAX_TORQUE])
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 self._send_pdo(i, POSITION_PDO, control, scaling.to_position(target), max_torque)
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 self._send_pdo(i, VELOCITY_PDO, control, scaling.to_velocity(target), max_torque)
-            case Mode.TORQUE | Mode.PASSIVE:
+            case JointMode.TORQUE | JointMode.PASSIVE:
                 self._send_pdo(i, TORQUE_PDO, control, scaling.to_torque(target), max_torque)
         if servo.mode != target_mode:
             self._send_pdo(i, MODE_PDO, target_mode)
@@ -485,11 +485,11 @@ class Cia402Drives(CanDrives):
         servo.was_enabled = False
         match command:
             case "idle":
-                self._send_disable(i, Control.DISABLE_VOLTAGE)
+                self._send_disable(i, ControlwordCommand.DISABLE_VOLTAGE)
             case "stop":
-                self._send_disable(i, Control.QUICK_STOP)
+                self._send_disable(i, ControlwordCommand.QUICK_STOP)
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return what is wrong, including drives that answer SYNC but have stopped to send heartbeats."""
         findings = super().findings()
         timeout_ns = MAX_MISSED_HEARTBEATS * self._settings.heartbeat_s * 1e9
@@ -503,10 +503,10 @@ class Cia402Drives(CanDrives):
                 cause = (
                     f"{self.states.drives[i].label} answers SYNC, but has sent no heartbeat for {age_ns * 1e-6:.0f} ms"
                 )
-                findings.append(Finding("drive_silent", cause, i, affects_only_joint=True))
+                findings.append(FaultFinding("drive_silent", cause, i, affects_only_joint=True))
         return findings
 
-    def _is_configuring(self, servo: Servo) -> bool:
+    def _is_configuring(self, servo: Cia402Drive) -> bool:
         """Return whether a drive is booting or being configured, and its time limit for that is not exceeded."""
         is_due = servo.phase in ("booting", "configuring") and not servo.failure
         return is_due and self._now_ns() - servo.phase_start_ns <= MAX_START_NS
@@ -515,13 +515,13 @@ class Cia402Drives(CanDrives):
         for servo in self.servos:
             servo.position = None
             servo.velocity = None
-        self._was_sync_accepted = self.wire.send(Frame(SYNC_ID, b""))
+        self._was_sync_accepted = self.wire.send(CanFrame(SYNC_ID, b""))
 
-    def _send_disable(self, i: int, control: Control) -> None:
+    def _send_disable(self, i: int, control: ControlwordCommand) -> None:
         """Send a command that ends motion, with no torque, and with the torque limit that the drive had before."""
         servo = self.servos[i]
         if servo.phase == "ready":
             self._send_pdo(i, TORQUE_PDO, control, 0, servo.values[MAX_TORQUE])
 
     def _send_pdo(self, i: int, pdo: Pdo, *values: int) -> None:
-        self.wire.send(Frame(pdo.base | self.node_ids[i], pdo.layout.pack(*values)))
+        self.wire.send(CanFrame(pdo.base | self.node_ids[i], pdo.layout.pack(*values)))

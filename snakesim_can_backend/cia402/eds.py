@@ -19,7 +19,7 @@ from snakesim_can_backend.cia402.objects import (
     PRODUCER_HEARTBEAT,
     SUPPORTED_MODES,
     VENDOR_ID,
-    Entry,
+    ObjectEntry,
 )
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_text
@@ -59,7 +59,7 @@ class EdsObject:
 
 
 @dataclass(frozen=True)
-class Eds:
+class EdsFile:
     """The object dictionary of a drive type."""
 
     path: str
@@ -67,7 +67,7 @@ class Eds:
     product: int
     objects: Mapping[tuple[int, int], EdsObject]  # by index and subindex
 
-    def find(self, entry: Entry) -> EdsObject | None:
+    def find(self, entry: ObjectEntry) -> EdsObject | None:
         """Return the description of an entry; None if the drive does not have it."""
         return self.objects.get((entry.index, entry.sub))
 
@@ -83,7 +83,7 @@ class Eds:
             for entry in pdo.entries:
                 yield from self._find_mapping_problems(entry)
 
-    def _find_mapping_problems(self, entry: Entry) -> Iterator[str]:
+    def _find_mapping_problems(self, entry: ObjectEntry) -> Iterator[str]:
         found = self.find(entry)
         if found is None:
             yield f"has no {entry.name} ({entry.address})"
@@ -93,7 +93,7 @@ class Eds:
             yield f"does not allow {entry.name} ({entry.address}) in a PDO"
 
 
-def read_all_eds(paths: Sequence[str]) -> list[Eds]:
+def read_all_eds(paths: Sequence[str]) -> list[EdsFile]:
     """Read the EDS files that the scenario names, and check that they have all objects that the driver needs.
 
     Raises:
@@ -111,7 +111,7 @@ def read_all_eds(paths: Sequence[str]) -> list[Eds]:
     return files
 
 
-def read_eds(path: str | Path) -> Eds:
+def read_eds(path: str | Path) -> EdsFile:
     """Read one EDS file, without checking which objects the drive has.
 
     Args:
@@ -144,10 +144,10 @@ def read_eds(path: str | Path) -> Eds:
         device = parser["DeviceInfo"]
         vendor = _read_number(str(path), device, "VendorNumber", 0)
         product = _read_number(str(path), device, "ProductNumber", 0)
-    return Eds(str(path), vendor, product, objects)
+    return EdsFile(str(path), vendor, product, objects)
 
 
-def find_eds(files: Sequence[Eds], vendor: int, product: int) -> Eds | None:
+def find_eds(files: Sequence[EdsFile], vendor: int, product: int) -> EdsFile | None:
     """Return the file of a drive, by the vendor and the product of its identity object."""
     for file in files:
         if (file.vendor, file.product) == (vendor, product):

@@ -14,8 +14,8 @@ from snakesim_can_backend.cia402.frames import (
     RECEIVE_PDOS,
     SYNC_ID,
     UPLOAD_RESPONSE,
-    Emergency,
-    Function,
+    EmergencyMessage,
+    FunctionCode,
     NmtCommand,
     NmtState,
     decode_sdo,
@@ -24,8 +24,8 @@ from snakesim_can_backend.cia402.frames import (
     encode_read_response,
     split_id,
 )
-from snakesim_can_backend.cia402.limits import REVOLUTION_RAD, THOUSANDTHS, Scaling, compute_shaft_range_rad
-from snakesim_can_backend.cia402.node import Address, Node
+from snakesim_can_backend.cia402.limits import REVOLUTION_RAD, THOUSANDTHS, UnitScaling, compute_shaft_range_rad
+from snakesim_can_backend.cia402.node import Address, Cia402Node
 from snakesim_can_backend.cia402.objects import (
     ABORT_CONNECTION_OPTION_CODE,
     CONSUMER_HEARTBEAT,
@@ -58,7 +58,7 @@ from snakesim_can_backend.cia402.objects import (
     VELOCITY,
     VENDOR_ID,
     VOLTAGE,
-    Entry,
+    ObjectEntry,
 )
 from snakesim_can_backend.cia402.servo import EMULATED_BOARD_TEMPERATURE, EMULATED_MOTOR_TEMPERATURE
 from snakesim_can_backend.cia402.settings import Cia402Settings, MountedCia402
@@ -69,9 +69,9 @@ from snakesim_can_backend.cia402.state_machine import (
     apply_controlword,
     encode_statusword,
 )
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 BROADCAST = 0  # the node of NMT commands to all nodes, SYNC and heartbeats
 COUNTS_PER_TURN = 65_536  # of the encoder
@@ -80,32 +80,32 @@ POSITION_MARGIN = 0.02  # of a joint's range: how far the position limits of a d
 EMULATED_REVISION = 0x0001_0000
 FIRST_SERIAL = 0x4020_0001
 DUPLICATE_SERIAL_BITS = 0x0100_0000  # in which the serial number of a second drive with the same id differs
-OVER_TEMPERATURE = Emergency(0x4210, 0x09)  # generic and temperature
-NO_HEARTBEAT = Emergency(HEARTBEAT_LOST, 0x11)  # generic and communication
+OVER_TEMPERATURE = EmergencyMessage(0x4210, 0x09)  # generic and temperature
+NO_HEARTBEAT = EmergencyMessage(HEARTBEAT_LOST, 0x11)  # generic and communication
 STAYS_IN_QUICK_STOP = 5  # from this option code on
 AT_REST_SPEED_RAD_S = 0.05  # shaft speed at which a quick stop ends
 TORQUE_OFF = 0  # quick stop option code
-DRIVE_MODES: dict[int, Mode] = {
-    OperationMode.CYCLIC_POSITION: Mode.POSITION,
-    OperationMode.CYCLIC_VELOCITY: Mode.VELOCITY,
-    OperationMode.CYCLIC_TORQUE: Mode.TORQUE,
+DRIVE_MODES: dict[int, JointMode] = {
+    OperationMode.CYCLIC_POSITION: JointMode.POSITION,
+    OperationMode.CYCLIC_VELOCITY: JointMode.VELOCITY,
+    OperationMode.CYCLIC_TORQUE: JointMode.TORQUE,
 }
 
 
 @dataclass
-class EmulatedDrive:
+class EmulatedCia402Drive:
     """One drive: its objects, and its state."""
 
     node: int  # id
-    objects: Node
-    scaling: Scaling
+    objects: Cia402Node
+    scaling: UnitScaling
     state: PowerState = PowerState.SWITCH_ON_DISABLED
     controlword: int = 0
-    error: Emergency | None = None  # that led to the fault
+    error: EmergencyMessage | None = None  # that led to the fault
     is_booting: bool = True
     last_heartbeat_us: float = -math.inf  # when it sent one last
     last_host_heartbeat_us: float | None = None  # when it received one last; None: none since the start
-    saved_values: dict[Entry, int] = field(default_factory=dict[Entry, int])  # in its nonvolatile memory
+    saved_values: dict[ObjectEntry, int] = field(default_factory=dict[ObjectEntry, int])  # in its nonvolatile memory
 
 
 class EmulatedCia402(CanEmulator):
@@ -123,25 +123,25 @@ class EmulatedCia402(CanEmulator):
         self.drives = [self._make_drive(i) for i in range(len(context.joints))]
         self.on_step(0.0)
 
-    def find_destination_node(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: CanFrame) -> int:
         """Return the node that a frame is for; all nodes receive NMT commands to all, SYNC and heartbeats."""
         function, node = split_id(frame)
-        if frame.id == Function.NMT:
+        if frame.id == FunctionCode.NMT:
             return frame.data[1]
-        if function in RECEIVE_PDOS or function == Function.SDO_REQUEST:
+        if function in RECEIVE_PDOS or function == FunctionCode.SDO_REQUEST:
             return node
         return BROADCAST
 
-    def duplicate_frame(self, frame: Frame) -> Frame:
+    def duplicate_frame(self, frame: CanFrame) -> CanFrame:
         """Return the frame of a second drive: it has another serial number."""
         function, _ = split_id(frame)
-        if function != Function.SDO_RESPONSE:
+        if function != FunctionCode.SDO_RESPONSE:
             return frame
         response = decode_sdo(frame.data)
         if response.kind != UPLOAD_RESPONSE or (response.index, response.sub) != (SERIAL.index, SERIAL.sub):
             return frame
         serial = SERIAL.decode(response.data) ^ DUPLICATE_SERIAL_BITS
-        return Frame(frame.id, encode_read_response(response.index, response.sub, SERIAL.encode(serial)))
+        return CanFrame(frame.id, encode_read_response(response.index, response.sub, SERIAL.encode(serial)))
 
     def restart(self, i: int) -> None:
         """Restart a drive: it loses all settings that it has not saved, and sends its boot-up message later."""
@@ -150,7 +150,7 @@ class EmulatedCia402(CanEmulator):
         self.drives[i].node = node
         self._drive_motor(i)
 
-    def handle_frame(self, i: int, frame: Frame) -> None:
+    def handle_frame(self, i: int, frame: CanFrame) -> None:
         """Handle a frame that a drive receives: SYNC, NMT command, SDO request, heartbeat of the host, or PDO.
 
         A drive that is booting ignores all frames.
@@ -165,13 +165,13 @@ class EmulatedCia402(CanEmulator):
             return
         if frame.id == SYNC_ID:
             for cob_id, data in drive.objects.list_synchronous_pdos():
-                self.send_frame(i, Frame(cob_id & ~0x7F | drive.node, data))
-        elif frame.id == Function.NMT:
+                self.send_frame(i, CanFrame(cob_id & ~0x7F | drive.node, data))
+        elif frame.id == FunctionCode.NMT:
             self._execute_nmt_command(i, frame.data[0])
-        elif function == Function.SDO_REQUEST:
+        elif function == FunctionCode.SDO_REQUEST:
             response = drive.objects.handle_sdo_request(decode_sdo(frame.data))
-            self.send_frame(i, Frame(Function.SDO_RESPONSE | drive.node, response))
-        elif function == Function.HEARTBEAT:
+            self.send_frame(i, CanFrame(FunctionCode.SDO_RESPONSE | drive.node, response))
+        elif function == FunctionCode.HEARTBEAT:
             if node == self._get_consumer_heartbeat(drive)[0]:
                 drive.last_host_heartbeat_us = self.body.now_us
         elif function in RECEIVE_PDOS:
@@ -197,14 +197,14 @@ class EmulatedCia402(CanEmulator):
 
     # --- what happens to a drive ------------------------------------------------------------------------------
 
-    def _make_drive(self, i: int) -> EmulatedDrive:
+    def _make_drive(self, i: int) -> EmulatedCia402Drive:
         """Create a drive as it is after power-on: its object dictionary has the defaults of the EDS and saved values.
 
         Args:
             i: Index of the drive.
         """
         joint = self._joints[i]
-        node = Node(
+        node = Cia402Node(
             eds=self._eds,
             node=self.body.joints[i].id,
             on_write=lambda address, value: self._handle_write(i, address, value),
@@ -215,7 +215,7 @@ class EmulatedCia402(CanEmulator):
         if self._settings.rated_torque_nm is not None:
             rated_torque_mnm = max(round(self._settings.rated_torque_nm * 1000), 1)
         counts = round(self._settings.counts_per_turn or COUNTS_PER_TURN)
-        scaling = Scaling(counts, self._settings.velocity_units_per_turn_s or counts, rated_torque_mnm / 1000)
+        scaling = UnitScaling(counts, self._settings.velocity_units_per_turn_s or counts, rated_torque_mnm / 1000)
         saved_values = make_saved_values(joint, mounted, scaling, self._settings.max_speed_units_per_turn_s)
         saved_values |= {
             VENDOR_ID: self._eds.vendor,
@@ -226,7 +226,7 @@ class EmulatedCia402(CanEmulator):
         for entry, value in saved_values.items():
             if _get_address(entry) in node.values:
                 node.values[_get_address(entry)] = int.from_bytes(entry.encode(value), "little")
-        return EmulatedDrive(node.node, node, scaling, saved_values=saved_values)
+        return EmulatedCia402Drive(node.node, node, scaling, saved_values=saved_values)
 
     def _execute_nmt_command(self, i: int, command: int) -> None:
         drive = self.drives[i]
@@ -242,7 +242,7 @@ class EmulatedCia402(CanEmulator):
         drive.last_host_heartbeat_us = None
         self.send_frame(i, encode_heartbeat(drive.node, NmtState.BOOT_UP))
 
-    def _receive_pdo(self, i: int, frame: Frame) -> None:
+    def _receive_pdo(self, i: int, frame: CanFrame) -> None:
         drive = self.drives[i]
         for address, value in drive.objects.unpack_received_pdo(frame.id, frame.data) or []:
             drive.objects.values[address] = value
@@ -258,7 +258,7 @@ class EmulatedCia402(CanEmulator):
             drive.controlword = value
             if was_fault and drive.state != PowerState.FAULT:
                 drive.error = None
-                self.send_frame(i, encode_emergency(drive.node, Emergency(0, 0)))
+                self.send_frame(i, encode_emergency(drive.node, EmergencyMessage(0, 0)))
         elif address == _get_address(CONSUMER_HEARTBEAT):
             drive.last_host_heartbeat_us = None  # the watch begins with the next heartbeat
         self._end_quick_stop(i)
@@ -277,12 +277,12 @@ class EmulatedCia402(CanEmulator):
         if drive.objects.get(_get_address(ABORT_CONNECTION_OPTION_CODE)) and drive.state not in FAULT_STATES:
             self._fail(i, NO_HEARTBEAT)
 
-    def _get_consumer_heartbeat(self, drive: EmulatedDrive) -> tuple[int, int]:
+    def _get_consumer_heartbeat(self, drive: EmulatedCia402Drive) -> tuple[int, int]:
         """Return the node whose heartbeats a drive monitors, and the timeout in ms; 0 if it does not monitor them."""
         value = drive.objects.get(_get_address(CONSUMER_HEARTBEAT))
         return value >> 16 & 0x7F, value & 0xFFFF
 
-    def _fail(self, i: int, error: Emergency) -> None:
+    def _fail(self, i: int, error: EmergencyMessage) -> None:
         drive = self.drives[i]
         drive.state = PowerState.FAULT
         drive.error = error
@@ -349,18 +349,18 @@ class EmulatedCia402(CanEmulator):
         joint = self._joints[i]
         gear = joint.drive.gear
         scaling = drive.scaling
-        mode = Mode.PASSIVE
+        mode = JointMode.PASSIVE
         target = 0.0
         match drive.state:
             case PowerState.ENABLED:
-                mode = DRIVE_MODES.get(_read_signed(drive, MODE), Mode.PASSIVE)
+                mode = DRIVE_MODES.get(_read_signed(drive, MODE), JointMode.PASSIVE)
                 target = self._read_target(drive, mode)
             case PowerState.QUICK_STOP:
-                mode = Mode.VELOCITY
+                mode = JointMode.VELOCITY
             case _:
                 pass
         damping = joint.motor.damping_nm_s_per_rad
-        if mode == Mode.VELOCITY:
+        if mode == JointMode.VELOCITY:
             damping = joint.motor.velocity_gain_nm_s_per_rad
         max_speed = drive.objects.get(_get_address(MAX_SPEED))
         self.body.drive_motor(
@@ -373,27 +373,27 @@ class EmulatedCia402(CanEmulator):
             speed_rad_s=max_speed / self._settings.max_speed_units_per_turn_s * REVOLUTION_RAD,
         )
 
-    def _read_target(self, drive: EmulatedDrive, mode: Mode) -> float:
+    def _read_target(self, drive: EmulatedCia402Drive, mode: JointMode) -> float:
         """Return the target of a mode in rad, rad/s or N·m. Positions end at the software position limits."""
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 position = _read_signed(drive, TARGET_POSITION)
                 low = _read_signed(drive, MIN_POSITION)
                 high = _read_signed(drive, MAX_POSITION)
                 if low < high:
                     position = min(max(position, low), high)
                 return drive.scaling.to_angle_rad(position)
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 return drive.scaling.to_velocity_rad_s(_read_signed(drive, TARGET_VELOCITY))
-            case Mode.TORQUE:
+            case JointMode.TORQUE:
                 return drive.scaling.to_torque_nm(_read_signed(drive, TARGET_TORQUE))
             case _:
                 return 0.0
 
 
 def make_saved_values(
-    joint: Joint, mounted: MountedCia402, scaling: Scaling, max_speed_units_per_turn_s: float
-) -> dict[Entry, int]:
+    joint: Joint, mounted: MountedCia402, scaling: UnitScaling, max_speed_units_per_turn_s: float
+) -> dict[ObjectEntry, int]:
     """Return the values in the nonvolatile memory of a drive: what its joint needs, unless `mounted` overrides it.
 
     Args:
@@ -426,9 +426,9 @@ def make_saved_values(
     }
 
 
-def _get_address(entry: Entry) -> Address:
+def _get_address(entry: ObjectEntry) -> Address:
     return entry.index, entry.sub
 
 
-def _read_signed(drive: EmulatedDrive, entry: Entry) -> int:
+def _read_signed(drive: EmulatedCia402Drive, entry: ObjectEntry) -> int:
     return entry.decode(drive.objects.get(_get_address(entry)).to_bytes(entry.size, "little"))

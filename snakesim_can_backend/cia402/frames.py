@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
 
-from snakesim_can_backend.cia402.objects import Entry
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.cia402.objects import ObjectEntry
+from snakesim_can_backend.protocol.definitions import CanFrame
 
 FIRST_NODE = 1
 LAST_NODE = 127
@@ -18,7 +18,7 @@ NODE_MASK = 0x7F
 SYNC_ID = 0x080
 
 
-class Function(IntEnum):
+class FunctionCode(IntEnum):
     """Function codes: the id of a frame without its node."""
 
     NMT = 0x000
@@ -37,8 +37,18 @@ class Function(IntEnum):
     HEARTBEAT = 0x700
 
 
-TRANSMIT_PDOS = (Function.TRANSMIT_PDO_1, Function.TRANSMIT_PDO_2, Function.TRANSMIT_PDO_3, Function.TRANSMIT_PDO_4)
-RECEIVE_PDOS = (Function.RECEIVE_PDO_1, Function.RECEIVE_PDO_2, Function.RECEIVE_PDO_3, Function.RECEIVE_PDO_4)
+TRANSMIT_PDOS = (
+    FunctionCode.TRANSMIT_PDO_1,
+    FunctionCode.TRANSMIT_PDO_2,
+    FunctionCode.TRANSMIT_PDO_3,
+    FunctionCode.TRANSMIT_PDO_4,
+)
+RECEIVE_PDOS = (
+    FunctionCode.RECEIVE_PDO_1,
+    FunctionCode.RECEIVE_PDO_2,
+    FunctionCode.RECEIVE_PDO_3,
+    FunctionCode.RECEIVE_PDO_4,
+)
 
 
 class NmtCommand(IntEnum):
@@ -131,45 +141,45 @@ class SdoFrame:
 
 
 @dataclass(frozen=True)
-class Emergency:
+class EmergencyMessage:
     """An emergency message (EMCY)."""
 
     code: int  # 0: the error is gone
     register: int
 
 
-def split_id(frame: Frame) -> tuple[int, int]:
+def split_id(frame: CanFrame) -> tuple[int, int]:
     """Return the function code and the node of a frame."""
     return frame.id & ~NODE_MASK, frame.id & NODE_MASK
 
 
-def encode_nmt(command: NmtCommand, node: int) -> Frame:
+def encode_nmt(command: NmtCommand, node: int) -> CanFrame:
     """Return an NMT command to a node; node 0 means all."""
-    return Frame(Function.NMT, bytes([command, node]))
+    return CanFrame(FunctionCode.NMT, bytes([command, node]))
 
 
-def encode_heartbeat(node: int, state: NmtState) -> Frame:
+def encode_heartbeat(node: int, state: NmtState) -> CanFrame:
     """Return a heartbeat; with the state `BOOT_UP` it is the boot-up message."""
-    return Frame(Function.HEARTBEAT | node, bytes([state]))
+    return CanFrame(FunctionCode.HEARTBEAT | node, bytes([state]))
 
 
-def encode_emergency(node: int, emergency: Emergency) -> Frame:
+def encode_emergency(node: int, emergency: EmergencyMessage) -> CanFrame:
     """Return an emergency message."""
-    return Frame(Function.EMERGENCY | node, EMERGENCY_LAYOUT.pack(emergency.code, emergency.register, b""))
+    return CanFrame(FunctionCode.EMERGENCY | node, EMERGENCY_LAYOUT.pack(emergency.code, emergency.register, b""))
 
 
-def decode_emergency(data: bytes) -> Emergency:
+def decode_emergency(data: bytes) -> EmergencyMessage:
     """Return an emergency message. Raises struct.error if its length is wrong."""
     code, register, _ = EMERGENCY_LAYOUT.unpack(data)
-    return Emergency(code, register)
+    return EmergencyMessage(code, register)
 
 
-def encode_read(entry: Entry) -> bytes:
+def encode_read(entry: ObjectEntry) -> bytes:
     """Return the request to read an entry."""
     return SDO_HEADER.pack(UPLOAD_REQUEST << 5, entry.index, entry.sub).ljust(8, b"\0")
 
 
-def encode_write(entry: Entry, value: int) -> bytes:
+def encode_write(entry: ObjectEntry, value: int) -> bytes:
     """Return the request to write an entry. Raises struct.error if the value does not fit."""
     return _encode_expedited(DOWNLOAD_REQUEST, entry.index, entry.sub, entry.encode(value))
 

@@ -16,12 +16,12 @@ from snakesim_can_backend.cia402.objects import (
     RATED_CURRENT,
     RATED_TORQUE,
     SUPPORTED_MODES,
-    Entry,
+    ObjectEntry,
 )
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_can_backend.cia402.state_machine import OperationMode
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 REVOLUTION_RAD = 2 * math.pi  # rad
 THOUSANDTHS = 1000  # torques are thousandths of the rated torque
@@ -30,10 +30,10 @@ INT16 = (-(2**15), 2**15 - 1)
 INT32 = (-(2**31), 2**31 - 1)
 UINT16_MAX = 2**16 - 1
 MODES = {
-    Mode.POSITION: OperationMode.CYCLIC_POSITION,
-    Mode.VELOCITY: OperationMode.CYCLIC_VELOCITY,
-    Mode.TORQUE: OperationMode.CYCLIC_TORQUE,
-    Mode.PASSIVE: OperationMode.CYCLIC_TORQUE,
+    JointMode.POSITION: OperationMode.CYCLIC_POSITION,
+    JointMode.VELOCITY: OperationMode.CYCLIC_VELOCITY,
+    JointMode.TORQUE: OperationMode.CYCLIC_TORQUE,
+    JointMode.PASSIVE: OperationMode.CYCLIC_TORQUE,
 }
 MODE_NAMES = {
     OperationMode.CYCLIC_POSITION: "cyclic synchronous position (CSP)",
@@ -41,11 +41,11 @@ MODE_NAMES = {
     OperationMode.CYCLIC_TORQUE: "cyclic synchronous torque (CST)",
 }
 
-EntryValues = Mapping[Entry, int]  # that a drive has reported; entries that it does not have are missing
+EntryValues = Mapping[ObjectEntry, int]  # that a drive has reported; entries that it does not have are missing
 
 
 @dataclass(frozen=True)
-class Scaling:
+class UnitScaling:
     """Units of a drive at its shaft."""
 
     counts_per_turn: float
@@ -82,7 +82,7 @@ class Scaling:
         return thousandths / THOUSANDTHS * self.rated_torque_nm
 
 
-def determine_scaling(values: EntryValues, settings: Cia402Settings, joint: Joint) -> Scaling | str:
+def determine_scaling(values: EntryValues, settings: Cia402Settings, joint: Joint) -> UnitScaling | str:
     """Determine the units of a drive from its reported values and the settings.
 
     Args:
@@ -105,11 +105,11 @@ def determine_scaling(values: EntryValues, settings: Cia402Settings, joint: Join
             f"does not report its rated torque ({RATED_TORQUE.address}), nor its rated current with a "
             f"`torque_constant_nm_per_a` in the robot file: set `backends.cia402.rated_torque_nm`"
         )
-    return Scaling(counts, settings.velocity_units_per_turn_s or counts, rated_torque_nm)
+    return UnitScaling(counts, settings.velocity_units_per_turn_s or counts, rated_torque_nm)
 
 
 def find_incompatibilities(
-    values: EntryValues, scaling: Scaling, settings: Cia402Settings, joint: Joint
+    values: EntryValues, scaling: UnitScaling, settings: Cia402Settings, joint: Joint
 ) -> Iterator[str]:
     """Yield a text for each mode, unit or limit of a drive that does not suit its joint.
 
@@ -155,7 +155,7 @@ def _find_mode_problems(values: EntryValues, joint: Joint) -> Iterator[str]:
     if profile != DS402:
         yield f"has the device profile {profile}, and this driver knows {DS402} ({DEVICE_TYPE.address})"
     required_modes = [OperationMode.CYCLIC_TORQUE]  # of passive joints
-    required_modes += [MODES[Mode[name.upper()]] for name in joint.drive.modes]
+    required_modes += [MODES[JointMode[name.upper()]] for name in joint.drive.modes]
     for mode in sorted(set(required_modes)):
         if not values[SUPPORTED_MODES] >> (mode - 1) & 1:
             yield f"does not support mode {mode:d}, {MODE_NAMES[mode]} ({SUPPORTED_MODES.address})"
@@ -184,7 +184,7 @@ def _find_unit_problems(values: EntryValues, settings: Cia402Settings, joint: Jo
         )
 
 
-def _find_position_limit_problems(values: EntryValues, scaling: Scaling, joint: Joint) -> Iterator[str]:
+def _find_position_limit_problems(values: EntryValues, scaling: UnitScaling, joint: Joint) -> Iterator[str]:
     """Yield position limits that stop the drive within the range of its joint. Equal ones mean that there are none."""
     if MIN_POSITION not in values or MAX_POSITION not in values:
         return

@@ -6,7 +6,7 @@ It supports expedited transfers only. What its objects do is in `emulator`.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from snakesim_can_backend.cia402.eds import READABLE, WRITABLE, Eds, EdsObject
+from snakesim_can_backend.cia402.eds import READABLE, WRITABLE, EdsFile, EdsObject
 from snakesim_can_backend.cia402.frames import (
     DOWNLOAD_REQUEST,
     UPLOAD_REQUEST,
@@ -57,10 +57,10 @@ class SdoAbortError(Exception):
 
 
 @dataclass
-class Node:
+class Cia402Node:
     """One node. Values are whole numbers without a sign, as they are sent."""
 
-    eds: Eds
+    eds: EdsFile
     node: int
     on_write: Callable[[Address, int], None]  # gets every value that a host has written
     compute_live_value: Callable[

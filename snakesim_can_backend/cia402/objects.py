@@ -11,7 +11,7 @@ from typing import Literal
 
 
 @dataclass(frozen=True)
-class Entry:
+class ObjectEntry:
     """One entry of an object dictionary."""
 
     index: int
@@ -42,46 +42,46 @@ class Entry:
 
 
 # Communication, CiA 301.
-DEVICE_TYPE = Entry(0x1000, 0, "I", "device type")  # its low 16 bits are the number of the profile
-VENDOR_ID = Entry(0x1018, 1, "I", "vendor")
-PRODUCT_CODE = Entry(0x1018, 2, "I", "product code")
-REVISION = Entry(0x1018, 3, "I", "revision")  # major and minor number, 16 bits each
-SERIAL = Entry(0x1018, 4, "I", "serial number")
-CONSUMER_HEARTBEAT = Entry(0x1016, 1, "I", "consumer heartbeat time")  # node << 16 | ms
-PRODUCER_HEARTBEAT = Entry(0x1017, 0, "H", "producer heartbeat time")  # ms
-ERROR_BEHAVIOR = Entry(0x1029, 1, "B", "error behavior")  # 1: no change of the NMT state
-ERROR_REGISTER = Entry(0x1001, 0, "B", "error register")
+DEVICE_TYPE = ObjectEntry(0x1000, 0, "I", "device type")  # its low 16 bits are the number of the profile
+VENDOR_ID = ObjectEntry(0x1018, 1, "I", "vendor")
+PRODUCT_CODE = ObjectEntry(0x1018, 2, "I", "product code")
+REVISION = ObjectEntry(0x1018, 3, "I", "revision")  # major and minor number, 16 bits each
+SERIAL = ObjectEntry(0x1018, 4, "I", "serial number")
+CONSUMER_HEARTBEAT = ObjectEntry(0x1016, 1, "I", "consumer heartbeat time")  # node << 16 | ms
+PRODUCER_HEARTBEAT = ObjectEntry(0x1017, 0, "H", "producer heartbeat time")  # ms
+ERROR_BEHAVIOR = ObjectEntry(0x1029, 1, "B", "error behavior")  # 1: no change of the NMT state
+ERROR_REGISTER = ObjectEntry(0x1001, 0, "B", "error register")
 
 # The state machine, CiA 402.
-ABORT_CONNECTION_OPTION_CODE = Entry(0x6007, 0, "h", "abort connection option code")  # 1: fault
-ERROR_CODE = Entry(0x603F, 0, "H", "error code")
-CONTROLWORD = Entry(0x6040, 0, "H", "controlword")
-STATUSWORD = Entry(0x6041, 0, "H", "statusword")
-QUICK_STOP_OPTION = Entry(0x605A, 0, "h", "quick stop option code")  # 0: off, 2: quick stop ramp, then off
-FAULT_REACTION = Entry(0x605E, 0, "h", "fault reaction option code")  # 0: off
-MODE = Entry(0x6060, 0, "b", "modes of operation")
-MODE_DISPLAY = Entry(0x6061, 0, "b", "modes of operation display")
-SUPPORTED_MODES = Entry(0x6502, 0, "I", "supported drive modes")
+ABORT_CONNECTION_OPTION_CODE = ObjectEntry(0x6007, 0, "h", "abort connection option code")  # 1: fault
+ERROR_CODE = ObjectEntry(0x603F, 0, "H", "error code")
+CONTROLWORD = ObjectEntry(0x6040, 0, "H", "controlword")
+STATUSWORD = ObjectEntry(0x6041, 0, "H", "statusword")
+QUICK_STOP_OPTION = ObjectEntry(0x605A, 0, "h", "quick stop option code")  # 0: off, 2: quick stop ramp, then off
+FAULT_REACTION = ObjectEntry(0x605E, 0, "h", "fault reaction option code")  # 0: off
+MODE = ObjectEntry(0x6060, 0, "b", "modes of operation")
+MODE_DISPLAY = ObjectEntry(0x6061, 0, "b", "modes of operation display")
+SUPPORTED_MODES = ObjectEntry(0x6502, 0, "I", "supported drive modes")
 
 # Motion.
-POSITION = Entry(0x6064, 0, "i", "position actual value")  # position units
-VELOCITY = Entry(0x606C, 0, "i", "velocity actual value")  # velocity units
-TARGET_TORQUE = Entry(0x6071, 0, "h", "target torque")  # 0.1 % of the rated torque
-MAX_TORQUE = Entry(0x6072, 0, "H", "max torque")  # 0.1 % of the rated torque
-RATED_CURRENT = Entry(0x6075, 0, "I", "motor rated current")  # mA
-RATED_TORQUE = Entry(0x6076, 0, "I", "motor rated torque")  # mN·m
-TORQUE = Entry(0x6077, 0, "h", "torque actual value")  # 0.1 % of the rated torque
-CURRENT = Entry(0x6078, 0, "h", "current actual value")  # 0.1 % of the rated current
-VOLTAGE = Entry(0x6079, 0, "I", "DC link circuit voltage")  # mV
-TARGET_POSITION = Entry(0x607A, 0, "i", "target position")  # position units
-MIN_POSITION = Entry(0x607D, 1, "i", "min software position limit")  # position units
-MAX_POSITION = Entry(0x607D, 2, "i", "max software position limit")  # position units
-MAX_SPEED = Entry(0x6080, 0, "I", "max motor speed")  # rpm, where the vendor does not differ
-ENCODER_INCREMENTS = Entry(0x608F, 1, "I", "encoder increments")
-ENCODER_REVOLUTIONS = Entry(0x608F, 2, "I", "motor revolutions")
-CYCLE_VALUE = Entry(0x60C2, 1, "B", "interpolation time period value")
-CYCLE_INDEX = Entry(0x60C2, 2, "b", "interpolation time index")  # exponent of 10, in seconds
-TARGET_VELOCITY = Entry(0x60FF, 0, "i", "target velocity")  # velocity units
+POSITION = ObjectEntry(0x6064, 0, "i", "position actual value")  # position units
+VELOCITY = ObjectEntry(0x606C, 0, "i", "velocity actual value")  # velocity units
+TARGET_TORQUE = ObjectEntry(0x6071, 0, "h", "target torque")  # 0.1 % of the rated torque
+MAX_TORQUE = ObjectEntry(0x6072, 0, "H", "max torque")  # 0.1 % of the rated torque
+RATED_CURRENT = ObjectEntry(0x6075, 0, "I", "motor rated current")  # mA
+RATED_TORQUE = ObjectEntry(0x6076, 0, "I", "motor rated torque")  # mN·m
+TORQUE = ObjectEntry(0x6077, 0, "h", "torque actual value")  # 0.1 % of the rated torque
+CURRENT = ObjectEntry(0x6078, 0, "h", "current actual value")  # 0.1 % of the rated current
+VOLTAGE = ObjectEntry(0x6079, 0, "I", "DC link circuit voltage")  # mV
+TARGET_POSITION = ObjectEntry(0x607A, 0, "i", "target position")  # position units
+MIN_POSITION = ObjectEntry(0x607D, 1, "i", "min software position limit")  # position units
+MAX_POSITION = ObjectEntry(0x607D, 2, "i", "max software position limit")  # position units
+MAX_SPEED = ObjectEntry(0x6080, 0, "I", "max motor speed")  # rpm, where the vendor does not differ
+ENCODER_INCREMENTS = ObjectEntry(0x608F, 1, "I", "encoder increments")
+ENCODER_REVOLUTIONS = ObjectEntry(0x608F, 2, "I", "motor revolutions")
+CYCLE_VALUE = ObjectEntry(0x60C2, 1, "B", "interpolation time period value")
+CYCLE_INDEX = ObjectEntry(0x60C2, 2, "b", "interpolation time index")  # exponent of 10, in seconds
+TARGET_VELOCITY = ObjectEntry(0x60FF, 0, "i", "target velocity")  # velocity units
 
 DS402 = 402  # the number of the profile in `DEVICE_TYPE`
 SYNCHRONOUS = 1  # transmission type: with every SYNC
@@ -97,7 +97,7 @@ class Pdo:
 
     direction: Literal["receive", "transmit"]  # as the drive sees it
     number: int  # 1 to 4
-    entries: tuple[Entry, ...]
+    entries: tuple[ObjectEntry, ...]
 
     @property
     def base(self) -> int:
@@ -117,18 +117,20 @@ class Pdo:
         """The values as bytes."""
         return struct.Struct("<" + "".join(entry.format for entry in self.entries))
 
-    def cob_id_entry(self) -> Entry:
+    def cob_id_entry(self) -> ObjectEntry:
         """Return the entry with the id of its frames."""
-        return Entry(self._communication_index, 1, "I", f"COB-ID of the {self.direction} PDO {self.number}")
+        return ObjectEntry(self._communication_index, 1, "I", f"COB-ID of the {self.direction} PDO {self.number}")
 
-    def transmission_entry(self) -> Entry:
+    def transmission_entry(self) -> ObjectEntry:
         """Return the entry with its transmission type."""
-        return Entry(self._communication_index, 2, "B", f"transmission type of the {self.direction} PDO {self.number}")
+        return ObjectEntry(
+            self._communication_index, 2, "B", f"transmission type of the {self.direction} PDO {self.number}"
+        )
 
-    def mapping_entry(self, sub: int) -> Entry:
+    def mapping_entry(self, sub: int) -> ObjectEntry:
         """Return an entry of its mapping. sub: 0 for the number of entries, and from 1 on the entries."""
         format_ = "I" if sub else "B"
-        return Entry(self._mapping_index, sub, format_, f"mapping of the {self.direction} PDO {self.number}")
+        return ObjectEntry(self._mapping_index, sub, format_, f"mapping of the {self.direction} PDO {self.number}")
 
     @property
     def _communication_index(self) -> int:
@@ -141,7 +143,7 @@ class Pdo:
         return first + self.number - 1
 
 
-def encode_mapping(entry: Entry) -> int:
+def encode_mapping(entry: ObjectEntry) -> int:
     """Return an entry as a PDO mapping names it: index, subindex, length in bits."""
     return entry.index << 16 | entry.sub << 8 | 8 * entry.size
 

@@ -11,7 +11,7 @@ from snakesim_can_backend.cia402.frames import (
     FIRST_NODE,
     LAST_NODE,
     UPLOAD_RESPONSE,
-    Function,
+    FunctionCode,
     decode_sdo,
     encode_read,
     split_id,
@@ -26,10 +26,10 @@ from snakesim_can_backend.cia402.objects import (
     STATUSWORD,
     SUPPORTED_MODES,
     VENDOR_ID,
-    Entry,
+    ObjectEntry,
 )
 from snakesim_can_backend.cia402.state_machine import OperationMode, decode_statusword
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.terminal import align_columns, print_json, print_line
 
 OK, FAILED = 0, 1
@@ -43,7 +43,7 @@ MODE_LABELS = {
     OperationMode.CYCLIC_TORQUE: "CST",
 }
 
-Values = dict[Entry, set[int]]  # several values of one entry come from several nodes with one id
+Values = dict[ObjectEntry, set[int]]  # several values of one entry come from several nodes with one id
 
 
 def scan_channels(arguments: argparse.Namespace) -> int:
@@ -89,7 +89,7 @@ def read_nodes(wire: Wire) -> dict[int, Values]:
     nodes: Iterable[int] = range(FIRST_NODE, LAST_NODE + 1)
     for entry in SCANNED_ENTRIES:
         for node in nodes:
-            wire.send(Frame(Function.SDO_REQUEST | node, encode_read(entry)))
+            wire.send(CanFrame(FunctionCode.SDO_REQUEST | node, encode_read(entry)))
         _receive_values(wire, entry, values_by_node)
         nodes = list(values_by_node)  # only those that have the first entry are asked for the others
     return values_by_node
@@ -126,7 +126,7 @@ def make_scan_row(channel: str, node: int, values: Values) -> dict[str, str]:
     return row
 
 
-def _receive_values(wire: Wire, entry: Entry, values_by_node: dict[int, Values]) -> None:
+def _receive_values(wire: Wire, entry: ObjectEntry, values_by_node: dict[int, Values]) -> None:
     """Receive the responses to requests for an entry until a timeout, and store their values by node."""
     deadline_s = time.monotonic() + RESPONSE_TIMEOUT_S
     while True:
@@ -135,7 +135,7 @@ def _receive_values(wire: Wire, entry: Entry, values_by_node: dict[int, Values])
             return
         for frame in wire.receive():
             function, node = split_id(frame)
-            if function != Function.SDO_RESPONSE:
+            if function != FunctionCode.SDO_RESPONSE:
                 continue
             try:
                 response = decode_sdo(frame.data)

@@ -14,46 +14,46 @@ from snakesim_can_backend.cia402.frames import (
     encode_read,
     encode_write,
 )
-from snakesim_can_backend.cia402.objects import Entry
+from snakesim_can_backend.cia402.objects import ObjectEntry
 
 REPEAT_PERIOD_NS = 100_000_000  # after which a request without an answer is sent again
 ALL_BITS = 0xFFFF_FFFF
 
 
 @dataclass(frozen=True)
-class Read:
+class ReadStep:
     """Read an entry, and perhaps check its value."""
 
-    entry: Entry
+    entry: ObjectEntry
     expected: int | None = None  # None: any value
     mask: int = ALL_BITS  # the bits that are compared
     optional: bool = False  # True: a drive without this entry is no failure
 
 
 @dataclass(frozen=True)
-class Write:
+class WriteStep:
     """Write an entry."""
 
-    entry: Entry
+    entry: ObjectEntry
     value: int
     optional: bool = False  # True: a drive that refuses it is no failure
 
 
 @dataclass(frozen=True)
-class Nmt:
+class NmtStep:
     """Send an NMT command, which has no answer."""
 
     command: NmtCommand
 
 
-Step = Read | Write | Nmt
+Step = ReadStep | WriteStep | NmtStep
 
 
 @dataclass(frozen=True)
-class StepResult:
+class SdoStepResult:
     """The response of a drive to a step."""
 
-    step: Read | Write
+    step: ReadStep | WriteStep
     value: int | None = None  # value that was read; None after a write or an abort
     abort: int = 0  # abort code with which the drive refused the step; 0: it did not
 
@@ -67,9 +67,9 @@ class StepResult:
         if self.abort:
             if self.step.optional:
                 return ""
-            verb = "read" if isinstance(self.step, Read) else "written"
+            verb = "read" if isinstance(self.step, ReadStep) else "written"
             return f"{entry.name} ({entry.address}) cannot be {verb}: {describe_abort(self.abort)}"
-        if not isinstance(self.step, Read) or self.step.expected is None or self.value is None:
+        if not isinstance(self.step, ReadStep) or self.step.expected is None or self.value is None:
             return ""
         mask = self.step.mask
         if self.value & mask == self.step.expected & mask:
@@ -87,7 +87,7 @@ class SdoQueue:
         self,
         send_request: Callable[[bytes], object],
         send_nmt: Callable[[NmtCommand], object],
-        on_result: Callable[[StepResult], None],
+        on_result: Callable[[SdoStepResult], None],
         now_ns: Callable[[], int],
     ) -> None:
         """Create an empty queue of steps for one drive.
@@ -103,7 +103,7 @@ class SdoQueue:
         self._on_result = on_result
         self._now_ns = now_ns
         self._steps: deque[Step] = deque()
-        self._current_step: Read | Write | None = None
+        self._current_step: ReadStep | WriteStep | None = None
         self._last_sent_ns = 0
 
     @property
@@ -147,11 +147,11 @@ class SdoQueue:
             return
         match step:
             case _ if response.kind == ABORT:
-                result = StepResult(step, abort=response.abort)
-            case Read() if response.kind == UPLOAD_RESPONSE:
-                result = StepResult(step, value=step.entry.decode(response.data))
-            case Write() if response.kind == DOWNLOAD_RESPONSE:
-                result = StepResult(step)
+                result = SdoStepResult(step, abort=response.abort)
+            case ReadStep() if response.kind == UPLOAD_RESPONSE:
+                result = SdoStepResult(step, value=step.entry.decode(response.data))
+            case WriteStep() if response.kind == DOWNLOAD_RESPONSE:
+                result = SdoStepResult(step)
             case _:
                 return
         self._current_step = None
@@ -162,16 +162,16 @@ class SdoQueue:
         while self._current_step is None and self._steps:
             step = self._steps.popleft()
             match step:
-                case Nmt():
+                case NmtStep():
                     self._send_nmt(step.command)
-                case Read() | Write():
+                case ReadStep() | WriteStep():
                     self._current_step = step
                     self._send(step)
 
-    def _send(self, step: Read | Write) -> None:
+    def _send(self, step: ReadStep | WriteStep) -> None:
         self._last_sent_ns = self._now_ns()
         match step:
-            case Read():
+            case ReadStep():
                 self._send_request(encode_read(step.entry))
-            case Write():
+            case WriteStep():
                 self._send_request(encode_write(step.entry, step.value))

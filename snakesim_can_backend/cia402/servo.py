@@ -3,14 +3,14 @@
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-from snakesim_can_backend.cia402.frames import Emergency, describe_error, describe_register
-from snakesim_can_backend.cia402.limits import Scaling
-from snakesim_can_backend.cia402.objects import CURRENT, RATED_CURRENT, VOLTAGE, Entry
+from snakesim_can_backend.cia402.frames import EmergencyMessage, describe_error, describe_register
+from snakesim_can_backend.cia402.limits import UnitScaling
+from snakesim_can_backend.cia402.objects import CURRENT, RATED_CURRENT, VOLTAGE, ObjectEntry
 from snakesim_can_backend.cia402.sdo import SdoQueue
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_can_backend.cia402.state_machine import (
     FAULT_STATES,
-    Control,
+    ControlwordCommand,
     OperationMode,
     PowerState,
     choose_next_controlword,
@@ -21,12 +21,12 @@ from snakesim_can_backend.cia402.state_machine import (
 Phase = Literal["unknown", "booting", "configuring", "ready"]
 
 # Objects of emulated drives alone, in the range of vendors.
-EMULATED_MOTOR_TEMPERATURE = Entry(0x2031, 1, "h", "temperature of the motor")
-EMULATED_BOARD_TEMPERATURE = Entry(0x2031, 2, "h", "temperature of the electronics")
+EMULATED_MOTOR_TEMPERATURE = ObjectEntry(0x2031, 1, "h", "temperature of the motor")
+EMULATED_BOARD_TEMPERATURE = ObjectEntry(0x2031, 2, "h", "temperature of the electronics")
 
 
 @dataclass
-class Servo:
+class Cia402Drive:
     """One drive."""
 
     queue: SdoQueue
@@ -34,19 +34,19 @@ class Servo:
     phase_start_ns: int = 0  # when the phase began
     failure: str = ""  # why it cannot be identified or configured
     # What the drive reports in bring-up.
-    values: dict[Entry, int] = field(default_factory=dict[Entry, int])
-    unread_entries: set[Entry] = field(default_factory=set[Entry])  # entries that bring-up still waits for
-    scaling: Scaling | None = None
+    values: dict[ObjectEntry, int] = field(default_factory=dict[ObjectEntry, int])
+    unread_entries: set[ObjectEntry] = field(default_factory=set[ObjectEntry])  # entries that bring-up still waits for
+    scaling: UnitScaling | None = None
     # What it reports later.
     state: PowerState = PowerState.UNKNOWN
     mode: int = 0  # of operation
     error_code: int = 0
-    emergency: Emergency | None = None  # the last one, until the drive reports that the error is gone
+    emergency: EmergencyMessage | None = None  # the last one, until the drive reports that the error is gone
     last_heartbeat_ns: int = 0  # when the last one arrived
     pre_operational_heartbeats: int = 0  # in a row
     position: int | None = None  # since the last SYNC
     velocity: int | None = None  # since the last SYNC
-    health: dict[Entry, int] = field(default_factory=dict[Entry, int])
+    health: dict[ObjectEntry, int] = field(default_factory=dict[ObjectEntry, int])
     # What the driver does with it.
     is_enabling: bool = False  # towards Operation enabled
     was_enabled: bool = False  # there, since it was switched off last: from then on it gets no further steps
@@ -65,7 +65,7 @@ class Servo:
             return describe_error(self.error_code)
         return "a fault without an error code"
 
-    def choose_controlword(self, target_mode: OperationMode) -> Control:
+    def choose_controlword(self, target_mode: OperationMode) -> ControlwordCommand:
         """Return the controlword for a drive that should be enabled.
 
         A drive that has left Operation enabled by itself stays off.
@@ -74,15 +74,15 @@ class Servo:
             target_mode: Operation mode of the setpoint. The drive is enabled only once it reports this mode.
         """
         if self.state == PowerState.ENABLED:
-            return Control.ENABLE_OPERATION
+            return ControlwordCommand.ENABLE_OPERATION
         if not self.is_enabling:
-            return Control.DISABLE_VOLTAGE
+            return ControlwordCommand.DISABLE_VOLTAGE
         if self.state == PowerState.SWITCHED_ON and self.mode != target_mode:
-            return Control.SWITCH_ON
+            return ControlwordCommand.SWITCH_ON
         return choose_next_controlword(self.state)
 
 
-class Health(NamedTuple):
+class DriveHealth(NamedTuple):
     """Supply and temperatures of a drive."""
 
     voltage_v: float
@@ -95,17 +95,17 @@ class Health(NamedTuple):
 class HealthObjects:
     """The objects with supply and temperatures; the latter are a vendor's own."""
 
-    motor: Entry | None  # temperature; None: it is unknown
-    board: Entry | None  # temperature; None: that of the motor is used
+    motor: ObjectEntry | None  # temperature; None: it is unknown
+    board: ObjectEntry | None  # temperature; None: that of the motor is used
     unit_c: float  # of both temperatures
 
     @property
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[ObjectEntry]:
         """The entries to read, each once."""
         temperatures = [entry for entry in (self.motor, self.board) if entry is not None]
         return list(dict.fromkeys([VOLTAGE, CURRENT, *temperatures]))
 
-    def convert(self, servo: Servo) -> Health | None:
+    def convert(self, servo: Cia402Drive) -> DriveHealth | None:
         """Return the health that a drive has reported; None if something of it is unknown."""
         health = servo.health
         if self.motor is None or self.motor not in health or VOLTAGE not in health or CURRENT not in health:
@@ -115,7 +115,7 @@ class HealthObjects:
         board_c = motor_c
         if self.board is not None and self.board in health:
             board_c = health[self.board] * self.unit_c
-        return Health(health[VOLTAGE] / 1000, health[CURRENT] / 1000 * rated_current_a, motor_c, board_c)
+        return DriveHealth(health[VOLTAGE] / 1000, health[CURRENT] / 1000 * rated_current_a, motor_c, board_c)
 
 
 def make_health_objects(settings: Cia402Settings, *, uses_bundled_eds: bool) -> HealthObjects:
@@ -133,9 +133,9 @@ def make_health_objects(settings: Cia402Settings, *, uses_bundled_eds: bool) -> 
     return HealthObjects(motor, board, settings.temperature_unit_c)
 
 
-def _parse_temperature(text: str | None) -> Entry | None:
+def _parse_temperature(text: str | None) -> ObjectEntry | None:
     """Return the entry of INDEX:SUBINDEX, in which the index is hexadecimal."""
     if text is None:
         return None
     index, _, sub = text.partition(":")
-    return Entry(int(index, 16), int(sub), "h", "temperature")
+    return ObjectEntry(int(index, 16), int(sub), "h", "temperature")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveSettings
-from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.mounted import MountedDrive
 
 Units = Annotated[float, Meta(gt=0, le=1e9, extra_json_schema={"unit": "1/turn"})]
 SpeedUnits = Annotated[float, Meta(gt=0, le=1e9, extra_json_schema={"unit": "1/(turn/s)"})]
@@ -15,7 +15,7 @@ Temperature = Annotated[str, Meta(pattern="^[0-9A-Fa-f]{4}:[0-9]{1,3}$")]
 Counts = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
 
 
-class MountedCia402(Mounted, frozen=True, kw_only=True):
+class MountedCia402(MountedDrive, frozen=True, kw_only=True):
     """How an emulated drive is mounted and configured, where that is not what the robot file needs."""
 
     max_torque_nm: RatedTorque | None = None

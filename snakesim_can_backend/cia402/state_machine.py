@@ -35,7 +35,7 @@ class PowerState(StrEnum):
 FAULT_STATES = (PowerState.FAULT_REACTION, PowerState.FAULT)
 
 
-class Control(IntEnum):
+class ControlwordCommand(IntEnum):
     """Commands in the controlword."""
 
     DISABLE_VOLTAGE = 0x00
@@ -84,17 +84,17 @@ def decode_statusword(word: int) -> PowerState:
             return PowerState.UNKNOWN
 
 
-def choose_next_controlword(state: PowerState) -> Control:
+def choose_next_controlword(state: PowerState) -> ControlwordCommand:
     """Return the controlword command that leads a drive one step towards Operation enabled."""
     match state:
         case PowerState.SWITCH_ON_DISABLED:
-            return Control.SHUTDOWN
+            return ControlwordCommand.SHUTDOWN
         case PowerState.READY:
-            return Control.SWITCH_ON
+            return ControlwordCommand.SWITCH_ON
         case PowerState.SWITCHED_ON | PowerState.ENABLED:
-            return Control.ENABLE_OPERATION
+            return ControlwordCommand.ENABLE_OPERATION
         case _:
-            return Control.DISABLE_VOLTAGE
+            return ControlwordCommand.DISABLE_VOLTAGE
 
 
 def apply_controlword(state: PowerState, word: int, previous_word: int) -> PowerState:
@@ -106,7 +106,7 @@ def apply_controlword(state: PowerState, word: int, previous_word: int) -> Power
         previous_word: Last controlword before it: a fault is reset when the reset bit changes from 0 to 1.
     """
     if state == PowerState.FAULT:
-        is_reset = bool(word & ~previous_word & Control.FAULT_RESET)
+        is_reset = bool(word & ~previous_word & ControlwordCommand.FAULT_RESET)
         return PowerState.SWITCH_ON_DISABLED if is_reset else state
     if state in (PowerState.FAULT_REACTION, PowerState.NOT_READY):
         return state

@@ -9,7 +9,7 @@ from snakesim_can_backend.driver.sensors import SampleBuilder, describe_sensors
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import validate_mounting_overrides
 from snakesim_drivers.kit.drive_backend import DriveBackend, DriveBackendParts, DriverClock
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import make_receiver, validate_pose_settings
 from snakesim_hal.backend import Samples
@@ -99,7 +99,7 @@ class CanBackend(DriveBackend):
     def _make_samples(self, tick: int, timestamp_ns: int) -> Samples:
         return self._sample_builder.make_samples(tick, timestamp_ns)
 
-    def _find_silent_drives(self) -> list[Finding]:
+    def _find_silent_drives(self) -> list[FaultFinding]:
         return []  # the monitor finds silent modules, by their answers to Syncs
 
     def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:

@@ -14,8 +14,8 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
     PROTOCOL_VERSION,
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleParameter,
     Opcode,
     ParameterOperation,
@@ -54,7 +54,7 @@ class ModuleBus:
 
 
 def find_modules(
-    buses: Sequence[ModuleBus], timeout_s: float, on_frame: Callable[[Frame], None] | None = None
+    buses: Sequence[ModuleBus], timeout_s: float, on_frame: Callable[[CanFrame], None] | None = None
 ) -> list[ModuleIdentity]:
     """Request the identity of all modules until the expected ones have responded, or until a timeout.
 
@@ -94,7 +94,7 @@ def find_modules(
     return sorted(identities.values(), key=lambda identity: (identity.node, identity.channel, identity.serial))
 
 
-def _parse_identity(channel: str, frame: Frame) -> ModuleIdentity | None:
+def _parse_identity(channel: str, frame: CanFrame) -> ModuleIdentity | None:
     """Return the identity in a frame from a channel; None if the frame is another message."""
     layout = load_layouts()[Opcode.IDENTITY]
     if parse_opcode(frame.id) != Opcode.IDENTITY or len(frame.data) != layout.length:
@@ -200,7 +200,7 @@ def configure_modules(
     buses: Sequence[ModuleBus],
     new_values: Mapping[int, Mapping[ModuleParameter, float]],
     timeout_s: float,
-    on_frame: Callable[[Frame], None] | None = None,
+    on_frame: Callable[[CanFrame], None] | None = None,
 ) -> dict[int, dict[ModuleParameter, float]]:
     """Write parameters to modules, and read all others.
 
@@ -262,7 +262,7 @@ def configure_modules(
     return current_values
 
 
-def _make_request(node: int, parameter: ModuleParameter, value: float | None) -> Frame:
+def _make_request(node: int, parameter: ModuleParameter, value: float | None) -> CanFrame:
     """Return a request to write a parameter, or to read it if there is no value."""
     layout = load_layouts()[Opcode.PARAMETER_REQUEST]
     if value is None:

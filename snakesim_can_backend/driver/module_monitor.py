@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence, Set
 from snakesim_can_backend.bus.bus_errors import BUS_FAULTS, BusError
 from snakesim_can_backend.driver.reports import ModuleReports, ModuleStatus
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
-from snakesim_drivers.kit.findings import Finding, ReportedFindings
+from snakesim_drivers.kit.findings import FaultFinding, ReportedFindings
 from snakesim_hal.wire.messages import LifecycleState
 
 MIN_UNANSWERED_SYNCS = 3  # Syncs without an answer
@@ -88,7 +88,7 @@ class ModuleMonitor:
         unsent: Iterable[str] = (),
         unconfigured: Iterable[int] = (),
         isolated: Set[int] = frozenset(),
-    ) -> list[Finding]:
+    ) -> list[FaultFinding]:
         """Check all modules and buses once in a control cycle, and return the findings that are new.
 
         The counts of consecutive errors are updated, so call it exactly once in each control cycle.
@@ -139,15 +139,15 @@ class ModuleMonitor:
 
     def _make_finding(
         self, joint: int, module: ModuleStatus, what: str, cause: str, also: Sequence[str] = ()
-    ) -> Finding:
+    ) -> FaultFinding:
         """Return a finding about a module; `also` names further kinds that apply."""
         subject = f"{self._joint_names[joint]} (node {module.node} on {self._channels[joint]})"
         concerns_only_this_joint = ROBOT_FAULT_KINDS.isdisjoint((what, *also))
-        return Finding(what, f"{subject} {cause}", joint, affects_only_joint=concerns_only_this_joint)
+        return FaultFinding(what, f"{subject} {cause}", joint, affects_only_joint=concerns_only_this_joint)
 
-    def _find_frame_faults(self, joint: int, module: ModuleStatus, module_reports: ModuleReports) -> list[Finding]:
+    def _find_frame_faults(self, joint: int, module: ModuleStatus, module_reports: ModuleReports) -> list[FaultFinding]:
         """Return findings about the frames of a module, or about their absence."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
 
         def report(what: str, cause: str) -> None:
             findings.append(self._make_finding(joint, module, what, cause))
@@ -206,7 +206,7 @@ class ModuleMonitor:
         lifecycle: LifecycleState,
         *,
         isolated: bool,
-    ) -> list[Finding]:
+    ) -> list[FaultFinding]:
         """Return a finding if the module reports a fault, or does not follow the robot's arming."""
         # An emergency stop is no reason to report a module that had no fault before it.
         stopped_on_command = lifecycle == "estop" and module.state == ModuleState.EMERGENCY and not module.faults
@@ -221,7 +221,7 @@ class ModuleMonitor:
         cause = f"does not arm: it is {state}"
         return [self._make_finding(joint, module, "module_not_armed", cause, [NEVER_ARMED])]
 
-    def _make_fault_finding(self, joint: int, module: ModuleStatus) -> Finding:
+    def _make_fault_finding(self, joint: int, module: ModuleStatus) -> FaultFinding:
         """Return the finding about a module that is in a latched state."""
         state = module.state.name.lower()
         faults = module.fault_names()
@@ -266,15 +266,15 @@ class ModuleMonitor:
         needed_syncs = 1 if fell_back else MIN_CONSECUTIVE_ERRORS
         return self._unarmed_sync_counts[joint] >= needed_syncs
 
-    def _make_unconfigured_finding(self, joint: int) -> Finding:
+    def _make_unconfigured_finding(self, joint: int) -> FaultFinding:
         cause = (
             f"{self._joint_names[joint]} has not accepted its parameters, and is not armed; reset, or power-cycle it"
         )
-        return Finding("module_not_configured", cause, joint)
+        return FaultFinding("module_not_configured", cause, joint)
 
     # --- the buses --------------------------------------------------------------------------------------------
 
-    def _find_bus_faults(self, errors: Iterable[BusError], unsent: set[str]) -> list[Finding]:
+    def _find_bus_faults(self, errors: Iterable[BusError], unsent: set[str]) -> list[FaultFinding]:
         """Return findings about bus errors, and about buses that have rejected frames for several cycles.
 
         Args:
@@ -282,7 +282,7 @@ class ModuleMonitor:
                 `minor_error_counts`.
             unsent: Channels of the buses that rejected a frame in this cycle.
         """
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for error in errors:
             if error.kind == "interface_down":
                 self._down_channels.add(error.channel)
@@ -292,7 +292,7 @@ class ModuleMonitor:
             if suggestion is None:
                 self.minor_error_counts[error.kind] = self.minor_error_counts.get(error.kind, 0) + 1
             else:
-                findings.append(Finding(error.kind, f"{error.channel}: {error.detail}; {suggestion}"))
+                findings.append(FaultFinding(error.kind, f"{error.channel}: {error.detail}; {suggestion}"))
         # Consecutive cycles are counted: a bus that sent everything in this cycle begins at 0 again. So does one whose
         # interface is down, which is a finding of its own.
         self._rejecting_cycle_count_by_channel = {
@@ -304,15 +304,15 @@ class ModuleMonitor:
                 findings.append(self._make_stuck_bus_finding(channel))
         return findings
 
-    def _make_stuck_bus_finding(self, channel: str) -> Finding:
+    def _make_stuck_bus_finding(self, channel: str) -> FaultFinding:
         duration_ms = 1000 * MIN_CONSECUTIVE_ERRORS * self._period_s
         cause = (
             f"{channel}: no frames sent for {duration_ms:.0f} ms, its transmit queue stays "
             f"full: no node acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
         )
-        return Finding("bus_stuck", cause)
+        return FaultFinding("bus_stuck", cause)
 
-    def _find_unknown_nodes(self, module_reports: ModuleReports) -> list[Finding]:
+    def _find_unknown_nodes(self, module_reports: ModuleReports) -> list[FaultFinding]:
         """Return a finding for each node on the bus that is no joint of this robot.
 
         One frame may be a transmission error, so a node is reported only after MIN_UNKNOWN_NODE_FRAMES frames. A
@@ -326,13 +326,15 @@ class ModuleMonitor:
             frame_count_by_node[node] = self._unknown_node_frames.get(node, 0) + new_frames
         self._unknown_node_frames = frame_count_by_node  # without the nodes that sent no frame in this cycle
 
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for node, frames in frame_count_by_node.items():
             if frames >= MIN_UNKNOWN_NODE_FRAMES:
-                findings.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
+                findings.append(
+                    FaultFinding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot")
+                )
         return findings
 
-    def _find_other_host(self, module_reports: ModuleReports) -> list[Finding]:
+    def _find_other_host(self, module_reports: ModuleReports) -> list[FaultFinding]:
         """Return findings about frames that only a host sends and that this driver did not send.
 
         An Emergency may come from any node. Every other frame of a host shows that a second program commands the
@@ -341,13 +343,13 @@ class ModuleMonitor:
         Args:
             module_reports: Reports of the modules, with the frames of other hosts in this cycle, by opcode.
         """
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         frame_count_by_opcode = module_reports.other_host_frame_counts
         if frame_count_by_opcode[Opcode.EMERGENCY]:
-            findings.append(Finding("emergency", "a node on the bus sent an Emergency"))
+            findings.append(FaultFinding("emergency", "a node on the bus sent an Emergency"))
         if frame_count_by_opcode.keys() - {Opcode.EMERGENCY}:
             cause = "another program commands the modules on this bus; end one of the two"
-            findings.append(Finding("second_host", cause))
+            findings.append(FaultFinding("second_host", cause))
             self._changed_joints |= set(range(len(module_reports.modules)))
         return findings
 

@@ -21,14 +21,14 @@ from snakesim_can_backend.driver.parameters import plan_parameters, validate_rat
 from snakesim_can_backend.driver.reports import ModuleReports, ModuleStatus
 from snakesim_can_backend.driver.sensors import are_contacts_due
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState
+from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drives import BusCommand, Drives
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import LifecycleState
 
@@ -249,7 +249,7 @@ class JointModules(Drives):
             else:  # the queue is full or the interface down: the next setpoint replaces this one
                 self._rejecting_channels.append(wire.channel)
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return the new faults that modules and buses report, or that the monitor detects."""
         errors = [error for wire in self.wires for error in wire.errors()]
         findings = self.monitor.find_faults(
@@ -275,7 +275,7 @@ class JointModules(Drives):
                 raise BackendError(ended)
         self._receive()
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end an injected fault of a bus or of an emulated module of this driver.
 
         Returns:
@@ -394,7 +394,7 @@ class JointModules(Drives):
             for frame in wire.receive():
                 process_frame(frame)
 
-    def _make_lockstep_queries(self) -> list[tuple[Wire, Frame]]:
+    def _make_lockstep_queries(self) -> list[tuple[Wire, CanFrame]]:
         """Return one query for each bus of emulators in lockstep, to be sent after the next Sync.
 
         Some reports come only at some Syncs, so that a missing one might still be on its way. Once a query is answered,
@@ -402,7 +402,7 @@ class JointModules(Drives):
         """
         if self._emulator_process is None or not self._lockstep:
             return []
-        queries: dict[str, tuple[Wire, Frame]] = {}
+        queries: dict[str, tuple[Wire, CanFrame]] = {}
         for module, wire in zip(self.module_reports.modules, self._wire_by_joint, strict=True):
             answered_newest_sync = module.sync >= 0 and module.sync == self.module_reports.sync
             if answered_newest_sync:
@@ -414,7 +414,7 @@ class JointModules(Drives):
     def _send_command(self, action: CommandAction, joint: int) -> None:
         self._wire_by_joint[joint].send(commands.make_command(action, joint + 1))
 
-    def _broadcast(self, frame: Frame) -> None:
+    def _broadcast(self, frame: CanFrame) -> None:
         """Send a frame to all buses; an error of one does not prevent sending on the others."""
         failure: BackendError | None = None
         for wire in self.wires:

@@ -17,10 +17,10 @@ from snakesim_can_backend.bus.unknown_frames import guess_frame_origin, is_joint
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.driver.sensors import are_contacts_due, to_joint_values
 from snakesim_can_backend.protocol.codec import load_layouts
-from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode, parse_opcode
-from snakesim_drivers.mounting import Mounting
+from snakesim_can_backend.protocol.definitions import FROM_HOST, CanFrame, Opcode, parse_opcode
+from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.run_log.black_box import Layout
+from snakesim_hal.run_log.black_box import RowLayout
 
 SYNC_BYTES = load_layouts()[Opcode.SYNC].length
 SYNC_COUNT_MASK = 0xFF  # the first byte of a Sync is the lowest 8 bits of its number
@@ -31,7 +31,7 @@ QUANTITIES = ("angle_rad", "velocity_rad_s", "torque_nm")
 class LogReplay:
     """Reads a log frame by frame as the driver reads a bus, and collects the joint states of every Sync."""
 
-    def __init__(self, mounting: Mounting, schedule: ReportSchedule, answer_limit_s: float) -> None:
+    def __init__(self, mounting: DriveMounting, schedule: ReportSchedule, answer_limit_s: float) -> None:
         """Prepare to read the log of a bus as the driver would have read the bus.
 
         Args:
@@ -80,14 +80,14 @@ class LogReplay:
         is_standard_data_frame = not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
         if not is_standard_data_frame:
             return
-        frame = Frame(message.arbitration_id, bytes(message.data))
+        frame = CanFrame(message.arbitration_id, bytes(message.data))
         opcode = parse_opcode(frame.id)
         if opcode not in FROM_HOST:
             self.reports.process_frame(frame)
         elif opcode == Opcode.SYNC and len(frame.data) == SYNC_BYTES:
             self._begin_sync(frame, time_s)
 
-    def _begin_sync(self, frame: Frame, time_s: float) -> None:
+    def _begin_sync(self, frame: CanFrame, time_s: float) -> None:
         """Begin the tick of a Sync, and end the one before. A Sync is on every bus, and counts once.
 
         Args:
@@ -120,7 +120,7 @@ class ReplayComparison:
     first_wrong: str  # the first difference, as text; empty: all values are equal to the bit
 
 
-def compare_with_run_log(replay: LogReplay, layout: Layout, rows: dict[str, Floats]) -> ReplayComparison:
+def compare_with_run_log(replay: LogReplay, layout: RowLayout, rows: dict[str, Floats]) -> ReplayComparison:
     """Compare the joint states that were replayed from a bus log with those of every tick in the run log.
 
     Args:

@@ -15,7 +15,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.base.terminal import print_stderr
-from snakesim_hal.model.fault_kinds import FAULT_KINDS, Injection
+from snakesim_hal.model.fault_kinds import FAULT_KINDS, FaultInjection
 from snakesim_hal.model.fault_plan import validate_faults_for_backend
 from snakesim_hal.model.scenario import RunConfig, write_config
 from snakesim_hal.service import SERVICE_START_LIMIT_S
@@ -79,7 +79,7 @@ def validate_fault_plan(config: RunConfig, settings: CanSettings) -> None:
     validate_faults_for_backend(config, supported_kinds=supported, buses=max(len(settings.channels), 1), reason=reason)
 
 
-def supports_fault(injection: Injection, joints: int) -> bool:
+def supports_fault(injection: FaultInjection, joints: int) -> bool:
     """Return whether emulated joint modules support a fault. Raises ConfigError for an unknown joint."""
     from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS, validate_fault
 
@@ -177,7 +177,7 @@ class EmulatorProcess:
             return None
         return f"the emulated joint modules have ended, with exit code {code}"
 
-    def inject(self, fault: Injection, *, begins: bool) -> None:
+    def inject(self, fault: FaultInjection, *, begins: bool) -> None:
         """Start or end a fault of a module. Raises BackendError if the child has ended."""
         from snakesim_can_backend.emulator.faults import format_typed_fault
 

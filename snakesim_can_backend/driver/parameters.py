@@ -7,7 +7,7 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import ModuleParameter, Opcode, SafeMotion
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.joints import Drive, Joint
+from snakesim_hal.model.joints import Joint, JointDrive
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
@@ -120,7 +120,7 @@ def _validate_protocol_ranges(robot: RobotFile, joint: Joint) -> None:
     """Raise ConfigError if a limit of a joint exceeds the range of the bus protocol."""
     for key, value, max_value, unit in _list_limits_at_shaft(joint):
         if value > max_value:
-            has_default_drive = joint.drive == Drive()
+            has_default_drive = joint.drive == JointDrive()
             place = "" if has_default_drive else " at the module's shaft, by `gear` and `zero_rad`,"
             raise ConfigError(
                 f"robot {robot.name!r}, {joint.name}: `{key}` = {value} {unit}{place} exceeds the range of the "

@@ -17,8 +17,8 @@ from snakesim_can_backend.protocol.definitions import (
     FROM_HOST,
     MAX_UPTIME_MS,
     UPTIME_RANGE_MS,
+    CanFrame,
     CommandAction,
-    Frame,
     LastStop,
     ModuleFault,
     ModuleState,
@@ -202,7 +202,7 @@ class ModuleReports:
         self.unknown_node_frame_counts.clear()
         self.other_host_frame_counts.clear()
 
-    def process_frame(self, frame: Frame) -> None:
+    def process_frame(self, frame: CanFrame) -> None:
         """Store the report in one received frame, or count the frame if it is none of this robot's."""
         known = self._handlers.get(frame.id)
         if known is None:
@@ -215,7 +215,7 @@ class ModuleReports:
         else:
             self.malformed += 1
 
-    def _count_other_frame(self, frame: Frame) -> None:
+    def _count_other_frame(self, frame: CanFrame) -> None:
         opcode = parse_opcode(frame.id)
         node = parse_node(frame.id)
         if opcode in FROM_HOST:
@@ -227,7 +227,7 @@ class ModuleReports:
             self.modules[node - 1].frame_count += 1
             self.answers_missing -= opcode == Opcode.PARAMETER_ANSWER
 
-    def _is_identify(self, frame: Frame) -> bool:
+    def _is_identify(self, frame: CanFrame) -> bool:
         """Return whether a frame of another host only requests the identity of modules, which disturbs nothing."""
         if parse_opcode(frame.id) != Opcode.COMMAND or len(frame.data) != self._command_length:
             return False
@@ -272,7 +272,7 @@ class ModuleReports:
 
     # --- one kind of frame each -------------------------------------------------------------------------------
 
-    def _handle_joint_state(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_joint_state(self, module: ModuleStatus, frame: CanFrame) -> None:
         """Store the joint state that a module has sent, if its checksum and its count are valid.
 
         The count is the number of the Sync to which the module responds, modulo COUNTER_MODULUS. A response to an older
@@ -324,10 +324,10 @@ class ModuleReports:
             module.double_answers = 1
         module.double_answer_sync = self.sync
 
-    def _handle_contact(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_contact(self, module: ModuleStatus, frame: CanFrame) -> None:
         self._store_contact(module, module.node, frame.data)
 
-    def _handle_tail_contact(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_tail_contact(self, module: ModuleStatus, frame: CanFrame) -> None:
         self._store_contact(module, module.node - 1, frame.data)
 
     def _store_contact(self, module: ModuleStatus, link: int, data: bytes) -> None:
@@ -338,7 +338,7 @@ class ModuleReports:
             self._contacts[link] = data if touched else NO_CONTACT
             self.contacts_missing -= module.is_awaited
 
-    def _handle_heartbeat(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_heartbeat(self, module: ModuleStatus, frame: CanFrame) -> None:
         state, last_stop, uptime_ms, *fault_bits = self._read_heartbeat(frame.data)
         self._update_uptime(module, uptime_ms)
         module.heartbeat_sync = self.sync
@@ -355,17 +355,17 @@ class ModuleReports:
         module.previous_uptime_ms = module.uptime_ms
         module.uptime_ms = uptime_ms
 
-    def _handle_gyro(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_gyro(self, module: ModuleStatus, frame: CanFrame) -> None:
         self._gyro[module.node - 1] = self._read_gyro(frame.data)
 
-    def _handle_acceleration(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_acceleration(self, module: ModuleStatus, frame: CanFrame) -> None:
         self._acceleration[module.node - 1] = self._read_acceleration(frame.data)
 
-    def _handle_shaft_load(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_shaft_load(self, module: ModuleStatus, frame: CanFrame) -> None:
         (torque,) = self._read_shaft_load(frame.data)
         self.shaft_raw[module.node - 1] = torque
 
-    def _handle_health(self, module: ModuleStatus, frame: Frame) -> None:
+    def _handle_health(self, module: ModuleStatus, frame: CanFrame) -> None:
         self._health[module.node - 1] = self._read_health(frame.data)
         module.health_sync = self.sync
 

@@ -13,7 +13,7 @@ from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, Opcode
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
-from snakesim_drivers.mounting import Mounting
+from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_contact_tangents
@@ -49,7 +49,7 @@ class SampleBuilder:
         self._mocap = mocap
 
         # The robot.
-        self._joint_mounting = Mounting(robot.joint_table)
+        self._joint_mounting = DriveMounting(robot.joint_table)
         self._radius_m = robot.module.radius_m
         self._lengths_m = robot.link_lengths_m
         self._min_force_n = robot.sensors.contacts.threshold_n if robot.sensors.contacts else 0.0
@@ -204,7 +204,7 @@ class SampleBuilder:
         )
 
 
-def to_joint_values(module_reports: ModuleReports, mounting: Mounting) -> Floats:
+def to_joint_values(module_reports: ModuleReports, mounting: DriveMounting) -> Floats:
     """Return the angle in rad, velocity in rad/s and torque in N·m of every joint, (3, n_joints).
 
     The modules measure at their shafts; sign, homing offset and gear lead from there to the joints.

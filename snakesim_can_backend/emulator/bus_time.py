@@ -11,7 +11,7 @@ from heapq import heappop, heappush
 from math import inf
 
 from snakesim_can_backend.bus.load import BIT_RATE, compute_max_frame_bits
-from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcode
 
 OPCODE_COUNT = 32  # an opcode has five bits
 ID_BITS = 11
@@ -22,7 +22,7 @@ MAX_WAITING_RESPONSES = 64  # that wait at once
 
 
 @dataclass(frozen=True)
-class Traffic:
+class BusTraffic:
     """Traffic of a bus up to a point in time, by opcode."""
 
     now_us: float
@@ -31,7 +31,7 @@ class Traffic:
     replaced: int  # frames that were replaced by newer ones before the bus was free
     late_us: float  # the longest that a frame waited for the bus
 
-    def load_since(self, before: "Traffic") -> float:
+    def load_since(self, before: "BusTraffic") -> float:
         """Return the load of the bus since an earlier point, as a fraction of time."""
         duration_us = self.now_us - before.now_us
         if duration_us <= 0:
@@ -55,17 +55,17 @@ class BusTime:
         ]
 
         # Frames that wait, each with the time since which it waits.
-        self._waiting_frame_by_mailbox_by_sender: dict[int, dict[int, tuple[Frame, float]]] = {}
+        self._waiting_frame_by_mailbox_by_sender: dict[int, dict[int, tuple[CanFrame, float]]] = {}
         # Heap of (id, sender, mailbox) of the first frame of every sender: the lowest id wins the arbitration.
         self._arbitration_heap: list[tuple[int, int, int]] = []
         self._response_count = 0  # frames of UNREPLACEABLE_OPCODES so far; each gets a mailbox of its own
         # The frame that a defective sender (a "babbling idiot") repeats without a pause.
-        self._babble_frame_by_sender: dict[int, Frame] = {}
+        self._babble_frame_by_sender: dict[int, CanFrame] = {}
 
         # The bus.
         self._bus_free_us = 0.0  # when the bus will be free
-        self._transmission: tuple[Frame, float] | None = None  # the frame on the bus, and its end
-        self._sent_frames: list[Frame] = []
+        self._transmission: tuple[CanFrame, float] | None = None  # the frame on the bus, and its end
+        self._sent_frames: list[CanFrame] = []
 
         # Statistics.
         self._frame_count_by_opcode = [0] * OPCODE_COUNT
@@ -73,14 +73,14 @@ class BusTime:
         self._replaced_count = 0
         self._max_wait_us = 0.0
 
-    def record_host_frame(self, frame: Frame, now_us: float) -> None:
+    def record_host_frame(self, frame: CanFrame, now_us: float) -> None:
         """Account for a frame of the host that has arrived."""
         self._advance_arbitration(now_us)
         duration_us = self.frame_duration_us_by_length[len(frame.data)]
         self._bus_free_us = min(max(self._bus_free_us, now_us) + duration_us, now_us + MAX_AHEAD_US)
         self.count_frame(frame)
 
-    def enqueue(self, sender: int, frame: Frame, now_us: float) -> None:
+    def enqueue(self, sender: int, frame: CanFrame, now_us: float) -> None:
         """Add a frame that a module wants to send; it replaces one with the same id that still waits."""
         self._advance_arbitration(now_us)
         mailboxes = self._waiting_frame_by_mailbox_by_sender.setdefault(sender, {})
@@ -94,7 +94,7 @@ class BusTime:
         if len(mailboxes) == 1:
             heappush(self._arbitration_heap, (frame.id, sender, mailbox))
 
-    def _choose_mailbox(self, frame: Frame) -> int:
+    def _choose_mailbox(self, frame: CanFrame) -> int:
         """Return the mailbox of a frame: one for each id, but another one for each frame that must not be replaced."""
         if frame.id >> NODE_BITS not in UNREPLACEABLE_OPCODES:
             return frame.id
@@ -102,7 +102,7 @@ class BusTime:
         number = self._response_count % MAX_WAITING_RESPONSES + 1
         return frame.id | number << ID_BITS
 
-    def pop_sent_frames(self, now_us: float) -> list[Frame]:
+    def pop_sent_frames(self, now_us: float) -> list[CanFrame]:
         """Return the frames that are completely sent by now, in order, each once."""
         self._advance_arbitration(now_us)
         sent = self._sent_frames
@@ -120,13 +120,13 @@ class BusTime:
         frame, since_us = self._waiting_frame_by_mailbox_by_sender[sender][mailbox]
         return max(self._bus_free_us, since_us) + self.frame_duration_us_by_length[len(frame.data)]
 
-    def count_frame(self, frame: Frame) -> None:
+    def count_frame(self, frame: CanFrame) -> None:
         """Add a frame and its time to the traffic."""
         opcode = frame.id >> NODE_BITS
         self._frame_count_by_opcode[opcode] += 1
         self._busy_us_by_opcode[opcode] += self.frame_duration_us_by_length[len(frame.data)]
 
-    def set_babbling(self, sender: int, frame: Frame | None, now_us: float) -> None:
+    def set_babbling(self, sender: int, frame: CanFrame | None, now_us: float) -> None:
         """Let a module repeat a frame as often as the bus allows, from now on; None ends that."""
         self._advance_arbitration(now_us)
         if frame is None:
@@ -135,9 +135,9 @@ class BusTime:
             self._babble_frame_by_sender[sender] = frame
             self.enqueue(sender, frame, now_us)
 
-    def traffic(self, now_us: float) -> Traffic:
+    def traffic(self, now_us: float) -> BusTraffic:
         """Return the traffic of the bus until now."""
-        return Traffic(
+        return BusTraffic(
             now_us,
             tuple(self._frame_count_by_opcode),
             tuple(self._busy_us_by_opcode),
@@ -187,7 +187,7 @@ class BusTime:
         self.count_frame(frame)
 
 
-def traffic_by_opcode(before: Traffic, after: Traffic) -> list[tuple[Opcode, int, float]]:
+def traffic_by_opcode(before: BusTraffic, after: BusTraffic) -> list[tuple[Opcode, int, float]]:
     """Return message, number of frames and fraction of time of every message that was sent between two points."""
     duration_us = max(after.now_us - before.now_us, 1.0)
     rows: list[tuple[Opcode, int, float]] = []

@@ -15,7 +15,7 @@ from zlib import crc32
 import msgspec
 
 from snakesim_can_backend.bus.load import count_joints_per_bus
-from snakesim_can_backend.emulator.bus_time import BusTime, Traffic
+from snakesim_can_backend.emulator.bus_time import BusTime, BusTraffic
 from snakesim_can_backend.emulator.faults import parse_fault
 from snakesim_can_backend.emulator.firmware import BOOT_US, ModuleFirmware
 from snakesim_can_backend.emulator.frames import LENGTHS, read_sync
@@ -25,7 +25,7 @@ from snakesim_can_backend.emulator.parameters import ParameterStore, make_factor
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     FROM_HOST,
-    Frame,
+    CanFrame,
     ModuleParameter,
     Opcode,
     parse_node,
@@ -34,13 +34,13 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import build_actual_config, build_actual_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
-from snakesim_drivers.mounting import Mounting, to_joint_target
-from snakesim_hal.model.fault_kinds import FaultTransition, Injection, InjectionPlan
+from snakesim_drivers.mounting import DriveMounting, to_joint_target
+from snakesim_hal.model.fault_kinds import FaultInjection, FaultTransition, InjectionPlan
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.motors import Motors
+from snakesim_hal.physics.motors import PowerStages
 from snakesim_hal.physics.physics_model import PhysicsModel
-from snakesim_hal.physics.thermal import Thermal
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.physics.thermal import ThermalModel
+from snakesim_hal.wire.messages import JointMode
 
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it
 THERMAL_DECIMATION = 10  # physics steps; windings heat up slowly
@@ -96,8 +96,8 @@ class ModuleChain:
 
         # The body.
         self.physics_model = physics_model
-        self.motors = Motors(build_actual_config(config, settings.mounted).robot, physics_model.step_s)
-        self.thermal = Thermal(self._joints)
+        self.motors = PowerStages(build_actual_config(config, settings.mounted).robot, physics_model.step_s)
+        self.thermal = ThermalModel(self._joints)
 
         # Time.
         self.now_us = 0.0  # module time, since the emulators were started
@@ -109,7 +109,7 @@ class ModuleChain:
 
         # Frames.
         self.refused = 0  # frames that no host sends
-        self._outgoing: list[list[Frame]] = [[] for _ in self.modules_per_bus]  # by bus, in stepped time
+        self._outgoing: list[list[CanFrame]] = [[] for _ in self.modules_per_bus]  # by bus, in stepped time
 
         # Injected faults.
         self.fault_log: list[str] = []  # each start and end of a fault
@@ -133,7 +133,7 @@ class ModuleChain:
             for joint in joints:
                 serial = crc32(f"{config.seed}:{joint + 1}".encode())
                 self._add_module(joint, channel, serial, -BOOT_US if stepped else 0.0)
-            mounting = Mounting(self._joints[first : first + count])
+            mounting = DriveMounting(self._joints[first : first + count])
             self._sensors.append(ModuleSensors(robot, physics_model, mounting, first, (config.seed, channel)))
         self._poll_modules(0.0)
 
@@ -241,7 +241,7 @@ class ModuleChain:
 
     # --- frames from the bus -------------------------------------------------------------------------------
 
-    def receive(self, channel: int, frame: Frame) -> None:
+    def receive(self, channel: int, frame: CanFrame) -> None:
         """Process a frame of the host that has arrived on a bus: pass it to the modules that it addresses.
 
         Args:
@@ -277,7 +277,7 @@ class ModuleChain:
                 self._deliver_to_slots(slots, frame)
                 self._poll_modules(self.now_us)
 
-    def pop_frames(self, channel: int) -> list[Frame]:
+    def pop_frames(self, channel: int) -> list[CanFrame]:
         """Return the frames that are on a bus by now, in the order of arbitration, each once."""
         if not self.stepped:
             return self.buses[channel].pop_sent_frames(self.now_us)
@@ -287,11 +287,11 @@ class ModuleChain:
             self.buses[channel].count_frame(frame)
         return frames
 
-    def traffic(self) -> list[Traffic]:
+    def traffic(self) -> list[BusTraffic]:
         """Return the traffic of each bus until now."""
         return [bus.traffic(self.now_us) for bus in self.buses]
 
-    def _deliver_to_slots(self, slots: Sequence[ModuleSlot], frame: Frame) -> None:
+    def _deliver_to_slots(self, slots: Sequence[ModuleSlot], frame: CanFrame) -> None:
         for slot in slots:
             slot.module.receive(frame, self.now_us)
             self._apply_module_outputs(slot)
@@ -307,7 +307,7 @@ class ModuleChain:
 
     # --- a Sync --------------------------------------------------------------------------------------------
 
-    def _receive_sync(self, channel: int, frame: Frame) -> None:
+    def _receive_sync(self, channel: int, frame: CanFrame) -> None:
         """Advance to a Sync, send the pose, and let every module of the bus respond and follow its setpoint.
 
         Responses are sent in the order of arbitration.
@@ -381,10 +381,10 @@ class ModuleChain:
         drive = slot.joint_model.drive
         gear = drive.gear
         damping = ModuleParameter.VELOCITY_GAIN
-        if demand.mode == Mode.POSITION:
+        if demand.mode == JointMode.POSITION:
             damping = ModuleParameter.DAMPING
         torque_limit_nm = inf
-        if demand.mode != Mode.PASSIVE:
+        if demand.mode != JointMode.PASSIVE:
             torque_limit_nm = min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT]) * gear
         self.motors.set_demand(
             slot.joint,
@@ -398,7 +398,7 @@ class ModuleChain:
 
     # --- injected faults -----------------------------------------------------------------------------------
 
-    def inject(self, fault: Injection, *, begins: bool = True) -> None:
+    def inject(self, fault: FaultInjection, *, begins: bool = True) -> None:
         """Start or end a fault now."""
         self._apply_fault(FaultTransition(self.now_us / 1e6, fault, begins), self.now_us)
         self._poll_modules(self.now_us)

@@ -14,7 +14,7 @@ from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation
 from snakesim_can_backend.bus.adapter import is_emulated, open_wire, validate_channels
 from snakesim_can_backend.bus.bus import Wire, wait
 from snakesim_can_backend.bus.load import count_joints_per_bus, format_bit_rate
-from snakesim_can_backend.emulator.bus_time import Traffic, traffic_by_opcode
+from snakesim_can_backend.emulator.bus_time import BusTraffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.faults import parse_fault, parse_typed_fault
 from snakesim_can_backend.emulator.server import EmulatorServer
@@ -26,7 +26,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import call_on_stop_signals, set_parent_death_signal, tune_garbage_collector
 from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.model.files import ConfigTable, decode_table
-from snakesim_hal.model.scenario import LoadedScenario, Override, load_scenario, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, LoadedScenario, load_scenario, parse_set_option
 
 TOOL = "snakesim drive emulate can"
 NO_POSE = "none"
@@ -75,7 +75,7 @@ def emulate(arguments: argparse.Namespace) -> int:
             wires.append(exit_stack.enter_context(closing(wire)))
         physics_model = make_physics_model(loaded.config, settings, "can")
         chain = ModuleChain(loaded.config, settings, physics_model, stepped=arguments.stepped, send_pose=send_pose)
-        loop = Loop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
+        loop = EmulatorLoop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
         call_on_stop_signals(loop.stop)
         tune_garbage_collector()
         print_line(f"modules ready: {module_count} on {', '.join(settings.channels)}")
@@ -87,10 +87,10 @@ def emulate(arguments: argparse.Namespace) -> int:
 
 def _load_configuration(arguments: argparse.Namespace) -> LoadedScenario:
     """Load the scenario for the backend `can`, whatever backend it runs on otherwise."""
-    overrides = [Override("backend", "can", TOOL)]
+    overrides = [KeyOverride("backend", "can", TOOL)]
     overrides += [parse_set_option(text) for text in arguments.set]
     if arguments.seed is not None:
-        overrides.append(Override("seed", arguments.seed, f"--seed {arguments.seed}"))
+        overrides.append(KeyOverride("seed", arguments.seed, f"--seed {arguments.seed}"))
     return load_scenario(arguments.scenario, overrides)
 
 
@@ -117,7 +117,7 @@ def _validate_virtual_channels(channels: Sequence[str], *, on_real_bus: bool) ->
             )
 
 
-class Loop:
+class EmulatorLoop:
     """Serves the emulators until it is stopped, and keeps statistics."""
 
     def __init__(self, server: EmulatorServer, arguments: argparse.Namespace, bit_rate: int) -> None:
@@ -182,7 +182,7 @@ class Loop:
         lines += [f"fault: {text}" for text in self._chain.fault_log]
         return lines
 
-    def _describe_traffic(self, channel: str, before: Traffic, after: Traffic) -> list[str]:
+    def _describe_traffic(self, channel: str, before: BusTraffic, after: BusTraffic) -> list[str]:
         frames = sum(after.frames) - sum(before.frames)
         load = after.load_since(before)
         lines = [
@@ -193,7 +193,7 @@ class Loop:
             lines.append(f"  {opcode.name.lower():<18}{count:8d} frames {fraction:7.2%}")
         return lines
 
-    def _print_loads(self, before: list[Traffic], now_s: float) -> list[Traffic]:
+    def _print_loads(self, before: list[BusTraffic], now_s: float) -> list[BusTraffic]:
         """Print the load of every bus since an earlier point; return the traffic until now."""
         after = self._chain.traffic()
         loads: list[str] = []

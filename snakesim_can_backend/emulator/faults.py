@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model import fault_kinds as injection
-from snakesim_hal.model.fault_kinds import FAULT_KINDS, Injection
+from snakesim_hal.model.fault_kinds import FAULT_KINDS, FaultInjection
 
 # What each kind does to a module.
 FAULT_DESCRIPTIONS: Mapping[str, str] = {
@@ -23,7 +23,7 @@ MAX_SHOWN_CHARACTERS = 40  # of a text that is too long
 TYPED_FAULT_PATTERN = re.compile(r"(?P<kind>[a-z_]+)[ :]+(?P<joint>joint_[0-9]+)(?: +(?P<off>off))?")
 
 
-def parse_fault(text: str, joints: int) -> Injection:
+def parse_fault(text: str, joints: int) -> FaultInjection:
     """Return the fault that a text describes in the notation of FORM.
 
     Args:
@@ -36,7 +36,7 @@ def parse_fault(text: str, joints: int) -> Injection:
     return validate_fault(injection.parse_injection(text), joints)
 
 
-def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[Injection, bool]:
+def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[FaultInjection, bool]:
     """Parse a fault that a person has typed in a terminal, such as `mute joint_3` or `mute joint_3 off`.
 
     Args:
@@ -62,19 +62,21 @@ def parse_typed_fault(text: str, joints: int, now_s: float) -> tuple[Injection, 
             f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {kinds}",
             code="injection/unknown-fault",
         )
-    fault = injection.validate_and_complete_injection(Injection(match["kind"], match["joint"], now_s), text.strip())
+    fault = injection.validate_and_complete_injection(
+        FaultInjection(match["kind"], match["joint"], now_s), text.strip()
+    )
     begins = match["off"] is None
     return validate_fault(fault, joints), begins
 
 
-def format_typed_fault(fault: Injection, *, begins: bool) -> str:
+def format_typed_fault(fault: FaultInjection, *, begins: bool) -> str:
     """Return the text of a fault that `parse_typed_fault` reads."""
     if begins:
         return f"{fault.kind} {fault.target}"
     return f"{fault.kind} {fault.target} off"
 
 
-def validate_fault(fault: Injection, joints: int) -> Injection:
+def validate_fault(fault: FaultInjection, joints: int) -> FaultInjection:
     """Return the same fault. Raises ConfigError if modules of a robot with this many joints do not support it."""
     if fault.target_type != "joint" or fault.kind not in FAULT_DESCRIPTIONS:
         raise ConfigError(

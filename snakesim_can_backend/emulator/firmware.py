@@ -14,7 +14,7 @@ from snakesim_can_backend.emulator.frames import (
     LENGTHS,
     TARGET_STEPS,
     TORQUE_LIMIT_STEP_NM,
-    ModuleHealth,
+    EmulatedHealth,
     ModuleReadings,
     encode_health,
     read_command,
@@ -39,8 +39,8 @@ from snakesim_can_backend.protocol.definitions import (
     MAX_UPTIME_MS,
     MAX_WRONG_COUNTS,
     PROTOCOL_VERSION,
+    CanFrame,
     CommandAction,
-    Frame,
     LastStop,
     ModuleFault,
     ModuleParameter,
@@ -51,7 +51,7 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_hal.physics.thermal import HeatLimits
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 BOOT_US = 100_000
 HEARTBEAT_US = round(HEARTBEAT_PERIOD_S * 1e6)
@@ -60,21 +60,21 @@ HEALTH_PHASES = 16  # modules send their first Health at different times, so tha
 AT_REST_RAD_S = 0.05  # a slower joint has come to rest, and STOPPING ends
 FIRMWARE_VERSION = (1, 0)  # major, minor
 IS_EMULATED = 1  # the bit of Identity that a real module does not set
-MODES = tuple(Mode)
+MODES = tuple(JointMode)
 STOP_OF_FAULT = {fault: LastStop[fault.name] for fault in ModuleFault}
 DRIVEN_STATES = (ModuleState.ARMED, ModuleState.STOPPING)
 LATCHED_STATES = (ModuleState.FAULT, ModuleState.EMERGENCY)
 
 
-class Demand(NamedTuple):
+class MotorDemand(NamedTuple):
     """What the firmware demands of its motor."""
 
-    mode: Mode
+    mode: JointMode
     target: float  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: float
 
 
-PASSIVE = Demand(Mode.PASSIVE, 0.0, 0.0)
+PASSIVE = MotorDemand(JointMode.PASSIVE, 0.0, 0.0)
 
 
 class ModuleFirmware:
@@ -111,18 +111,18 @@ class ModuleFirmware:
         self._stepped = stepped
 
         # What the caller exchanges with it.
-        self.frames: list[Frame] = []  # to send
-        self.health = ModuleHealth()  # present internal measurements
+        self.frames: list[CanFrame] = []  # to send
+        self.health = EmulatedHealth()  # present internal measurements
         self.is_hanging = False  # whether the main loop hangs, so that only the hardware still works
         self.rejected_frame_count = 0  # frames with a wrong checksum, count or length
 
-        self._last_joint_state: Frame | None = None
+        self._last_joint_state: CanFrame | None = None
         self._reset_state(now_us)
         self.last_stop = LastStop.NONE
 
     # --- frames from the bus -------------------------------------------------------------------------------
 
-    def receive(self, frame: Frame, now_us: float) -> None:
+    def receive(self, frame: CanFrame, now_us: float) -> None:
         """Process an Emergency, Command or ParameterRequest. The first two may be broadcasts.
 
         A module that boots executes only an Emergency; one that hangs ignores all frames.
@@ -169,7 +169,7 @@ class ModuleFirmware:
             case _:
                 pass
 
-    def receive_setpoint(self, frame: Frame, now_us: float) -> None:
+    def receive_setpoint(self, frame: CanFrame, now_us: float) -> None:
         """Check a setpoint for this node, and store it until the next Sync.
 
         A setpoint with a wrong length, checksum, counter or mode is rejected. MAX_WRONG_COUNTS wrong counters in a row
@@ -192,16 +192,16 @@ class ModuleFirmware:
                 self._fail(ModuleFault.STREAM, now_us)
             return
         self._wrong_counts = 0
-        if mode > Mode.TORQUE:
+        if mode > JointMode.TORQUE:
             self.rejected_frame_count += 1
             return
         if self._has_sync_since_setpoint:  # otherwise a host without Syncs would keep an old demand active for ever
             self._watchdog_fed_us = now_us
             self._has_sync_since_setpoint = False
         target = target_steps * TARGET_STEPS[mode]  # position, velocity and torque share their bits
-        if mode == Mode.POSITION:
+        if mode == JointMode.POSITION:
             target = self._clamp_angle(target)
-        self._pending_demand = Demand(MODES[mode], target, limit_steps * TORQUE_LIMIT_STEP_NM)
+        self._pending_demand = MotorDemand(MODES[mode], target, limit_steps * TORQUE_LIMIT_STEP_NM)
 
     def _is_counter_valid(self, count: int) -> bool:
         """Return whether a setpoint's counter follows the one before; a few setpoints in between may be lost."""
@@ -314,9 +314,9 @@ class ModuleFirmware:
         motor's bridge.
         """
         watchdog_end_us = self._watchdog_fed_us + self.watchdog_us
-        if self.demand.mode != Mode.PASSIVE and now_us >= watchdog_end_us:
+        if self.demand.mode != JointMode.PASSIVE and now_us >= watchdog_end_us:
             self.demand = PASSIVE
-        if self.demand.mode == Mode.PASSIVE:
+        if self.demand.mode == JointMode.PASSIVE:
             return now_us + HEARTBEAT_US
         return watchdog_end_us
 
@@ -334,7 +334,7 @@ class ModuleFirmware:
 
         # Setpoints.
         self.demand = PASSIVE
-        self._pending_demand: Demand | None = None  # followed from the next Sync on
+        self._pending_demand: MotorDemand | None = None  # followed from the next Sync on
         self._expected_count: int | None = None  # counter of the next setpoint; None: any
         self._wrong_counts = 0  # in a row
         self._sync_count = 0
@@ -348,7 +348,7 @@ class ModuleFirmware:
         self._next_health_us = now_us  # when the next Health is due
 
     def _enter_state(
-        self, state: ModuleState, now_us: float, reason: LastStop | None = None, demand: Demand = PASSIVE
+        self, state: ModuleState, now_us: float, reason: LastStop | None = None, demand: MotorDemand = PASSIVE
     ) -> None:
         """Change the state of the module, drop all setpoints, and send a heartbeat.
 
@@ -383,11 +383,11 @@ class ModuleFirmware:
             self._stopping_start_us = now_us
             self._enter_state(ModuleState.STOPPING, now_us, LastStop.STOP, self._make_stopping_demand())
 
-    def _make_stopping_demand(self) -> Demand:
+    def _make_stopping_demand(self) -> MotorDemand:
         """Return the demand while the module comes to rest in its stop mode."""
         values = self.parameters.values
         if values[ModuleParameter.STOP_MODE] == SafeMotion.DAMP:
-            return Demand(Mode.VELOCITY, 0.0, values[ModuleParameter.TORQUE_LIMIT])
+            return MotorDemand(JointMode.VELOCITY, 0.0, values[ModuleParameter.TORQUE_LIMIT])
         return PASSIVE
 
     def _clear(self, now_us: float) -> None:
@@ -430,7 +430,7 @@ class ModuleFirmware:
 
     # --- reports -------------------------------------------------------------------------------------------
 
-    def heartbeat(self, now_us: float) -> Frame:
+    def heartbeat(self, now_us: float) -> CanFrame:
         """Return the present heartbeat."""
         uptime_ms = min(round(now_us - self._boot_start_us) // 1000, MAX_UPTIME_MS)
         fault_bits = [self.faults >> fault & 1 for fault in ModuleFault]

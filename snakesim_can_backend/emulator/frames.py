@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_can_backend.protocol.codec import Signal, load_layouts
+from snakesim_can_backend.protocol.codec import FrameSignal, load_layouts
 from snakesim_can_backend.protocol.definitions import ModuleFault, Opcode
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.physics.physics_model import LinkLoad
@@ -36,7 +36,7 @@ class ModuleReadings:
 
 
 @dataclass(slots=True)
-class ModuleHealth:
+class EmulatedHealth:
     """The internal measurements of one module."""
 
     speed_rad_s: float = 0.0
@@ -47,10 +47,10 @@ class ModuleHealth:
     leak: bool = False
 
 
-class Rounder:
+class SignalRounder:
     """Converts measurements to raw numbers; for all signals that have the same step, offset and range."""
 
-    def __init__(self, signal: Signal) -> None:
+    def __init__(self, signal: FrameSignal) -> None:
         self._offset = signal.offset
         self._steps_per_unit = 1.0 / signal.scale
         self._min_raw = round((signal.low - signal.offset) / signal.scale)
@@ -89,7 +89,7 @@ def encode_contact(load: LinkLoad) -> tuple[int, int, int, int, int, int]:
     )
 
 
-def encode_health(health: ModuleHealth) -> tuple[int, int, int, int, int, int]:
+def encode_health(health: EmulatedHealth) -> tuple[int, int, int, int, int, int]:
     """Return the raw numbers of a Health report: voltage, current, two temperatures, leak, water."""
     water_percent = WET_PERCENT if health.leak else 0.0
     return (
@@ -148,8 +148,8 @@ write_identity = _layouts[Opcode.IDENTITY].make_writer(
 # --- measurements -------------------------------------------------------------------------------------------------
 
 
-def _make_rounder(opcode: Opcode, signal: str) -> Rounder:
-    return Rounder(_layouts[opcode].signals[signal])
+def _make_rounder(opcode: Opcode, signal: str) -> SignalRounder:
+    return SignalRounder(_layouts[opcode].signals[signal])
 
 
 ANGLE = _make_rounder(Opcode.JOINT_STATE, "angle")  # rad, -3.2768 to 3.2767

@@ -20,7 +20,7 @@ from snakesim_can_backend.emulator.frames import (
     ModuleReadings,
     encode_contact,
 )
-from snakesim_drivers.mounting import Mounting
+from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
@@ -31,7 +31,12 @@ class ModuleSensors:
     """Sensors of neighboring modules on one bus, with a noise generator of their own."""
 
     def __init__(
-        self, robot: RobotFile, physics_model: PhysicsModel, mounting: Mounting, first_joint: int, seed: Sequence[int]
+        self,
+        robot: RobotFile,
+        physics_model: PhysicsModel,
+        mounting: DriveMounting,
+        first_joint: int,
+        seed: Sequence[int],
     ) -> None:
         """Create the emulated sensors of the modules on one bus, with a noise generator of their own.
 

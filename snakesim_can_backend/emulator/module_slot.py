@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from snakesim_can_backend.emulator.firmware import Demand, ModuleFirmware
-from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, parse_opcode
+from snakesim_can_backend.emulator.firmware import ModuleFirmware, MotorDemand
+from snakesim_can_backend.protocol.definitions import CanFrame, Opcode, checksum, parse_opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
@@ -29,7 +29,7 @@ class ModuleSlot:
     module: ModuleFirmware
     joint_model: Joint  # the joint as it is really built
     drives: bool = True  # False: the module moves no motor, as a duplicate does not
-    driven: Demand | None = None  # the demand that was last applied to the motor
+    driven: MotorDemand | None = None  # the demand that was last applied to the motor
 
     # Injected faults.
     mute: bool = False
@@ -77,7 +77,7 @@ class ModuleSlot:
         health.board_c = board_c
         health.current_a = self.joint_model.supply.idle_a + power_w / health.voltage_v
 
-    def pop_frames(self) -> list[Frame]:
+    def pop_frames(self) -> list[CanFrame]:
         """Return the frames that the module sends, with injected faults applied; each frame once."""
         frames = self.module.frames
         if not frames:
@@ -89,7 +89,7 @@ class ModuleSlot:
             return [self._corrupt(frame) for frame in frames]
         return frames
 
-    def _corrupt(self, frame: Frame) -> Frame:
+    def _corrupt(self, frame: CanFrame) -> CanFrame:
         """Return a joint state with a wrong counter or checksum, and any other frame as it is."""
         if parse_opcode(frame.id) != Opcode.JOINT_STATE:
             return frame
@@ -101,7 +101,7 @@ class ModuleSlot:
             data[CHECKSUM_BYTE] = checksum(frame.id, bytes(data[:CHECKSUM_BYTE]))
         if self.wrong_checksum:
             data[CHECKSUM_BYTE] ^= WRONG_CHECKSUM_MASK
-        return Frame(frame.id, bytes(data))
+        return CanFrame(frame.id, bytes(data))
 
 
 def assign_node_ids(robot: RobotFile, settings: CanSettings) -> list[int]:

@@ -6,7 +6,7 @@ from struct import Struct
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
-    Frame,
+    CanFrame,
     ModuleParameter,
     Opcode,
     ParameterOperation,
@@ -53,7 +53,7 @@ class ParameterStore:
         """Load the saved values."""
         self.values = dict(self._flash)
 
-    def handle_request(self, node: int, data: bytes, is_armed: bool) -> Frame:
+    def handle_request(self, node: int, data: bytes, is_armed: bool) -> CanFrame:
         """Read, write or save a parameter as a ParameterRequest demands, and return the response.
 
         Args:

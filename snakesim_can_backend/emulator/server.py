@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 
 from snakesim_can_backend.bus.bus import VirtualWire, Wire
 from snakesim_can_backend.emulator.chain import ModuleChain
-from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_LAG_US = 2000.0  # of the physics model behind the present, so that a Sync needs little computing
@@ -62,7 +62,7 @@ class EmulatorServer:
         pause_us = min(self.chain.next_us() - self.chain.now_us, MAX_LAG_US)
         return max(pause_us, MIN_PAUSE_US) * 1e-6
 
-    def _receive_at_arrival_times(self, received: Sequence[Sequence[Frame]], clock_us: float) -> None:
+    def _receive_at_arrival_times(self, received: Sequence[Sequence[CanFrame]], clock_us: float) -> None:
         """Process received frames at their estimated times of arrival.
 
         After a delay of this process several periods are in the queue. They are spread over the time since the last
@@ -93,7 +93,7 @@ class EmulatorServer:
                     self.unsent += 1
 
 
-def _is_sync(frame: Frame) -> bool:
+def _is_sync(frame: CanFrame) -> bool:
     return frame.id >> NODE_BITS == Opcode.SYNC
 
 
@@ -109,7 +109,7 @@ class InProcessEmulators:
         """Process received frames and send due ones; return the seconds until the next run is due, None for never."""
         return self.server.run_due(self._clock_ns())
 
-    def inject(self, injection: Injection, *, begins: bool) -> None:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> None:
         """Start or end a fault of a module."""
         self.server.chain.inject(injection, begins=begins)
 

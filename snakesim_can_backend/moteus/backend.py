@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
-from snakesim_can_backend.moteus.controllers import Controllers, compute_required_gains, get_configured_gains
+from snakesim_can_backend.moteus.controllers import MoteusControllers, compute_required_gains, get_configured_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
 from snakesim_can_backend.moteus.settings import MoteusSettings
@@ -19,7 +19,7 @@ class MoteusBackend(CanDriveBackend):
     """The backend on moteus controllers, real or emulated."""
 
     Settings = MoteusSettings
-    drives_class = Controllers
+    drives_class = MoteusControllers
     emulator_class = EmulatedMoteus
     name = "moteus"
     plural_noun = "controllers"

@@ -30,10 +30,10 @@ from snakesim_can_backend.moteus.protocol import (
     split_addresses,
 )
 from snakesim_can_backend.moteus.settings import MoteusSettings
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 REVOLUTION_RAD = 2 * math.pi  # rad
 LATCHED_MODES = (MoteusMode.FAULT, MoteusMode.TIMEOUT)  # until a stop, which also clears the reason
@@ -69,7 +69,7 @@ class ShaftGains(NamedTuple):
     velocity: float  # N·m/(turn/s), velocity mode
 
 
-class Controllers(CanDrives):
+class MoteusControllers(CanDrives):
     """All controllers of a bus."""
 
     missing_identity_text = (
@@ -96,7 +96,7 @@ class Controllers(CanDrives):
 
     # --- frames that arrive -----------------------------------------------------------------------------------
 
-    def find_sender(self, frame: Frame) -> int | None:
+    def find_sender(self, frame: CanFrame) -> int | None:
         """Return the id of the sender, or None for frames to other nodes.
 
         Another host has the same id as this one. Its frames are ignored (None) unless they write (`HOST`).
@@ -107,7 +107,7 @@ class Controllers(CanDrives):
             return HOST if first_subframe_writes else None
         return source if destination == HOST_ID else None
 
-    def handle_response(self, i: int, frame: Frame) -> None:
+    def handle_response(self, i: int, frame: CanFrame) -> None:
         """Store the registers of a response. Each request reads other registers, so they identify the response."""
         registers: dict[int, float] = {}
         for subframe in decode_subframes(frame.data):
@@ -186,7 +186,7 @@ class Controllers(CanDrives):
         self._send(i, *HEALTH_REQUESTS, reply=True)
         self._send(i, SERIAL, reply=True)
 
-    def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+    def send_setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """Send a command, unless the controller was restarted or may be restarting: a command would enable it.
 
         The controller adds position, velocity and torque control; what a mode does not use gets a gain of 0.
@@ -207,14 +207,14 @@ class Controllers(CanDrives):
         kp = 0.0
         kd = 0.0
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 position = target / REVOLUTION_RAD
                 kp = gains.stiffness
                 kd = gains.damping
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 velocity = target / REVOLUTION_RAD
                 kd = gains.velocity
-            case Mode.TORQUE | Mode.PASSIVE:
+            case JointMode.TORQUE | JointMode.PASSIVE:
                 torque = target
         self._send(
             i,

@@ -25,8 +25,8 @@ from snakesim_can_backend.moteus.protocol import (
     make_frame,
     split_addresses,
 )
-from snakesim_can_backend.protocol.definitions import Frame
-from snakesim_hal.wire.messages import Mode
+from snakesim_can_backend.protocol.definitions import CanFrame
+from snakesim_hal.wire.messages import JointMode
 
 OVER_TEMPERATURE = 38  # fault number
 UPPER_SERIAL_WORDS = (0x65115510, 0x30333636)  # the same for all controllers
@@ -76,12 +76,12 @@ class EmulatedMoteus(CanEmulator):
         self.controllers = [EmulatedController(joint.id) for joint in context.body.joints]
         self._kp_nm_per_turn, self._kd_nm_s_per_turn = get_configured_gains(context.joints, context.settings)
 
-    def find_destination_node(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: CanFrame) -> int:
         """Return the destination of a frame."""
         _, destination = split_addresses(frame)
         return destination
 
-    def duplicate_frame(self, frame: Frame) -> Frame:
+    def duplicate_frame(self, frame: CanFrame) -> CanFrame:
         """Return the frame of a second controller: it has another serial number."""
         response_subframes: list[bytes] = []
         for subframe in decode_subframes(frame.data):
@@ -96,7 +96,7 @@ class EmulatedMoteus(CanEmulator):
         self.controllers[i] = EmulatedController(self.controllers[i].id)
         self._drive_motor(i)
 
-    def handle_frame(self, i: int, frame: Frame) -> None:
+    def handle_frame(self, i: int, frame: CanFrame) -> None:
         """Apply all values that a frame writes together; then send what it reads, if it requests a reply."""
         subframes = list(decode_subframes(frame.data))
         written_values: dict[int, float] = {}
@@ -225,16 +225,16 @@ class EmulatedMoteus(CanEmulator):
             controller.command[FIRST_COMMAND_REGISTER + offset] for offset in range(6)
         )
         if controller.mode != MoteusMode.POSITION:
-            mode = Mode.PASSIVE
+            mode = JointMode.PASSIVE
             target = 0.0
         elif kp:
-            mode = Mode.POSITION
+            mode = JointMode.POSITION
             target = self.body.read_shaft(i)[0] if math.isnan(position) else position * REVOLUTION_RAD
         elif kd:
-            mode = Mode.VELOCITY
+            mode = JointMode.VELOCITY
             target = velocity * REVOLUTION_RAD
         else:
-            mode = Mode.TORQUE
+            mode = JointMode.TORQUE
             target = torque
         if math.isnan(limit_nm):
             limit_nm = joint.limits.torque_nm / joint.drive.gear

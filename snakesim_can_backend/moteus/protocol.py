@@ -10,7 +10,7 @@ from enum import IntEnum
 from struct import Struct
 from typing import NamedTuple
 
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 
 HOST_ID = 0
 LAST_ID = 126
@@ -133,7 +133,7 @@ def decode_subframes(data: bytes) -> Iterator[Subframe]:
         yield Subframe(kind, type_, register, count, tuple(values))
 
 
-def make_frame(source: int, destination: int, *subframes: bytes, reply: bool = False) -> Frame:
+def make_frame(source: int, destination: int, *subframes: bytes, reply: bool = False) -> CanFrame:
     """Return a frame with these subframes, padded to a data length that CAN FD has.
 
     Args:
@@ -146,10 +146,10 @@ def make_frame(source: int, destination: int, *subframes: bytes, reply: bool = F
     length = next(length for length in CAN_FD_DATA_LENGTHS if length >= len(data))
     padded = data.ljust(length, bytes([PADDING]))
     reply_bit = REPLY_REQUESTED_BIT if reply else 0
-    return Frame(reply_bit | source << 8 | destination, padded)
+    return CanFrame(reply_bit | source << 8 | destination, padded)
 
 
-def split_addresses(frame: Frame) -> tuple[int, int]:
+def split_addresses(frame: CanFrame) -> tuple[int, int]:
     """Return source and destination of a frame."""
     return frame.id >> 8 & 0x7F, frame.id & 0x7F
 

@@ -15,7 +15,7 @@ from snakesim_can_backend.odrive.endpoints import (
     SETTING_TYPES,
     VALUE_FORMATS,
     AxisSetting,
-    Endpoints,
+    EndpointIds,
     read_all_endpoints,
 )
 from snakesim_can_backend.odrive.protocol import (
@@ -35,10 +35,10 @@ from snakesim_can_backend.odrive.protocol import (
     encode_setting_request,
     split_id,
 )
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 REVOLUTION_RAD = 2 * math.pi  # rad
 EMULATED_CONSTANT_NM_PER_A = 1.0  # torque constant of emulated axes whose robot file names none
@@ -47,17 +47,17 @@ NO_LIMIT_SENT = -1.0
 RELATIVE_TOLERANCE = 1e-3  # relative: settings are single precision, and people round them
 LEFTOVER_ERRORS = AxisError.WATCHDOG_TIMER_EXPIRED  # of a driver that was killed
 CONTROL_MODES = {
-    Mode.PASSIVE: ControlMode.TORQUE,
-    Mode.TORQUE: ControlMode.TORQUE,
-    Mode.VELOCITY: ControlMode.VELOCITY,
-    Mode.POSITION: ControlMode.POSITION,
+    JointMode.PASSIVE: ControlMode.TORQUE,
+    JointMode.TORQUE: ControlMode.TORQUE,
+    JointMode.VELOCITY: ControlMode.VELOCITY,
+    JointMode.POSITION: ControlMode.POSITION,
 }
 
 _log = logging.getLogger("snakesim.drivers")
 
 
 @dataclass
-class Axis:
+class OdriveAxis:
     """One axis: what its joint needs, what the axis is configured for, and what this driver has sent."""
 
     # What its joint needs, at the shaft.
@@ -72,11 +72,11 @@ class Axis:
     configured: dict[AxisSetting, float] = field(default_factory=dict[AxisSetting, float])  # read in bring-up
     errors: int = 0
     # What the driver has sent.
-    mode: Mode | None = None
+    mode: JointMode | None = None
     limit_nm: float = NO_LIMIT_SENT
 
 
-class Axes(CanDrives):
+class OdriveAxes(CanDrives):
     """All axes of a bus."""
 
     missing_identity_text = (
@@ -115,7 +115,7 @@ class Axes(CanDrives):
 
     # --- frames that arrive -----------------------------------------------------------------------------------
 
-    def find_sender(self, frame: Frame) -> int | None:
+    def find_sender(self, frame: CanFrame) -> int | None:
         """Return the node id of the sender, `HOST` for commands of another host, or None for requests.
 
         A request has no data. Requests of other programs are ignored, because they only read.
@@ -127,7 +127,7 @@ class Axes(CanDrives):
             return HOST if frame.data[0] == WRITE_SETTING else None
         return HOST if message_id in FROM_HOST else node
 
-    def handle_response(self, i: int, frame: Frame) -> None:
+    def handle_response(self, i: int, frame: CanFrame) -> None:
         """Store the measurements, errors, version or setting that an axis reports in a frame.
 
         Args:
@@ -216,7 +216,7 @@ class Axes(CanDrives):
         firmware = _join_version(self.firmware[i])
         if self.firmware[i][:2] != FIRMWARE:
             return f"has firmware {firmware}; this driver knows {FIRMWARE[0]}.{FIRMWARE[1]}"
-        if not self._endpoint_files:  # the limits are unknown: `Axis.max_current_a` caps the current
+        if not self._endpoint_files:  # the limits are unknown: `OdriveAxis.max_current_a` caps the current
             return ""
         if self._find_endpoints(i) is None:
             files = ", ".join(f"{file.firmware} on {file.hardware}" for file in self._endpoint_files)
@@ -231,7 +231,7 @@ class Axes(CanDrives):
         axis.max_current_a = min(axis.configured[AxisSetting.CURRENT], self._max_allowed_current_a)
         return "; ".join(find_configuration_problems(axis, self._watchdog_s))
 
-    def _find_endpoints(self, i: int) -> Endpoints | None:
+    def _find_endpoints(self, i: int) -> EndpointIds | None:
         """Return the endpoint ids of an axis' settings, or None if no file is of its firmware and hardware."""
         firmware = _join_version(self.firmware[i])
         for file in self._endpoint_files:
@@ -300,17 +300,17 @@ class Axes(CanDrives):
         """Request supply, temperatures and errors; and the serial number, to notice a second axis with this id."""
         self._request(i, MessageId.SUPPLY, MessageId.TEMPERATURE, MessageId.ERROR, MessageId.ADDRESS)
 
-    def send_setpoint(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+    def send_setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """Send the setpoint of an axis; before it the limits, and after it gains and mode, if they have changed."""
         axis = self.axes[i]
         if limit_nm != axis.limit_nm:
             self._send_limits(i, limit_nm)
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 self._send(i, MessageId.SET_POSITION, target / REVOLUTION_RAD, 0, 0)
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 self._send(i, MessageId.SET_VELOCITY, target / REVOLUTION_RAD, 0.0)
-            case Mode.TORQUE | Mode.PASSIVE:
+            case JointMode.TORQUE | JointMode.PASSIVE:
                 self._send(i, MessageId.SET_TORQUE, target)
         if mode != axis.mode:
             self._send_mode(i, mode)
@@ -334,10 +334,10 @@ class Axes(CanDrives):
         if self._send(i, MessageId.SET_LIMITS, axis.speed_limit, current_a):
             axis.limit_nm = limit_nm
 
-    def _send_mode(self, i: int, mode: Mode) -> None:
+    def _send_mode(self, i: int, mode: JointMode) -> None:
         """Send the gain and the control mode; both again in the next cycle if the bus did not accept one of them."""
         axis = self.axes[i]
-        gain = axis.damping if mode == Mode.POSITION else axis.velocity_gain
+        gain = axis.damping if mode == JointMode.POSITION else axis.velocity_gain
         gain_sent = self._send(i, MessageId.SET_VELOCITY_GAINS, gain, 0.0)
         mode_sent = self._send(i, MessageId.SET_MODE, CONTROL_MODES[mode], PASSTHROUGH)
         if gain_sent and mode_sent:
@@ -352,7 +352,7 @@ class Axes(CanDrives):
         return all(accepted)
 
 
-def make_axis(joint: Joint, max_current_a: float) -> Axis:
+def make_axis(joint: Joint, max_current_a: float) -> OdriveAxis:
     """Create the state of an axis, with the gains and limits of its joint converted to the shaft.
 
     Args:
@@ -361,7 +361,7 @@ def make_axis(joint: Joint, max_current_a: float) -> Axis:
     """
     motor = joint.motor
     gear = joint.drive.gear
-    return Axis(
+    return OdriveAxis(
         torque_constant=motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A,
         position_gain=motor.stiffness_nm_per_rad / motor.damping_nm_s_per_rad,
         damping=motor.damping_nm_s_per_rad / gear**2 * REVOLUTION_RAD,
@@ -378,7 +378,7 @@ def compute_required_current_a(joint: Joint) -> float:
     return joint.limits.torque_nm / joint.drive.gear / torque_constant_nm_per_a
 
 
-def find_configuration_problems(axis: Axis, watchdog_s: float) -> Iterator[str]:
+def find_configuration_problems(axis: OdriveAxis, watchdog_s: float) -> Iterator[str]:
     """Yield a text for each setting of an axis that does not suit its joint, with what to do about it.
 
     Each text is a predicate, such as "has its watchdog off: ...", to be put after the name of the axis. A setting that

@@ -9,7 +9,7 @@ from snakesim_can_backend.odrive.axes import (
     EMULATED_CONSTANT_NM_PER_A,
     RELATIVE_TOLERANCE,
     UNKNOWN_MAX_CURRENT_A,
-    Axes,
+    OdriveAxes,
     compute_required_current_a,
 )
 from snakesim_can_backend.odrive.emulator import HEARTBEAT_US, EmulatedOdrive
@@ -26,7 +26,7 @@ class OdriveBackend(CanDriveBackend):
     """The backend on ODrive axes, real or emulated."""
 
     Settings = OdriveSettings
-    drives_class = Axes
+    drives_class = OdriveAxes
     emulator_class = EmulatedOdrive
     name = "odrive"
     plural_noun = "axes"

@@ -31,9 +31,9 @@ from snakesim_can_backend.odrive.protocol import (
     split_id,
 )
 from snakesim_can_backend.odrive.settings import MountedAxis, OdriveSettings
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 HEARTBEAT_US = 100_000.0  # ODrive's default period
 COUNTS_PER_TURN = 16384  # of the encoder
@@ -41,9 +41,9 @@ VERSION = (2, 4, 4, 58, 0, 6, 11, 0)  # protocol, hardware (3), firmware (3), un
 FIRST_SERIAL = 0x3855_0000_0001
 DUPLICATE_SERIAL_BITS = 0x0000_0100_0000  # in which the serial number of a second axis with the same id differs
 MODE_BY_CONTROL_MODE = {
-    ControlMode.TORQUE: Mode.TORQUE,
-    ControlMode.VELOCITY: Mode.VELOCITY,
-    ControlMode.POSITION: Mode.POSITION,
+    ControlMode.TORQUE: JointMode.TORQUE,
+    ControlMode.VELOCITY: JointMode.VELOCITY,
+    ControlMode.POSITION: JointMode.POSITION,
 }
 SETPOINT_INDEX = {
     MessageId.SET_TORQUE: 0,
@@ -128,12 +128,12 @@ class EmulatedOdrive(CanEmulator):
         self._last_heartbeat_us = -math.inf
         self.on_step(0.0)
 
-    def find_destination_node(self, frame: Frame) -> int:
+    def find_destination_node(self, frame: CanFrame) -> int:
         """Return the node of a frame."""
         node, _ = split_id(frame)
         return node
 
-    def duplicate_frame(self, frame: Frame) -> Frame:
+    def duplicate_frame(self, frame: CanFrame) -> CanFrame:
         """Return the frame of a second axis: it has another serial number in its address."""
         if split_id(frame)[1] != MessageId.ADDRESS or not frame.data:
             return frame
@@ -147,7 +147,7 @@ class EmulatedOdrive(CanEmulator):
         self.axes[i] = EmulatedAxis(axis.node, axis.torque_constant, axis.saved)
         self._drive_motor(i, self.axes[i])
 
-    def handle_frame(self, i: int, frame: Frame) -> None:
+    def handle_frame(self, i: int, frame: CanFrame) -> None:
         """Send the report that a frame requests, or execute its command. Requests have no data, except for settings."""
         message_id = MessageId(split_id(frame)[1])
         axis = self.axes[i]
@@ -219,7 +219,7 @@ class EmulatedOdrive(CanEmulator):
             value = VALUE_FORMATS[SETTING_TYPES[setting]].pack(axis.read_setting(setting))
             self.send_frame(i, encode_setting_answer(axis.node, endpoint, value))
 
-    def _make_report(self, i: int, axis: EmulatedAxis, message_id: MessageId) -> Frame:
+    def _make_report(self, i: int, axis: EmulatedAxis, message_id: MessageId) -> CanFrame:
         """Return a frame in which an axis reports values of its state.
 
         Args:
@@ -268,7 +268,7 @@ class EmulatedOdrive(CanEmulator):
         control_mode = ControlMode.TORQUE
         if axis.control_mode in list(ControlMode):
             control_mode = ControlMode(axis.control_mode)
-        mode = Mode.PASSIVE
+        mode = JointMode.PASSIVE
         target = 0.0
         if axis.state == AxisState.CLOSED_LOOP:
             mode = MODE_BY_CONTROL_MODE[control_mode]

@@ -34,7 +34,7 @@ VALUE_FORMATS = {"bool": Struct("<?"), "float": Struct("<f")}
 
 
 @dataclass(frozen=True)
-class Endpoints:
+class EndpointIds:
     """Endpoint ids of one firmware on one hardware."""
 
     firmware: str  # such as 0.6.11
@@ -47,21 +47,21 @@ class Endpoints:
 
 
 # Of emulated axes. The numbers are their own: no firmware of ODrive has them.
-EMULATED = Endpoints("0.6.11", "4.4.58", {setting: 200 + i for i, setting in enumerate(AxisSetting)})
+EMULATED = EndpointIds("0.6.11", "4.4.58", {setting: 200 + i for i, setting in enumerate(AxisSetting)})
 
 
-class _Endpoint(msgspec.Struct):
+class _EndpointEntry(msgspec.Struct):
     type: str
     id: int = -1
 
 
-class _File(msgspec.Struct):
+class _EndpointFile(msgspec.Struct):
     fw_version: str
     hw_version: str
-    endpoints: dict[str, _Endpoint]
+    endpoints: dict[str, _EndpointEntry]
 
 
-def read_all_endpoints(paths: Sequence[str]) -> list[Endpoints]:
+def read_all_endpoints(paths: Sequence[str]) -> list[EndpointIds]:
     """Read all endpoint files that the scenario names.
 
     Raises:
@@ -70,7 +70,7 @@ def read_all_endpoints(paths: Sequence[str]) -> list[Endpoints]:
     return [read_endpoints(path) for path in paths]
 
 
-def read_endpoints(path: str) -> Endpoints:
+def read_endpoints(path: str) -> EndpointIds:
     """Read from a `flat_endpoints.json` of ODrive the ids of the settings that this driver uses.
 
     Args:
@@ -85,7 +85,7 @@ def read_endpoints(path: str) -> Endpoints:
     context = "`backends.odrive.endpoints`"
     suggestion = "take the flat_endpoints.json that ODrive publishes with the axes' firmware"
     try:
-        file = msgspec.json.decode(read_text(Path(path)), type=_File)
+        file = msgspec.json.decode(read_text(Path(path)), type=_EndpointFile)
     except ConfigError as error:
         raise ConfigError(f"{context}: {error}; {suggestion}", code="file/not-readable") from None
     except (msgspec.DecodeError, RecursionError) as error:
@@ -106,4 +106,4 @@ def read_endpoints(path: str) -> Endpoints:
             )
         ids[setting] = endpoint.id
     firmware = file.fw_version.partition("-")[0]  # a release may have a suffix, which axes do not report
-    return Endpoints(firmware, file.hw_version, ids)
+    return EndpointIds(firmware, file.hw_version, ids)

@@ -8,7 +8,7 @@ Written from ODrive's public documentation; tests hold it against the database t
 from enum import IntEnum, IntFlag
 from struct import Struct
 
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 
 NODE_BITS = 5
 LAST_NODE = 62
@@ -113,24 +113,24 @@ SETTERS = frozenset(message_id for message_id in MessageId if message_id.name.st
 FROM_HOST = SETTERS | {MessageId.ESTOP, MessageId.CLEAR_ERRORS}  # messages that only a host sends
 
 
-def encode_message(node: int, message_id: MessageId, *values: float | bytes) -> Frame:
+def encode_message(node: int, message_id: MessageId, *values: float | bytes) -> CanFrame:
     """Return a message of, or to, an axis."""
-    return Frame(node << NODE_BITS | message_id, PAYLOADS[message_id].pack(*values))
+    return CanFrame(node << NODE_BITS | message_id, PAYLOADS[message_id].pack(*values))
 
 
-def encode_request(node: int, message_id: MessageId) -> Frame:
+def encode_request(node: int, message_id: MessageId) -> CanFrame:
     """Return the request for a message: the message without data."""
-    return Frame(node << NODE_BITS | message_id, b"")
+    return CanFrame(node << NODE_BITS | message_id, b"")
 
 
-def encode_setting_request(node: int, endpoint: int) -> Frame:
+def encode_setting_request(node: int, endpoint: int) -> CanFrame:
     """Return the request for the setting with an endpoint id."""
-    return Frame(node << NODE_BITS | MessageId.RX_SDO, SDO_HEADER.pack(READ_SETTING, endpoint, 0))
+    return CanFrame(node << NODE_BITS | MessageId.RX_SDO, SDO_HEADER.pack(READ_SETTING, endpoint, 0))
 
 
-def encode_setting_answer(node: int, endpoint: int, value: bytes) -> Frame:
+def encode_setting_answer(node: int, endpoint: int, value: bytes) -> CanFrame:
     """Return an axis' answer to the request for a setting."""
-    return Frame(node << NODE_BITS | MessageId.TX_SDO, SDO_HEADER.pack(0, endpoint, 0) + value)
+    return CanFrame(node << NODE_BITS | MessageId.TX_SDO, SDO_HEADER.pack(0, endpoint, 0) + value)
 
 
 def decode_setting_answer(data: bytes) -> tuple[int, bytes]:
@@ -143,7 +143,7 @@ def decode_setting_answer(data: bytes) -> tuple[int, bytes]:
     return endpoint, data[SDO_HEADER.size :]
 
 
-def split_id(frame: Frame) -> tuple[int, int]:
+def split_id(frame: CanFrame) -> tuple[int, int]:
     """Return node and message number of a frame."""
     return frame.id >> NODE_BITS, frame.id & ((1 << NODE_BITS) - 1)
 

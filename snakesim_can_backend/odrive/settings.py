@@ -6,14 +6,14 @@ from typing import Annotated
 from msgspec import Meta
 
 from snakesim_can_backend.can_drives.backend import CanDriveSettings
-from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.mounted import MountedDrive
 
 Amperes = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "A"})]
 Seconds = Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})]
 TurnsPerSecond = Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "turns/s"})]
 
 
-class MountedAxis(Mounted, frozen=True, kw_only=True):
+class MountedAxis(MountedDrive, frozen=True, kw_only=True):
     """How an emulated axis is mounted and configured, where that is not what the robot file needs."""
 
     current_soft_max_a: Amperes | None = None

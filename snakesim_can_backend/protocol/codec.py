@@ -20,7 +20,7 @@ from snakesim_can_backend.protocol.definitions import (
     NODE_BITS,
     NODE_MASK,
     WITH_CHECKSUM,
-    Frame,
+    CanFrame,
     Opcode,
     checksum,
     frame_id,
@@ -34,7 +34,7 @@ FLOAT_BYTES = 4
 _single = Struct("<f")
 
 Reader = Callable[[bytes], tuple[int, ...]]  # data of a frame -> raw numbers
-Writer = Callable[[int, Sequence[int]], Frame]  # node, raw numbers -> frame
+Writer = Callable[[int, Sequence[int]], CanFrame]  # node, raw numbers -> frame
 
 
 class CodecError(SnakesimError, ValueError):
@@ -44,7 +44,7 @@ class CodecError(SnakesimError, ValueError):
 
 
 @dataclass(frozen=True)
-class Signal:
+class FrameSignal:
     """The place of a number in a frame, and its conversion: value = raw * scale + offset."""
 
     name: str
@@ -97,7 +97,7 @@ class MessageLayout:
         self.name: str = message.name
         self.opcode = Opcode(message.frame_id >> NODE_BITS)
         self.length: int = message.length  # bytes
-        self.signals: dict[str, Signal] = {signal.name: _make_signal(signal) for signal in message.signals}
+        self.signals: dict[str, FrameSignal] = {signal.name: _make_signal(signal) for signal in message.signals}
         self._has_checksum = self.opcode in WITH_CHECKSUM
         self._readers = {name: self.make_reader(name) for name in self.signals}
 
@@ -140,7 +140,7 @@ class MessageLayout:
         has_checksum = self._has_checksum
         payload_bytes = self.length - 1 if has_checksum else self.length
 
-        def write(node: int, raw: Sequence[int]) -> Frame:
+        def write(node: int, raw: Sequence[int]) -> CanFrame:
             bits = 0
             for (shift, mask), number in zip(bit_fields, raw, strict=True):
                 bits |= (number & mask) << shift
@@ -148,11 +148,11 @@ class MessageLayout:
             data = bits.to_bytes(payload_bytes, "little")
             if has_checksum:
                 data += bytes((checksum(identifier, data),))
-            return Frame(identifier, data)
+            return CanFrame(identifier, data)
 
         return write
 
-    def encode(self, node: int, **values: float) -> Frame:
+    def encode(self, node: int, **values: float) -> CanFrame:
         """Return the frame of a node with some values.
 
         Args:
@@ -203,10 +203,10 @@ def _padding_format(bits: int) -> str:
     return f"p{bits}" if bits else ""
 
 
-def _make_signal(signal: Any) -> Signal:
+def _make_signal(signal: Any) -> FrameSignal:
     if signal.byte_order != "little_endian":
         raise CodecError(f"signal {signal.name}: only little-endian signals are meant here")
-    return Signal(
+    return FrameSignal(
         name=signal.name,
         shift=signal.start,
         bits=signal.length,

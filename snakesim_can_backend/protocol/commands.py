@@ -15,16 +15,16 @@ from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     COMMAND_KEY,
     COUNTER_MODULUS,
+    CanFrame,
     CommandAction,
     EmergencyReason,
-    Frame,
     ModuleParameter,
     ModuleState,
     Opcode,
     ParameterOperation,
 )
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import JointMode, LifecycleState
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
 MAX_TARGET_RAW = 32767  # of a signed number of 16 bits; -32768 is not used, so that the range is symmetric
@@ -45,7 +45,7 @@ class SetpointWriter:
         self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; a passive joint has no target
         self._limit_steps_per_nm = 1.0 / layout.signals["torque_limit"].scale
 
-    def encode(self, modes: list[Mode], targets: Floats, limits_nm: Floats) -> list[Frame]:
+    def encode(self, modes: list[JointMode], targets: Floats, limits_nm: Floats) -> list[CanFrame]:
         """Return one frame a joint, tail to head.
 
         Args:
@@ -69,7 +69,7 @@ def _round_steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np
     return np.clip(np.rint(values), low, high).astype(np.int64)
 
 
-def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[Frame]:
+def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[CanFrame]:
     """Return the frames to all modules when the robot's lifecycle changes.
 
     The lifecycle may have passed through other states between `before` and `now`, within one control cycle.
@@ -88,7 +88,7 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     if before == "armed":
         action = CommandAction.STOP if now == "fault" else CommandAction.DISARM
         return [make_command(action)]
-    frames: list[Frame] = []
+    frames: list[CanFrame] = []
     if before in LATCHED and now not in LATCHED:
         frames.append(make_command(CommandAction.CLEAR))
     if now == "armed":
@@ -96,7 +96,7 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     return frames
 
 
-def make_repeated_command(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
+def make_repeated_command(lifecycle: LifecycleState, state: ModuleState, node: int) -> CanFrame | None:
     """Return the frame to repeat to a module in an unexpected state, because an earlier one may have been lost."""
     match lifecycle, state:
         case "armed", ModuleState.DISARMED:
@@ -108,28 +108,28 @@ def make_repeated_command(lifecycle: LifecycleState, state: ModuleState, node: i
     return None
 
 
-def is_arm_command(frame: Frame) -> bool:
+def is_arm_command(frame: CanFrame) -> bool:
     """Return whether a frame would switch the motors of all modules on."""
     return frame == make_command(CommandAction.ARM)
 
 
-def make_command(action: CommandAction, node: int = BROADCAST) -> Frame:
+def make_command(action: CommandAction, node: int = BROADCAST) -> CanFrame:
     """Return a Command to one module, or to all."""
     return load_layouts()[Opcode.COMMAND].encode(node, action=action, key=COMMAND_KEY)
 
 
-def make_query(node: int) -> Frame:
+def make_query(node: int) -> CanFrame:
     """Return a request for a constant parameter. Its answer comes after all earlier frames of the module."""
     layout = load_layouts()[Opcode.PARAMETER_REQUEST]
     return layout.encode(node, index=ModuleParameter.TAIL, operation=ParameterOperation.READ, value=0.0)
 
 
-def make_emergency() -> Frame:
+def make_emergency() -> CanFrame:
     """Return the frame that switches the motors of all modules off at once."""
     return load_layouts()[Opcode.EMERGENCY].encode(BROADCAST, reason=EmergencyReason.HOST)
 
 
-def make_sync(count: int, time_us: int) -> Frame:
+def make_sync(count: int, time_us: int) -> CanFrame:
     """Return the frame at which all modules sample their sensors and then follow their newest setpoints.
 
     Args:

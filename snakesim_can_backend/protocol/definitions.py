@@ -184,7 +184,7 @@ PARAMETERS: dict[ModuleParameter, ParameterRange] = {
 }
 
 
-class Frame(NamedTuple):
+class CanFrame(NamedTuple):
     """A data frame on the bus."""
 
     id: int
@@ -214,6 +214,6 @@ def checksum(identifier: int, data: bytes) -> int:
     return crc_hqx(data, identifier) & 0xFF
 
 
-def has_valid_checksum(frame: Frame) -> bool:
+def has_valid_checksum(frame: CanFrame) -> bool:
     """Return whether the last byte of a frame is the checksum of the others."""
     return crc_hqx(frame.data[:-1], frame.id) & 0xFF == frame.data[-1]

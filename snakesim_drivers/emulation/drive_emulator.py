@@ -13,7 +13,7 @@ from snakesim_hal.base.process import (
     tune_garbage_collector,
 )
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 
 MAX_WAIT_S = 0.001  # longest wait for frames or bytes, of drives in a process of their own
 MAX_REALTIME_BUSY_S = 0.2  # computing without a pause, after which emulated drives give up their real-time priority
@@ -102,7 +102,7 @@ class DriveEmulator(ABC, Generic[BusEndT]):
         """Simulate up to the current time."""
         self.body.advance_to(self._read_clock_us())
 
-    def inject(self, injection: Injection, *, begins: bool) -> None:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> None:
         """Start or end an injected fault of a drive.
 
         Args:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 from snakesim_drivers.emulation.shared_physics import MAX_CATCH_UP_US, SharedPhysics
 from snakesim_drivers.mounting import to_joint_target
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 BOOT_US = 500_000.0  # in which a drive that restarts neither receives nor sends; a guess
 UNDERVOLTAGE_V = 12.0  # of a supply that an injected fault lets fall
@@ -76,7 +76,14 @@ class EmulatedBody:
     # --- motor and sensors ------------------------------------------------------------------------------------
 
     def drive_motor(
-        self, i: int, mode: Mode, target: float, limit_nm: float, stiffness: float, damping: float, speed_rad_s: float
+        self,
+        i: int,
+        mode: JointMode,
+        target: float,
+        limit_nm: float,
+        stiffness: float,
+        damping: float,
+        speed_rad_s: float,
     ) -> None:
         """Set the setpoint, gains and limits of a drive's motor, all at the drive's shaft, until the next call.
 
@@ -147,7 +154,7 @@ class EmulatedBody:
         """Start to reboot a drive, which neither receives nor sends for `BOOT_US`."""
         self._shared.boot_end_us[self._joint_indices[i]] = self.now_us + BOOT_US
 
-    def inject(self, injection: Injection, *, begins: bool) -> int | None:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> int | None:
         """Start or end an injected fault of a drive.
 
         Args:

@@ -13,13 +13,13 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import (
     Backlash,
-    Drive,
     Friction,
     Gear,
     Joint,
+    JointDrive,
     JointExceptions,
+    JointMotor,
     Lag,
-    Motor,
     RotorInertia,
     Sign,
     TorqueConstant,
@@ -30,7 +30,7 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
 
-class Mounted(FileStruct, frozen=True, kw_only=True):
+class MountedDrive(FileStruct, frozen=True, kw_only=True):
     """How an emulated drive is really mounted and built, where that differs from the robot file.
 
     A driver type may add fields of its own in a subclass.
@@ -64,7 +64,7 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     """Whole backlash of the gear, between the encoder on the motor and the link. None: no backlash."""
 
 
-def build_actual_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
+def build_actual_joints(robot: RobotFile, mounted: Mapping[str, MountedDrive]) -> list[Joint]:
     """Return every joint with the drive and motor that are really mounted, from tail to head.
 
     Args:
@@ -75,13 +75,13 @@ def build_actual_joints(robot: RobotFile, mounted: Mapping[str, Mounted]) -> lis
     for i, joint in enumerate(joints):
         true_mounting = mounted.get(joint.name)
         if true_mounting is not None:
-            drive = msgspec.structs.replace(joint.drive, **_collect_overrides(true_mounting, Drive))
-            motor = msgspec.structs.replace(joint.motor, **_collect_overrides(true_mounting, Motor))
+            drive = msgspec.structs.replace(joint.drive, **_collect_overrides(true_mounting, JointDrive))
+            motor = msgspec.structs.replace(joint.motor, **_collect_overrides(true_mounting, JointMotor))
             joints[i] = dataclasses.replace(joint, drive=drive, motor=motor)
     return joints
 
 
-def build_actual_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> RunConfig:
+def build_actual_config(config: RunConfig, mounted: Mapping[str, MountedDrive]) -> RunConfig:
     """Return the configuration for the physics model that the drives move, with the motors that are really mounted.
 
     Args:
@@ -90,7 +90,7 @@ def build_actual_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> Ru
     """
     joints = dict(config.robot.joints)
     for name, true_mounting in mounted.items():
-        overrides = _collect_overrides(true_mounting, Motor)
+        overrides = _collect_overrides(true_mounting, JointMotor)
         if overrides:
             exceptions = joints.get(name, JointExceptions())
             joints[name] = msgspec.structs.replace(exceptions, **overrides)
@@ -98,15 +98,15 @@ def build_actual_config(config: RunConfig, mounted: Mapping[str, Mounted]) -> Ru
     return msgspec.structs.replace(config, robot=robot)
 
 
-def _collect_overrides(true_mounting: Mounted, section: type[Drive | Motor]) -> dict[str, Any]:
-    """Return the true values of those fields of `Drive` or `Motor` that differ from the robot file."""
-    common_fields = {*section.__struct_fields__} & {*Mounted.__struct_fields__}
+def _collect_overrides(true_mounting: MountedDrive, section: type[JointDrive | JointMotor]) -> dict[str, Any]:
+    """Return the true values of those fields of `JointDrive` or `JointMotor` that differ from the robot file."""
+    common_fields = {*section.__struct_fields__} & {*MountedDrive.__struct_fields__}
     true_values = msgspec.structs.asdict(true_mounting)
     return {field: value for field, value in true_values.items() if field in common_fields and value is not None}
 
 
 def validate_mounting_overrides(
-    robot: RobotFile, section: str, mounted: Mapping[str, Mounted], *, are_emulated: bool
+    robot: RobotFile, section: str, mounted: Mapping[str, MountedDrive], *, are_emulated: bool
 ) -> None:
     """Check the settings that override the mounting of drives in the robot file, for emulated drives.
 

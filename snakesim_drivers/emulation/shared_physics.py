@@ -6,14 +6,14 @@ from typing import Any, Protocol
 
 import msgspec
 
-from snakesim_drivers.emulation.mounted import Mounted, build_actual_config, build_actual_joints
+from snakesim_drivers.emulation.mounted import MountedDrive, build_actual_config, build_actual_joints
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_hal.model.plugins import PHYSICS_MODELS, decode_plugin_settings, load_plugin, require_base_class
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.backlash import BacklashModel, move_rotor_inertia_to_motor_side
-from snakesim_hal.physics.motors import Motors
+from snakesim_hal.physics.motors import PowerStages
 from snakesim_hal.physics.physics_model import PhysicsModel
-from snakesim_hal.physics.thermal import Thermal
+from snakesim_hal.physics.thermal import ThermalModel
 
 THERMAL_DECIMATION = 10  # physics steps from one step of the windings' heat to the next: they heat up slowly
 MAX_CATCH_UP_US = 200_000.0  # after a longer delay of this process the drives skip the rest of it
@@ -35,7 +35,7 @@ class PhysicsSettings(Protocol):
         ...
 
     @property
-    def mounted(self) -> Mapping[str, Mounted]:
+    def mounted(self) -> Mapping[str, MountedDrive]:
         """How drives are mounted in truth, where that differs from the robot file; by the joint's name."""
         ...
 
@@ -78,7 +78,7 @@ class SharedPhysics:
         self,
         config: RunConfig,
         physics_model: PhysicsModel,
-        mounted: Mapping[str, Mounted],
+        mounted: Mapping[str, MountedDrive],
         send_pose: Callable[[bytes], None] | None,
     ) -> None:
         """Create the physics at time 0, with all motors passive.
@@ -93,8 +93,8 @@ class SharedPhysics:
         # Physics.
         self.physics_model = physics_model
         self.joints = build_actual_joints(config.robot, mounted)
-        self.motors = Motors(build_actual_config(config, mounted).robot, physics_model.step_s)
-        self.thermal = Thermal(self.joints)
+        self.motors = PowerStages(build_actual_config(config, mounted).robot, physics_model.step_s)
+        self.thermal = ThermalModel(self.joints)
 
         # Time.
         self.now_us = 0.0  # since the start

@@ -7,12 +7,12 @@ long as a driver commands it, so the driver ends it by the same rule: docs/conce
 from collections.abc import Sequence
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 AT_REST_SPEED_RAD_S = 0.05  # the limit that joint modules have
 
 
-class Braking:
+class BrakingJoints:
     """The joints that still brake in a fault, by their indices in the robot."""
 
     def __init__(self, max_braking_durations_ns: Sequence[int], *, is_hold_mode: bool) -> None:
@@ -35,7 +35,7 @@ class Braking:
         self._stopped_joints.clear()
 
     def select_braking_joints(
-        self, driven_joints: frozenset[int], modes: Sequence[Mode], velocity_rad_s: Floats, now_ns: int
+        self, driven_joints: frozenset[int], modes: Sequence[JointMode], velocity_rad_s: Floats, now_ns: int
     ) -> frozenset[int]:
         """Return the joints that continue to brake in this control cycle of a fault, and remember those that are done.
 
@@ -56,7 +56,7 @@ class Braking:
         braking_duration_ns = now_ns - self._fault_start_ns
         for i in driven_joints:
             speed_rad_s = abs(float(velocity_rad_s[i]))
-            if modes[i] == Mode.PASSIVE or self._has_stopped_braking(i, speed_rad_s, braking_duration_ns):
+            if modes[i] == JointMode.PASSIVE or self._has_stopped_braking(i, speed_rad_s, braking_duration_ns):
                 self._stopped_joints.add(i)
         return driven_joints - self._stopped_joints
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from snakesim_drivers.kit.drive_guard import RESET_GRACE_CYCLES, DriveGuard
 from snakesim_drivers.kit.drives import BusCommand, Drives
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.joints import Joint
 
@@ -60,7 +60,7 @@ class InlineBus:
         self._guard = DriveGuard(
             clock_ns, watchdog_timeout_ns=max_pause_ns, reset_grace_period_ns=reset_grace_period_ns
         )
-        self._findings_after_pause: list[Finding] = []  # found after a pause, before any setpoint was sent
+        self._findings_after_pause: list[FaultFinding] = []  # found after a pause, before any setpoint was sent
 
     def start(self) -> None:
         """Prepare for control cycles. Called in each of them."""
@@ -110,7 +110,7 @@ class InlineBus:
         """Receive what has arrived."""
         self.drives.poll()
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return what is wrong with the drives and the bus.
 
         Raises:
@@ -183,7 +183,7 @@ class InlineBus:
             start_up.abort("emergency stop")
         return frozenset(i for i in command.enabled_drives if start_up.is_ready(i))
 
-    def _collect_findings(self) -> list[Finding]:
+    def _collect_findings(self) -> list[FaultFinding]:
         """Return what is wrong with the drives and the bus, and keep the concerned drives off until a reset."""
         findings = [*self._findings_after_pause, *self.drives.findings()]
         if self.drives.start_up is not None:
@@ -193,6 +193,6 @@ class InlineBus:
         return findings
 
 
-def select_bus_findings(findings: list[Finding]) -> list[Finding]:
+def select_bus_findings(findings: list[FaultFinding]) -> list[FaultFinding]:
     """Return those findings that concern the bus as a whole rather than one drive."""
     return [finding for finding in findings if finding.joint is None]

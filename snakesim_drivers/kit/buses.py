@@ -12,11 +12,11 @@ from dataclasses import replace
 from snakesim_drivers.kit.bus import BusSpec, InlineBus
 from snakesim_drivers.kit.drive_settings import compute_response_timeout_s
 from snakesim_drivers.kit.drives import BusCommand, Drives
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.kit.threaded_bus import WAIT_SLICES, ThreadedBus
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_WAIT_RESPONSE_TIMEOUTS = (
@@ -25,7 +25,7 @@ MAX_WAIT_RESPONSE_TIMEOUTS = (
 CLOSE_TIMEOUT_S = 2.0  # for all buses together, before those that hang are left
 
 
-class Buses(Drives):
+class RobotBuses(Drives):
     """All buses of a robot, as one `Drives`. Joints are numbered as in the robot."""
 
     def __init__(
@@ -126,9 +126,9 @@ class Buses(Drives):
             if joints_on_bus:
                 bus.reset_faults(joints_on_bus)
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return what is wrong on all buses, with joints numbered as in the robot."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for bus in self.buses:
             for finding in bus.findings():
                 if finding.joint is None:
@@ -142,7 +142,7 @@ class Buses(Drives):
         for bus in self.buses:
             bus.poll()
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end an injected fault of a bus, by its number in the robot, or of a drive on a bus.
 
         Returns:
@@ -191,7 +191,7 @@ class Buses(Drives):
     def _is_due(self, bus: InlineBus) -> bool:
         return self._cycle_count % bus.spec.decimation == 0
 
-    def _inject_into_bus(self, injection: Injection, *, begins: bool) -> bool:
+    def _inject_into_bus(self, injection: FaultInjection, *, begins: bool) -> bool:
         number = injection.target_index
         if not 0 <= number < len(self.buses):
             raise ConfigError(
@@ -206,7 +206,7 @@ class Buses(Drives):
         local_injection = replace(injection, target="bus_1")  # `Drives` number their own bus 1
         return bus.drives.inject(local_injection, begins=begins)
 
-    def _inject_into_drive(self, injection: Injection, *, begins: bool) -> bool:
+    def _inject_into_drive(self, injection: FaultInjection, *, begins: bool) -> bool:
         for bus in self.buses:
             if injection.target_index in bus.spec.joints:
                 local_number = bus.spec.joints.index(injection.target_index) + 1  # targets count from 1

@@ -8,14 +8,16 @@ from snakesim_hal.programs.arguments import (
     add_scenario_name_argument,
     add_set_argument,
 )
-from snakesim_hal.programs.commands import Commands, Noun
+from snakesim_hal.programs.commands import CommandGroup, Commands
 
 DRIVE_NOUNS: Commands = (
-    Noun(name="drive", heading="robot", help="Scan, emulate and examine the drives of a robot, by driver type."),
-    Noun(name="drive scan", help="List the drives that answer on a bus. It moves nothing."),
-    Noun(name="drive emulate", help="Emulate the drives of a robot, as a process on a bus."),
-    Noun(name="drive load", help="Print how much of a bus the drives of a scenario use."),
-    Noun(name="drive replay", help="Read the log of a bus as the driver does."),
+    CommandGroup(
+        name="drive", heading="robot", help="Scan, emulate and examine the drives of a robot, by driver type."
+    ),
+    CommandGroup(name="drive scan", help="List the drives that answer on a bus. It moves nothing."),
+    CommandGroup(name="drive emulate", help="Emulate the drives of a robot, as a process on a bus."),
+    CommandGroup(name="drive load", help="Print how much of a bus the drives of a scenario use."),
+    CommandGroup(name="drive replay", help="Read the log of a bus as the driver does."),
 )
 
 

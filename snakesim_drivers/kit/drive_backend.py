@@ -12,19 +12,19 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from snakesim_drivers.kit.braking import Braking
+from snakesim_drivers.kit.braking import BrakingJoints
 from snakesim_drivers.kit.drive_guard import NO_DRIVES, RESET_GRACE_CYCLES
 from snakesim_drivers.kit.drives import BusCommand, Drives
-from snakesim_drivers.kit.findings import Finding, ReportedFindings
+from snakesim_drivers.kit.findings import FaultFinding, ReportedFindings
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.robot import add_drive_identities
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Message, Mode, SensorDescription
+from snakesim_hal.wire.messages import Fault, JointMode, LifecycleState, Message, RobotDescription, SensorDescription
 
 LATCHED_STATES = ("fault", "estop")  # only the operator's reset ends them
 MIN_UNANSWERED_REQUESTS = 3  # unanswered ones: a single lost answer is no fault
@@ -97,7 +97,7 @@ class DriveBackend(Backend):
         self._tick = 0
         self._lifecycle: LifecycleState = "disarmed"
         self._driven_joints = NO_DRIVES  # joints whose drives got setpoints in the newest cycle
-        self._braking = Braking(
+        self._braking = BrakingJoints(
             [round(watchdog_s * 1e9) for watchdog_s in parts.watchdog_timeouts_s],
             is_hold_mode=config.robot.safety.action == "hold",
         )
@@ -123,7 +123,7 @@ class DriveBackend(Backend):
         description = add_drive_identities(description, self._readings.serials, self._readings.firmware)
         self._description = _mark_missing_watchdogs(description, parts.joints_without_watchdog)
 
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         """Return the robot of the robot file, with the sensors and serial numbers of its drives."""
         return self._description
 
@@ -190,7 +190,7 @@ class DriveBackend(Backend):
             try:
                 self._send_lifecycle_state("fault", self._isolated_joints)
             except BackendError as error:  # report the faults all the same; the failing bus raises in the next cycle
-                new_findings.append(Finding("stop_not_sent", str(error)))
+                new_findings.append(FaultFinding("stop_not_sent", str(error)))
             self._lifecycle = "fault"  # now, so that a reset before the next control cycle is recognized, too
         return [finding.to_fault(self._tick, self._joint_names) for finding in new_findings]
 
@@ -202,7 +202,7 @@ class DriveBackend(Backend):
                 obstacles.append(reason)
         return obstacles
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end an injected fault of a bus or of a drive that is emulated here.
 
         Returns:
@@ -236,7 +236,7 @@ class DriveBackend(Backend):
         return reconnected_joints
 
     def _select_joints_to_drive(
-        self, lifecycle: LifecycleState, connected_joints: frozenset[int], modes: Sequence[Mode]
+        self, lifecycle: LifecycleState, connected_joints: frozenset[int], modes: Sequence[JointMode]
     ) -> frozenset[int]:
         """Return the joints whose drives get setpoints in this lifecycle state, and update which joints still brake.
 
@@ -284,10 +284,10 @@ class DriveBackend(Backend):
         self._drives.reset_faults(connected_joints if was_latched else reconnected_joints)
         self._remaining_grace_cycles = self.reset_grace_cycles * self._decimation
 
-    def _collect_relevant_findings(self) -> list[Finding]:
+    def _collect_relevant_findings(self) -> list[FaultFinding]:
         """Return what is wrong now, without isolated joints and without errors that may be from before a reset."""
         findings = [*self._drives.findings(), *self._find_silent_drives()]
-        relevant: list[Finding] = []
+        relevant: list[FaultFinding] = []
         for finding in findings:
             is_known = finding.affects_only_joint and finding.joint in self._isolated_joints
             is_outdated = self._remaining_grace_cycles > 0 and finding.joint is not None
@@ -295,7 +295,7 @@ class DriveBackend(Backend):
                 relevant.append(finding)
         return relevant
 
-    def _can_isolate(self, findings: list[Finding], failed_joints: frozenset[int]) -> bool:
+    def _can_isolate(self, findings: list[FaultFinding], failed_joints: frozenset[int]) -> bool:
         """Return whether the robot may stay armed without the failed joints, which the HAL then isolates."""
         if self._lifecycle != "armed":
             return False
@@ -307,7 +307,7 @@ class DriveBackend(Backend):
         if not self._is_open:
             raise BackendError("the buses are closed; open a new backend", code="backend/closed")
 
-    def _make_description(self, config: RunConfig, name: str, hardware: str) -> Description:
+    def _make_description(self, config: RunConfig, name: str, hardware: str) -> RobotDescription:
         description = describe_run_robot(config, name, emulated=self._drives.emulated)
         pose_sensor = config.robot.sensors.pose
         pose_delay_s = None
@@ -336,14 +336,14 @@ class DriveBackend(Backend):
                 others[keys.POSE] = pose
         return Samples(self._readings.make_joint_state(tick, timestamp_ns, self._lease_ns), others)
 
-    def _find_silent_drives(self) -> list[Finding]:
+    def _find_silent_drives(self) -> list[FaultFinding]:
         """Return a finding for each drive that has left several requests unanswered."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for i, name in enumerate(self._joint_names):
             if self._readings.count_unanswered_requests(i) >= MIN_UNANSWERED_REQUESTS:
                 silent_ms = self._readings.compute_age_ns(i) * 1e-6
                 cause = f"{name}: its drive has not answered for {silent_ms:.0f} ms: power, cable, id or a restart"
-                findings.append(Finding("drive_silent", cause, i, affects_only_joint=True))
+                findings.append(FaultFinding("drive_silent", cause, i, affects_only_joint=True))
         return findings
 
     def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
@@ -364,7 +364,7 @@ class DriveBackend(Backend):
         return sensors
 
 
-def _mark_missing_watchdogs(robot: Description, joints: frozenset[int]) -> Description:
+def _mark_missing_watchdogs(robot: RobotDescription, joints: frozenset[int]) -> RobotDescription:
     """Return a description in which these joints have no watchdog."""
     noted = [
         msgspec.structs.replace(joint, watchdog=False) if i in joints else joint for i, joint in enumerate(robot.joints)

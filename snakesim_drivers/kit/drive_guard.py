@@ -6,7 +6,7 @@ happen to such a stop: a command clears it before the driver has read it, or a l
 
 from collections.abc import Callable, Iterable
 
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 
 NO_DRIVES: frozenset[int] = frozenset()
 RESET_GRACE_CYCLES = 5  # control cycles after a reset in which drives may still report errors from before it
@@ -87,7 +87,7 @@ class DriveGuard:
         self._were_drives_released |= was_enabled
         return was_enabled
 
-    def note_findings(self, findings: Iterable[Finding]) -> None:
+    def note_findings(self, findings: Iterable[FaultFinding]) -> None:
         """Note what is wrong with the drives. An enabled drive with a finding is not enabled again before a reset."""
         if self._last_reset_ns is not None and self._clock_ns() - self._last_reset_ns <= self._reset_grace_period_ns:
             return

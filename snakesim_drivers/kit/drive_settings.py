@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody
-from snakesim_drivers.emulation.mounted import Mounted, validate_mounting_overrides
+from snakesim_drivers.emulation.mounted import MountedDrive, validate_mounting_overrides
 from snakesim_drivers.emulation.shared_physics import SharedPhysics, make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_drivers.motion_capture.mocap import validate_pose_settings
@@ -34,7 +34,7 @@ class BodySettings(FileStruct, frozen=True, kw_only=True):
     physics_model_settings: dict[str, Any] = {}
     """Settings of the physics model, which checks them."""
 
-    mounted: Mapping[str, Mounted] = {}
+    mounted: Mapping[str, MountedDrive] = {}
     """For joints of emulated drives, how each is really mounted, to see what a wrong robot file does."""
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 
 DriveCommand = Literal["follow", "idle", "stop"]  # enable, disable, or the drive's own emergency stop
 
@@ -105,20 +105,20 @@ class DriveStates:
             self.drives[i].errors = ""
             self.drives[i].is_emergency_stopped = False
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return a finding for each drive that reports errors, or that is off although it should be on."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for i, drive in enumerate(self.drives):
             if drive.safe_torque_off:
                 cause = f"{drive.label}: its safe-torque-off input is active; release it, then reset and arm"
-                findings.append(Finding("safe_torque_off", cause, i))
+                findings.append(FaultFinding("safe_torque_off", cause, i))
             elif drive.errors:
                 findings.append(
-                    Finding("drive_fault", f"{drive.label} reports {drive.errors}", i, affects_only_joint=True)
+                    FaultFinding("drive_fault", f"{drive.label} reports {drive.errors}", i, affects_only_joint=True)
                 )
             elif drive.should_be_enabled and self._should_have_enabled(drive) and not drive.enabled:
                 cause = f"{drive.label} does not follow: it is {drive.state or 'in an unknown state'}"
-                findings.append(Finding("drive_not_armed", cause, i, affects_only_joint=drive.was_enabled))
+                findings.append(FaultFinding("drive_not_armed", cause, i, affects_only_joint=drive.was_enabled))
         return findings
 
     def _needs_retry(self, drive: DriveState) -> bool:

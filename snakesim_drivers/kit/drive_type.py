@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
-from snakesim_drivers.kit.buses import Buses
+from snakesim_drivers.kit.buses import RobotBuses
 from snakesim_drivers.kit.drive_backend import DriveBackend, DriveBackendParts, DriverClock
 from snakesim_drivers.kit.drive_settings import (
     DriveSettings,
@@ -134,7 +134,7 @@ class BusesBackend(DriveBackend):
             clock=lambda _timestamp_ns: clock.now_ns(),
         )
 
-        def open_buses(readings: DriveReadings) -> Buses:
+        def open_buses(readings: DriveReadings) -> RobotBuses:
             """Open the buses of all driver types, with an emulated body if there is no real bus."""
             body = None
             if are_emulated_in_process:
@@ -146,7 +146,7 @@ class BusesBackend(DriveBackend):
                 context = DriverTypeContext(config, part.settings, part.joints, clock, part_body)
                 specs += part.driver_type.plan_buses(context)
             advance_time = clock.advance_start_up_time if config.clock_mode == "lockstep" else None
-            return Buses(config, readings, specs, clock.now_ns, advance_time)
+            return RobotBuses(config, readings, specs, clock.now_ns, advance_time)
 
         drive_backend_parts = DriveBackendParts(
             name=self.name,

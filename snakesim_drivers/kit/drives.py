@@ -27,7 +27,7 @@ Start-up
 
 Errors
     An exception of any call ends the run safely. The bus first switches its drives off, by `send_setpoints` without
-    followers, and then closes. A drive that is silent or reports an error is no exception but a `Finding`.
+    followers, and then closes. A drive that is silent or reports an error is no exception but a `FaultFinding`.
 
 All drives are numbered by their place on this bus, from tail to head. All values are those at the shafts of the drives,
 in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint values. What drives measure is stored in the
@@ -37,18 +37,18 @@ in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint value
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.start_up import StartUp
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.model.fault_kinds import FaultInjection
+from snakesim_hal.wire.messages import JointMode
 
 
 class BusCommand(NamedTuple):
     """What all drives of a bus are to do until the next command."""
 
     enabled_drives: frozenset[int]  # indices of the drives that follow setpoints; all others are switched off
-    modes: list[Mode]  # of every drive
+    modes: list[JointMode]  # of every drive
     targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive (0 for passive drives)
     limits_nm: Floats  # (n_drives,) torque limits, not negative
     may_enable: bool  # True: the robot is armed (False: a drive that is off stays off)
@@ -116,7 +116,7 @@ class Drives(ABC):
             BackendError: The bus cannot be closed.
         """
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return what is wrong now with the drives and their bus. The caller reports each finding once.
 
         Drives that do not answer need not be included: the caller counts the requests that they left unanswered.
@@ -133,7 +133,7 @@ class Drives(ABC):
         """
         return
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end an injected fault of the bus, `bus_1`, or of a drive emulated here, `joint_1` for drive 0.
 
         Args:

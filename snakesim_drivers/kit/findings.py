@@ -9,7 +9,7 @@ MAX_CAUSE_CHARACTERS = 500  # the limit of the message `Fault`
 
 
 @dataclass(frozen=True)
-class Finding:
+class FaultFinding:
     """One detected fault."""
 
     what: str  # kind of the fault, such as drive_silent
@@ -45,7 +45,7 @@ class ReportedFindings:
     def __init__(self) -> None:
         self._subjects: set[tuple[str, int | str, bool]] = set()
 
-    def filter_new(self, findings: Iterable[Finding]) -> list[Finding]:
+    def filter_new(self, findings: Iterable[FaultFinding]) -> list[FaultFinding]:
         """Return the findings that have not been reported, and remember them as reported."""
         new_findings = [finding for finding in findings if finding.subject not in self._subjects]
         self._subjects.update(finding.subject for finding in new_findings)

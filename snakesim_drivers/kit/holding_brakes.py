@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from snakesim_drivers.kit.drives import BusCommand
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 
 class BrakePlan(NamedTuple):
@@ -109,7 +109,7 @@ class HoldingBrakes:
         targets = command.targets.copy()
         limits_nm = command.limits_nm.copy()
         for i in holding_drives:
-            modes[i] = Mode.POSITION
+            modes[i] = JointMode.POSITION
             targets[i] = self._hold_angles_rad[i]
             limits_nm[i] = self._hold_torque_limits_nm[i]
         return command._replace(

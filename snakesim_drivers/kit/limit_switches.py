@@ -7,9 +7,9 @@ further into it: without the first it could never leave the switch, without the 
 from collections.abc import Sequence
 
 from snakesim_drivers.kit.drives import BusCommand
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 
 class LimitSwitches:
@@ -41,12 +41,12 @@ class LimitSwitches:
         """Forget the findings of these drives, after the operator's reset; closed switches still restrict motion."""
         self._unacknowledged -= drives
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return a finding for each drive whose switch has closed since the last reset."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for i in sorted(self._unacknowledged):
             cause = f"{self._labels[i]} has reached its {self._name_end(i)} limit switch; reset, and move away from it"
-            findings.append(Finding("limit_switch", cause, i, affects_only_joint=True))
+            findings.append(FaultFinding("limit_switch", cause, i, affects_only_joint=True))
         return findings
 
     def restrict_command(self, command: BusCommand, angle_rad: Floats) -> BusCommand:
@@ -60,7 +60,7 @@ class LimitSwitches:
             return command
         targets = command.targets.copy()
         for i in command.enabled_drives:
-            bound = float(angle_rad[i]) if command.modes[i] == Mode.POSITION else 0.0
+            bound = float(angle_rad[i]) if command.modes[i] == JointMode.POSITION else 0.0
             if i in self._at_lower:
                 targets[i] = max(targets[i], bound)
             if i in self._at_upper:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from snakesim_drivers.mounting import Mounting
+from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import JointState, Power
@@ -31,7 +31,7 @@ class DriveReadings:
             clock_ns: Function that returns the driver's time in ns, to timestamp values.
         """
         count = len(joints)
-        self.mounting = Mounting(joints)
+        self.mounting = DriveMounting(joints)
         self._clock_ns = clock_ns
         self._measures_torque = ["torque" in joint.drive.measures for joint in joints]
         # Motion and torque.

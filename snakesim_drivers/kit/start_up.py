@@ -18,7 +18,7 @@ Pure: the clock is passed in.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 
 
@@ -43,7 +43,7 @@ class StartUpStep:
 
 
 @dataclass
-class _Progress:
+class _StartUpProgress:
     """How far one drive is."""
 
     step: int = 0  # index of the current step; equal to the number of steps if the start-up is finished
@@ -78,7 +78,7 @@ class StartUp:
         self._clock_ns = clock_ns
         self._steps = steps
         self._may_move = may_move
-        self._progress = [_Progress() for _ in labels]
+        self._progress = [_StartUpProgress() for _ in labels]
         self._publish_not_ready_reasons()
 
     def update(self) -> None:
@@ -132,22 +132,24 @@ class StartUp:
         """Restart the start-up of those of these drives whose start-up has failed, after the operator's reset."""
         for i in drives:
             if self._progress[i].failure:
-                self._progress[i] = _Progress()
+                self._progress[i] = _StartUpProgress()
         self._publish_not_ready_reasons()
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return a finding for each drive whose start-up has failed or was invalidated."""
-        findings: list[Finding] = []
+        findings: list[FaultFinding] = []
         for i, progress in enumerate(self._progress):
             if progress.is_fault:
                 findings.append(
-                    Finding("drive_not_ready", f"{self._labels[i]}: {progress.failure}", i, affects_only_joint=True)
+                    FaultFinding(
+                        "drive_not_ready", f"{self._labels[i]}: {progress.failure}", i, affects_only_joint=True
+                    )
                 )
         return findings
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _update_drive(self, i: int, progress: _Progress) -> None:
+    def _update_drive(self, i: int, progress: _StartUpProgress) -> None:
         """Start the current step of a drive, or the next one if the drive has acknowledged the current one.
 
         A step that fails or exceeds its time limit is aborted, and ends the start-up of the drive.
@@ -174,7 +176,7 @@ class StartUp:
             progress.step += 1
             progress.start_time_ns = None
 
-    def _abort_start_up(self, i: int, progress: _Progress, failure: str) -> None:
+    def _abort_start_up(self, i: int, progress: _StartUpProgress, failure: str) -> None:
         """Abort the current step, and end the start-up of a drive with a failure."""
         if progress.start_time_ns is not None:
             self._steps[progress.step].abort(i)
@@ -182,12 +184,12 @@ class StartUp:
         progress.failure = failure
         progress.is_fault = True
 
-    def _is_motion_forbidden(self, progress: _Progress) -> bool:
+    def _is_motion_forbidden(self, progress: _StartUpProgress) -> bool:
         if progress.step == len(self._steps):
             return False
         return self._steps[progress.step].moves_joint and not self._may_move
 
-    def _elapsed_s(self, progress: _Progress) -> float:
+    def _elapsed_s(self, progress: _StartUpProgress) -> float:
         start_time_ns = progress.start_time_ns
         return 0.0 if start_time_ns is None else (self._clock_ns() - start_time_ns) * 1e-9
 
@@ -197,7 +199,7 @@ class StartUp:
             reason = self._describe_not_ready_reason(progress)
             self._readings.set_not_ready(i, f"{self._labels[i]}: {reason}" if reason else "")
 
-    def _describe_not_ready_reason(self, progress: _Progress) -> str:
+    def _describe_not_ready_reason(self, progress: _StartUpProgress) -> str:
         """Return the step and the reason why a drive is not ready; empty if it is."""
         if progress.failure:
             return f"{progress.failure}; `snakesim robot reset` begins its start-up again"

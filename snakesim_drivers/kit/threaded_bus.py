@@ -17,10 +17,10 @@ import numpy as np
 from snakesim_drivers.kit.bus import BusSpec, InlineBus, select_bus_findings
 from snakesim_drivers.kit.drive_guard import NO_DRIVES
 from snakesim_drivers.kit.drives import BusCommand
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 WAIT_SLICES = 6  # remaining_slices of the time that the host waits: a computer that pauses then loses one slice only
 
@@ -80,7 +80,7 @@ class ThreadedBus(InlineBus):
         # Commands.
         self._queued_command: _QueuedCommand | None = None
         self._drives_to_reset = NO_DRIVES
-        self._new_findings: list[Finding] = []
+        self._new_findings: list[FaultFinding] = []
 
     # --- called by the host's thread --------------------------------------------------------------------------
 
@@ -131,7 +131,7 @@ class ThreadedBus(InlineBus):
     def poll(self) -> None:
         """Do nothing, because the bus thread receives by itself."""
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         """Return what was found wrong since the last call, each time that setpoints were sent."""
         with self._condition:
             self._raise_bus_error()
@@ -266,10 +266,10 @@ class ThreadedBus(InlineBus):
         if self._guard.note_drives_released():
             lease_ms = 1e3 * self._lease_s
             cause = f"{self.spec.name}: no setpoints for {lease_ms:.0f} ms, one lease: its drives were switched off"
-            self._findings_after_pause.append(Finding("no_setpoints", cause))
+            self._findings_after_pause.append(FaultFinding("no_setpoints", cause))
         count = len(self.spec.joints)
         zeros = np.zeros(count)
-        passive = [Mode.PASSIVE] * count
+        passive = [JointMode.PASSIVE] * count
         super().send(BusCommand(NO_DRIVES, passive, zeros, zeros, may_enable=False, emergency=False))
         self.drives.poll()
         self._publish_findings()

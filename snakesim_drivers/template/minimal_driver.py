@@ -16,13 +16,13 @@ from snakesim_drivers.kit.drive_settings import DriveSettings
 from snakesim_drivers.kit.drive_states import DriveStates
 from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.drives import BusCommand, Drives
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 # --- the protocol ----------------------------------------------------------------------------------------------
 
@@ -30,7 +30,7 @@ from snakesim_hal.wire.messages import Mode
 class Setpoint(NamedTuple):
     """What a drive is to do until the next setpoint. It also feeds the watchdog of the drive."""
 
-    mode: Mode
+    mode: JointMode
     target: float  # rad, rad/s or N·m, by the mode
     limit_nm: float
 
@@ -51,7 +51,7 @@ class Report(NamedTuple):
 
 
 Message = Setpoint | Literal["enable", "disable", "clear_error"]
-NO_SETPOINT = Setpoint(Mode.PASSIVE, 0.0, 0.0)
+NO_SETPOINT = Setpoint(JointMode.PASSIVE, 0.0, 0.0)
 
 
 # --- the emulated drives ---------------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ class MinimalEmulator(DriveEmulator[BusEnd]):
         gear = joint.drive.gear
         stiffness = joint.motor.stiffness_nm_per_rad / gear**2
         damping = joint.motor.damping_nm_s_per_rad / gear**2
-        if setpoint.mode == Mode.VELOCITY:
+        if setpoint.mode == JointMode.VELOCITY:
             damping = joint.motor.velocity_gain_nm_s_per_rad / gear**2
         speed_rad_s = joint.limits.speed_rad_s * gear
         self.body.drive_motor(i, setpoint.mode, setpoint.target, setpoint.limit_nm, stiffness, damping, speed_rad_s)
@@ -206,14 +206,14 @@ class MinimalDrives(Drives):
     def poll(self) -> None:
         self.emulator()
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         findings = self.states.findings()
         if self.emulator.is_cut:
-            findings.append(Finding("interface_down", "the bus is cut; check the adapter and its cable"))
+            findings.append(FaultFinding("interface_down", "the bus is cut; check the adapter and its cable"))
         for i in self.all_drives:
             if len(self.serials[i]) > 1:
                 cause = f"{self.labels[i]}: two drives answer, {' and '.join(sorted(self.serials[i]))}; change one id"
-                findings.append(Finding("duplicate_node", cause, i))
+                findings.append(FaultFinding("duplicate_node", cause, i))
         return findings
 
     def reset_faults(self, joints: frozenset[int]) -> None:
@@ -222,7 +222,7 @@ class MinimalDrives(Drives):
             self.serials[i].clear()  # a second drive that is still there answers again
             self.emulator.handle_message(i, "clear_error")
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         if (injection.target_type, injection.kind) == ("bus", "cut"):
             self.emulator.is_cut = begins
             return True

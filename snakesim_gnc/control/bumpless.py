@@ -15,7 +15,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import ControllerCommand, Observation, Telemetry, make_position_setpoints
-from snakesim_hal.wire.messages import Description, JointState
+from snakesim_hal.wire.messages import JointState, RobotDescription
 from snakesim_hal.wire.quantities import above
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
@@ -30,7 +30,7 @@ class BumplessTransfer:
     All arrays are (n_joints,), tail to head. At most one joint is in torque mode.
     """
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         """Prepare the bumpless transfer between control modes; all joints are in position mode at first.
 
         Args:
@@ -113,7 +113,7 @@ class BumplessTransfer:
 class BumplessFollower:
     """Makes setpoints that follow a reference in position mode without a jump."""
 
-    def __init__(self, robot: Description, blend_s: float) -> None:
+    def __init__(self, robot: RobotDescription, blend_s: float) -> None:
         """Start without a reference.
 
         Args:

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Description, Rise
+from snakesim_hal.wire.messages import PathRise, RobotDescription
 
 MAX_SLOPE = 0.35  # height over length of a ramp
 CLEARANCE_M = 0.02  # height of the line over the top of a platform
 
 
-def compute_path_height_m(rises: Sequence[Rise], s_m: float) -> float:
+def compute_path_height_m(rises: Sequence[PathRise], s_m: float) -> float:
     """Return the height of the path above the ground at an arc length.
 
     With the height h_i of each platform and the distance d_i to it along the path, it is
@@ -33,7 +33,7 @@ def compute_path_height_m(rises: Sequence[Rise], s_m: float) -> float:
 class PlatformClimb:
     """Computes the pitch angles of one robot."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         joint_s_m = np.cumsum([link.length_m for link in robot.links])
         self._joint_count = len(robot.joints)
         self._pitch_joints = [i for i, joint in enumerate(robot.joints) if joint.axis == "pitch"]
@@ -41,7 +41,7 @@ class PlatformClimb:
         # Arc lengths of the tail end, the pitch joints and the head end on the body.
         self._bend_points_s_m = np.concatenate(([0.0], joint_s_m[self._pitch_joints], joint_s_m[-1:]))
 
-    def compute_pitch_angles_rad(self, rises: list[Rise], tail_s_m: float) -> Floats:
+    def compute_pitch_angles_rad(self, rises: list[PathRise], tail_s_m: float) -> Floats:
         """Compute the pitch angles with which the body follows the height of its path over platforms.
 
         Between two pitch joints at the line's heights z_i and z_{i+1}, a distance l_i apart, the body has the slope

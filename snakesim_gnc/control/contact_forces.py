@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from snakesim_hal.model.measured_force import FORCE_WINDOW_S
-from snakesim_hal.wire.messages import World, WorldContact
+from snakesim_hal.wire.messages import WorldContact, WorldModel
 
 JAM_FORCE_RATIO = 0.5  # contacts that push backward with more than this ratio of the forward push jam the body
 
@@ -35,7 +35,7 @@ class MeasuredContacts:
     def __init__(self) -> None:
         self._samples: deque[tuple[int, Sequence[WorldContact]]] = deque()  # sensor timestamp in ns, contacts
 
-    def add_world(self, world: World) -> None:
+    def add_world(self, world: WorldModel) -> None:
         """Add the contacts of a world model to the average, unless they were added before.
 
         Contacts that were estimated from joint torques show where the body touches, but not how hard, so they clear

@@ -23,7 +23,7 @@ from snakesim_gnc.control.standstill import StandstillDetector
 from snakesim_gnc.control.undulation import HeadSteeredUndulation, HeadSteeredUndulationParameters, LateralUndulation
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 MAX_STANDSTILL_DISTANCE_M = 0.02  # a body stands that moves less than this, or less than half of what it should
 MIN_PROGRESS_M = 0.05  # a wave makes progress if the goal comes so much nearer within PROGRESS_TIMEOUT_S
@@ -36,7 +36,7 @@ FORWARD_WAVE = HeadSteeredUndulationParameters(amplitude_rad=0.7, period_s=0.8, 
 class ContactSearch:
     """Decides whether to search, and by which wave."""
 
-    def __init__(self, robot: Description, *, standstill_duration_s: float, search_duration_s: float) -> None:
+    def __init__(self, robot: RobotDescription, *, standstill_duration_s: float, search_duration_s: float) -> None:
         """Prepare the waves with which a stationary body searches for obstacles to push off.
 
         Args:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.undulation import LateralUndulation, LateralUndulationParameters, compute_direction_angle_rad
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 # The trained wave.
 AMPLITUDE_RAD = 0.637896
@@ -52,7 +52,7 @@ TRAINED_SPACING_M = 0.11
 TRAINED_TORQUE_NM = 7.0
 
 
-def compute_joint_spacing_ratio(robot: Description) -> float:
+def compute_joint_spacing_ratio(robot: RobotDescription) -> float:
     """Return the distance between a robot's joints, divided by that of the robot that the waves were trained on."""
     return PlanarBody(robot).spacing_m / TRAINED_SPACING_M
 
@@ -60,7 +60,7 @@ def compute_joint_spacing_ratio(robot: Description) -> float:
 class ForceFeedbackWave(LateralUndulation):
     """A wave that bends towards the goal and yields to measured forces; its amplitude is largest at the head."""
 
-    def __init__(self, robot: Description, *, time_scale: float = 1.0) -> None:
+    def __init__(self, robot: RobotDescription, *, time_scale: float = 1.0) -> None:
         """Scale a wave that was trained on one robot to the size and torque of another.
 
         Args:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from snakesim_hal.model.scenario import SENSOR, RunConfig, ServiceSchedule
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.freshness import max_state_age_ns
-from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
+from snakesim_hal.wire.messages import JointState, RobotDescription, Trajectory, WorldModel
 
 MAX_MISSED_SAMPLES = 3  # in a row that are tolerated; the fourth means that the publisher has stopped
 MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer delays them
@@ -39,7 +39,7 @@ class AgeLimits:
     sensors_s: dict[str, float]  # by key: the sensors that a world model is made from; none for an absent sensor
 
     @staticmethod
-    def from_config(config: RunConfig, robot: Description) -> "AgeLimits":
+    def from_config(config: RunConfig, robot: RobotDescription) -> "AgeLimits":
         """Compute the age limits of a run: those in its scenario, or else defaults from the rates of the streams."""
         max_age = config.max_age
         period_s = robot.period_ns * 1e-9
@@ -60,7 +60,7 @@ class AgeLimits:
         """Return why a joint state is rejected at a robot time; empty if it is fresh."""
         return _check_age(keys.JOINTS, joints.timestamp_ns, now_ns, self.joints_s)
 
-    def check_world(self, world: World, now_ns: int) -> str:
+    def check_world(self, world: WorldModel, now_ns: int) -> str:
         """Return why a world model is rejected at a robot time; empty if it and the samples in it are fresh."""
         world_reason = _check_age(keys.WORLD, world.timestamp_ns, now_ns, self.world_s)
         if world_reason:
@@ -100,7 +100,7 @@ class AgeLimits:
 
 
 def _compute_sensor_limits_s(
-    config: RunConfig, robot: Description, guidance_cycle_s: float, guidance_latency_s: float
+    config: RunConfig, robot: RobotDescription, guidance_cycle_s: float, guidance_latency_s: float
 ) -> dict[str, float]:
     """Compute the maximum age of the pose, contact and depth samples that a world model is made from.
 

@@ -9,7 +9,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Task
 from snakesim_hal.model.kinematics import ForwardKinematics
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
-from snakesim_hal.wire.messages import Description, JointState, Pose
+from snakesim_hal.wire.messages import JointState, Pose, RobotDescription
 
 
 class GoalProgress:
@@ -19,7 +19,7 @@ class GoalProgress:
     direction d: `(c - c_0) . d`. For waypoints it is the decrease of the way from the head through all points left.
     """
 
-    def __init__(self, robot: Description, task: Task) -> None:
+    def __init__(self, robot: RobotDescription, task: Task) -> None:
         """Prepare to measure the advance of a body from the start pose of its task.
 
         Args:
@@ -146,7 +146,7 @@ class GoalProgress:
 class BodyLocator:
     """Computes body points and centers of mass, for any number of robots with equal links."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         """Read the links of a robot."""
         self._nodes = ForwardKinematics(robot)
         masses_kg = np.array([link.mass_kg for link in robot.links])

@@ -1,6 +1,6 @@
 """Wraps a controller, which may be third-party code, and checks everything that it returns. Errors name the controller.
 
-The wire accepts only lists of modes, targets and torque limits with one entry per joint, which are of `Mode` and
+The wire accepts only lists of modes, targets and torque limits with one entry per joint, which are of `JointMode` and
 of plain, finite Python numbers.
 """
 
@@ -11,19 +11,21 @@ from typing import Any
 
 from snakesim_hal.base.errors import ControllerError, describe_exception
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
-from snakesim_hal.wire.messages import Description, JointDescription, Mode
+from snakesim_hal.wire.messages import JointDescription, JointMode, RobotDescription
 from snakesim_hal.wire.quantities import MAX_TARGET
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 PLAIN_NUMBER_TYPES = {float, int}  # exactly these types: a NumPy number or a bool cannot be sent
-MODE_NAMES = ", ".join(f"Mode.{mode.name}" for mode in Mode)
+MODE_NAMES = ", ".join(f"Mode.{mode.name}" for mode in JointMode)
 MAX_VALUE_LENGTH = 60  # characters of a value in an error message
 
 
 class GuardedController:
     """A checked controller, constructed for one arm session. Every call may raise ControllerError."""
 
-    def __init__(self, name: str, controller_class: type[Controller[Any]], robot: Description, parameters: Any) -> None:
+    def __init__(
+        self, name: str, controller_class: type[Controller[Any]], robot: RobotDescription, parameters: Any
+    ) -> None:
         """Construct a controller, and convert exceptions of its constructor into a ControllerError.
 
         Args:
@@ -97,7 +99,7 @@ def _check_modes(modes: Any, joint_descriptions: Sequence[JointDescription], joi
     """Check that the modes of a command are a list of one Mode per joint that the joint supports. Raises ValueError."""
     _check_length("mode", modes, joint_names)
     for i, mode in enumerate(modes):
-        if type(mode) is not Mode:
+        if type(mode) is not JointMode:
             raise ValueError(
                 f"RequestedSetpoints.mode[{i}] ({joint_names[i]}) is {_format_value(mode)}, must be one of {MODE_NAMES}"
             )

@@ -8,15 +8,15 @@ from snakesim_hal.controller import (
     Telemetry,
     make_position_setpoints,
 )
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 
-class Hold(Controller[NoParameters]):
+class HoldPose(Controller[NoParameters]):
     """Keeps the pose of the first observation."""
 
     needs_world = False
 
-    def __init__(self, robot: Description, parameters: NoParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: NoParameters) -> None:
         super().__init__(robot, parameters)
         self._start_angles_rad: list[float] | None = None  # None if there has been no observation yet
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded
 
 JOINT_LIMIT_MARGIN_RAD = 0.02  # between a target and the joint's limit
@@ -56,7 +56,7 @@ class IdentifyParameters(FileStruct, frozen=True):
     """Time until each motion reaches its full size."""
 
 
-class Identify(Controller[IdentifyParameters]):
+class Identification(Controller[IdentifyParameters]):
     """Sends position targets: for each joint a slow triangle wave and four tones, which fade in.
 
     With the triangle wave w of period T_i, and with the tones' frequencies f_ik, amplitudes a_ik and phases p_ik, the
@@ -71,7 +71,7 @@ class Identify(Controller[IdentifyParameters]):
     needs_world = False
     required_measurements = ("torque",)
 
-    def __init__(self, robot: Description, parameters: IdentifyParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: IdentifyParameters) -> None:
         super().__init__(robot, parameters)
         self._tones = make_multisine_tones(len(robot.joints), parameters.shake_to_hz)
         self._start_angles_rad: list[float] = []  # empty if there has been no observation yet

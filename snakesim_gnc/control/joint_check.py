@@ -9,7 +9,7 @@ from typing import Annotated
 
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded
 
 JOINT_LIMIT_MARGIN_RAD = 0.02  # between a target and the joint's limit
@@ -45,7 +45,7 @@ class JointCheck(Controller[JointCheckParameters]):
     Parameters = JointCheckParameters
     needs_world = False
 
-    def __init__(self, robot: Description, parameters: JointCheckParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: JointCheckParameters) -> None:
         """Create a controller that tests one joint after the other, beginning at the tail.
 
         Args:

@@ -15,12 +15,12 @@ from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.controller import Controller, decode_parameters, load_controller
 from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.streams import Query
+from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import UNDECODABLE, Decoder
-from snakesim_hal.wire.messages import Answer, Clock, ControlParameters, Description, ParametersRequest
+from snakesim_hal.wire.codec import UNDECODABLE, MessageDecoder
+from snakesim_hal.wire.messages import Answer, Clock, ControlParameters, ParametersRequest, RobotDescription
 from snakesim_hal.wire.quantities import MAX_PARAMETERS_JSON, MAX_SCHEMA
 
 MAX_WAITING_REQUESTS = 8  # a later request displaces the oldest, which gets no answer
@@ -32,7 +32,7 @@ MAX_NAME_LENGTH = 64  # characters of a controller's name on the wire; of a path
 class LiveParameters:
     """The parameters in force. Constructs controllers with them."""
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Load the controller class of a run, and check its parameters, which clients may change while it runs.
 
         Args:
@@ -48,7 +48,7 @@ class LiveParameters:
         # The controller.
         self.controller_class: type[Controller[Any]] = load_controller(config.controller)
         self._name = config.controller[-MAX_NAME_LENGTH:]
-        self._robot: Description | None = None  # None if `configure` has not been called yet
+        self._robot: RobotDescription | None = None  # None if `configure` has not been called yet
 
         # The parameters in force.
         self._parameters = self._check_parameters(config.controller_parameters, f"scenario {config.name!r}")
@@ -58,8 +58,8 @@ class LiveParameters:
         self._published_change_count = -1  # number of the change that was published last
 
         # Requests and publications.
-        self._request_queue: Mailbox[Query] = Mailbox((MAX_WAITING_REQUESTS,))
-        self._decoder = Decoder(ParametersRequest)
+        self._request_queue: Mailbox[IncomingQuery] = Mailbox((MAX_WAITING_REQUESTS,))
+        self._decoder = MessageDecoder(ParametersRequest)
         client.session.on_query(keys.PARAMETERS, self._request_queue.put)
         self._publisher = client.session.declare_latched_publisher(keys.PARAMETERS_IN_FORCE, ControlParameters)
 
@@ -68,7 +68,7 @@ class LiveParameters:
         """Whether observations of this controller have `sensor_samples`."""
         return self.controller_class.uses_sensors
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         """Construct controllers for this robot from now on, and publish the parameters again in the next tick.
 
         They are published again because robot time may have started over.
@@ -99,7 +99,7 @@ class LiveParameters:
             self._publish_parameters(clock)
         return self._change_count != count_before
 
-    def _answer_request(self, query: Query) -> Answer:
+    def _answer_request(self, query: IncomingQuery) -> Answer:
         """Put the parameters of a request in force if the controller accepts them.
 
         Args:

@@ -14,7 +14,7 @@ from snakesim_gnc.control.goal_progress import GoalProgress
 from snakesim_hal.base.errors import ConfigError, suggest_word
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contacts, Description, Message, Pose
+from snakesim_hal.wire.messages import Contacts, Message, Pose, RobotDescription
 
 # Bounds of an observation. They are generous: a value outside is clipped.
 MAX_ANGLE_RAD = 2 * math.pi
@@ -60,12 +60,12 @@ def _make_symmetric_part(
     return ObservationPart(names, unit, low, high, read, sensor)
 
 
-def make_observation_parts(robot: Description) -> dict[str, ObservationPart]:
+def make_observation_parts(robot: RobotDescription) -> dict[str, ObservationPart]:
     """Return all parts of an observation that a robot with every sensor can have, by name."""
     return _make_joint_parts(robot) | _make_goal_parts() | _make_contact_parts(robot) | _make_pose_parts()
 
 
-def _make_joint_parts(robot: Description) -> dict[str, ObservationPart]:
+def _make_joint_parts(robot: RobotDescription) -> dict[str, ObservationPart]:
     """Make the parts for the time since arming and for the measurements of the joints."""
     joints = robot.joints
     names = [joint.name for joint in joints]
@@ -98,7 +98,7 @@ def _make_goal_parts() -> dict[str, ObservationPart]:
     }
 
 
-def _make_contact_parts(robot: Description) -> dict[str, ObservationPart]:
+def _make_contact_parts(robot: RobotDescription) -> dict[str, ObservationPart]:
     """Make the part for the magnitude of the contact force on every link."""
     names = [link.name for link in robot.links]
     link_count = len(names)
@@ -131,7 +131,7 @@ def _make_pose_parts() -> dict[str, ObservationPart]:
 DEFAULT_PARTS = ("angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m", "contact_n")
 
 
-def select_observation_parts(robot: Description, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
+def select_observation_parts(robot: RobotDescription, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
     """Return the parts that make up the observation of a policy, by their names.
 
     Args:
@@ -171,7 +171,7 @@ def select_observation_parts(robot: Description, observe: Sequence[str] | None) 
 class ObservationBuilder:
     """Makes the observation of an episode, tick by tick."""
 
-    def __init__(self, robot: Description, parts: Mapping[str, ObservationPart]) -> None:
+    def __init__(self, robot: RobotDescription, parts: Mapping[str, ObservationPart]) -> None:
         """Prepare to build the observations of one episode.
 
         Args:

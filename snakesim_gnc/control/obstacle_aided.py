@@ -40,8 +40,8 @@ from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Description, Mode, World, WorldContact
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import JointMode, RobotDescription, WorldContact, WorldModel
 from snakesim_hal.wire.quantities import above, from_zero
 
 MAX_CONTINUOUS_CHANGE_RAD = 0.1  # a new path whose reference differs more than this starts with a small look-ahead
@@ -71,7 +71,7 @@ MIN_STANDSTILL_DURATION_S = 0.5
 class PushSnapshot:
     """The contacts of a world model, and the push that they allow."""
 
-    world: World
+    world: WorldModel
     contacts: BodyContacts
     push: NormalizedPush
 
@@ -151,7 +151,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
 
     Parameters = ObstacleAidedParameters
 
-    def __init__(self, robot: Description, parameters: ObstacleAidedParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: ObstacleAidedParameters) -> None:
         """Create a controller that moves the body along a planned path by pushing off obstacles.
 
         It starts with all integrals and forces at zero, before the first measurement.
@@ -169,7 +169,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         # Joints.
         self._yaw_joints = self._body.yaw_joints  # indices of the joints that bend
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._has_torque_mode = all(robot.joints[i].supports_mode(Mode.TORQUE) for i in self._yaw_joints)
+        self._has_torque_mode = all(robot.joints[i].supports_mode(JointMode.TORQUE) for i in self._yaw_joints)
         self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
         self._is_holding = False  # the joints hold a pose; the next reference may jump
         # Look-ahead.
@@ -304,7 +304,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         for i in self._yaw_joints:
             limit_nm = setpoints.torque_limit_nm[i]
             torque_nm = float(shape_nm[i] + push_torques_nm[i])
-            setpoints.mode[i] = Mode.TORQUE
+            setpoints.mode[i] = JointMode.TORQUE
             setpoints.target[i] = min(max(torque_nm, -limit_nm), limit_nm)
         return ControllerCommand(setpoints, self._make_telemetry(observation, location, 0.0, theta))
 
@@ -437,7 +437,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         contacts = find_body_contacts(
             body_points_w,
             self._body.radius_m,
-            Outlines.from_obstacles(obstacles),
+            ObstacleOutlines.from_obstacles(obstacles),
             max_gap_m=parameters.reach_m,
             friction=location.trajectory.assumed_obstacle_friction,
         )

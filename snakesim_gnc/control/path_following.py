@@ -17,7 +17,7 @@ from snakesim_gnc.control.progress import PathProgress, SpeedFilter
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import from_zero
 
 
@@ -39,7 +39,7 @@ class PathFollowing(Controller[PathFollowingParameters]):
 
     Parameters = PathFollowingParameters
 
-    def __init__(self, robot: Description, parameters: PathFollowingParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: PathFollowingParameters) -> None:
         super().__init__(robot, parameters)
         self._body = PlanarBody(robot)
         self._platform_climb = PlatformClimb(robot)

@@ -24,7 +24,7 @@ from snakesim_hal.controller import Controller, ControllerCommand, Observation, 
 from snakesim_hal.model.files import SHIPPED_FILES_DIR, FileStruct, expand_home
 from snakesim_hal.model.plugins import make_pip_install_command
 from snakesim_hal.model.textfiles import read_bytes
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.messages import JointMode, RobotDescription
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 ONNX_RUNTIME: Any = None
@@ -40,7 +40,7 @@ ACTION_KEY = "snakesim.action"
 JOINTS_KEY = "snakesim.joints"
 FRAME_SKIP_KEY = "snakesim.frame_skip"
 
-MODE_BY_ACTION = {"position": Mode.POSITION, "velocity": Mode.VELOCITY, "torque": Mode.TORQUE}
+MODE_BY_ACTION = {"position": JointMode.POSITION, "velocity": JointMode.VELOCITY, "torque": JointMode.TORQUE}
 MAX_FRAME_SKIP = 1000  # ticks; a longer pause between two targets is a mistake
 MAX_INTEGER_DIGITS = 9  # of a number in the metadata; more digits are a mistake
 
@@ -52,7 +52,7 @@ MODEL_SUFFIX = ".onnx"
 class PolicyModel:
     """A model from a file, with its metadata. Calling it computes targets from an observation."""
 
-    def __init__(self, robot: Description, file: str) -> None:
+    def __init__(self, robot: RobotDescription, file: str) -> None:
         """Load the model and check that it fits the robot.
 
         Args:
@@ -89,7 +89,7 @@ class PolicyModel:
 
 
 def _check_joints_of_model(
-    metadata: "_ModelMetadata", robot: Description, action: str, parts: Mapping[str, ObservationPart]
+    metadata: "_ModelMetadata", robot: RobotDescription, action: str, parts: Mapping[str, ObservationPart]
 ) -> None:
     """Check that the robot has the joints that the model commands and observes. Raises ConfigError."""
     joint_count = len(robot.joints)
@@ -113,14 +113,14 @@ class PolicyParameters(FileStruct, frozen=True, kw_only=True):
     """Name of a shipped model, or path of an ONNX file."""
 
 
-class Policy(Controller[PolicyParameters]):
+class PolicyController(Controller[PolicyParameters]):
     """Runs the model every `snakesim.frame_skip` ticks, and repeats its targets in between."""
 
     Parameters = PolicyParameters
     needs_world = False
     uses_sensors = True
 
-    def __init__(self, robot: Description, parameters: PolicyParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: PolicyParameters) -> None:
         """Load the model. Raises ConfigError if it does not fit the robot."""
         super().__init__(robot, parameters)
         self._torque_limits_nm = [joint.torque_limit_nm for joint in robot.joints]
@@ -138,7 +138,7 @@ class Policy(Controller[PolicyParameters]):
         self._hold_setpoints: RequestedSetpoints | None = None
 
     @classmethod
-    def check(cls, robot: Description, parameters: PolicyParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: PolicyParameters) -> None:
         """Check before a run that the model fits the robot. Raises ConfigError."""
         PolicyModel(robot, parameters.model)
 
@@ -164,7 +164,7 @@ class Policy(Controller[PolicyParameters]):
         modes = [self._mode] * len(self._last_targets)
         setpoints = RequestedSetpoints(modes, list(self._last_targets), list(self._torque_limits_nm))
         reference: Sequence[float] = ()
-        if self._mode is Mode.POSITION:
+        if self._mode is JointMode.POSITION:
             reference = self._last_targets
         return ControllerCommand(setpoints, Telemetry(reason="a policy moves the joints", reference_rad=reference))
 
@@ -195,7 +195,7 @@ class _ModelMetadata:
         self._file = shorten(file)
         self._properties = properties
 
-    def read_parts(self, robot: Description) -> dict[str, ObservationPart]:
+    def read_parts(self, robot: RobotDescription) -> dict[str, ObservationPart]:
         """Return the parts of the observation, in the order in which the model expects them. Raises ConfigError."""
         available = make_observation_parts(robot)
         allowed = f"names out of {', '.join(available)}, each once, with commas between"

@@ -14,7 +14,7 @@ from snakesim_gnc.geometry.planar_body import JointAngleHistory, PlanarBody, get
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Trajectory, World
+from snakesim_hal.wire.messages import Trajectory, WorldModel
 from snakesim_hal.wire.quantities import from_zero
 
 SpeedFilter = Annotated[float, from_zero(1, "s")]
@@ -36,7 +36,7 @@ class BodyLocation:
 
     is_new_world: bool  # this tick has another world model than the tick before
     may_have_jumped: bool  # the path is new, or the position was unknown in the tick before
-    world: World
+    world: WorldModel
     trajectory: Trajectory
 
 
@@ -118,7 +118,7 @@ class PathProgress:
         )
 
     def _localize_if_new(
-        self, body_on_path: BodyOnPath, world: World, observation: Observation, *, is_new_path: bool
+        self, body_on_path: BodyOnPath, world: WorldModel, observation: Observation, *, is_new_path: bool
     ) -> int:
         """Localize the body on the path if the path or the pose is new since the last tick.
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.geometry.planar import cross_2d
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import LINK_FRACTIONS, Outlines, find_nearest_points_on_chain
+from snakesim_hal.model.outlines import LINK_FRACTIONS, ObstacleOutlines, find_nearest_points_on_chain
 
 MAX_NORMAL_ALONG_BODY = 0.6  # |n . t| of a contact; above it, the obstacle stands in front of the head
 MAX_BALANCE_RESIDUAL = 0.05  # unbalanced fraction of the force up to which contacts count as able to push
@@ -112,7 +112,7 @@ class PushLowPassFilter:
 
 
 def find_body_contacts(
-    body_points_w: Floats, radius_m: float, outlines: Outlines, *, max_gap_m: float, friction: float
+    body_points_w: Floats, radius_m: float, outlines: ObstacleOutlines, *, max_gap_m: float, friction: float
 ) -> BodyContacts:
     """Find the point of the body that is nearest to each obstacle within reach and beside the body.
 

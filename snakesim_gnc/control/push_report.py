@@ -7,13 +7,13 @@ import numpy as np
 from snakesim_gnc.control.contact_forces import NetContactForce, explain_standstill
 from snakesim_gnc.control.push import BodyContacts, NormalizedPush
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.wire.messages import World, WorldContact
+from snakesim_hal.wire.messages import WorldContact, WorldModel
 
 MAX_REPORTED_PUSH_POINTS = 64  # push-points in a message
 
 
 def make_push_point_messages(
-    body: PlanarBody, world: World, contacts: BodyContacts, push: NormalizedPush, force_n: float
+    body: PlanarBody, world: WorldModel, contacts: BodyContacts, push: NormalizedPush, force_n: float
 ) -> list[WorldContact]:
     """Return the contacts that push, as messages with their desired forces.
 
@@ -35,7 +35,7 @@ def make_push_point_messages(
 
 
 def _describe_push_point(
-    body: PlanarBody, world: World, contacts: BodyContacts, contact_index: int, push_magnitude_n: float
+    body: PlanarBody, world: WorldModel, contacts: BodyContacts, contact_index: int, push_magnitude_n: float
 ) -> WorldContact:
     """Return the message that reports one contact and the force with which the body pushes there.
 

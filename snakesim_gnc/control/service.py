@@ -17,7 +17,7 @@ from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.controller import Observation, SensorSamples, Task
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.client import Client, Commander, Feed
+from snakesim_hal.network.client import Commander, HostClient, SampleFeed
 from snakesim_hal.programs.preflight import find_missing_capability
 from snakesim_hal.service import SILENCE_S, Service
 from snakesim_hal.wire import keys
@@ -25,13 +25,13 @@ from snakesim_hal.wire.messages import (
     Clock,
     Contacts,
     ControlState,
-    Description,
     JointState,
     Message,
     Pose,
-    Status,
+    RobotDescription,
+    RobotStatus,
     Trajectory,
-    World,
+    WorldModel,
 )
 
 # Sensor samples that a controller may request.
@@ -40,13 +40,13 @@ SENSOR_MESSAGE_TYPES: dict[str, type[Message]] = {keys.POSE: Pose, keys.CONTACTS
 KeyedMessages = list[tuple[str, Message]]  # messages to publish, with their keys
 
 
-class Control(Service):
+class ControlService(Service):
     """Runs the scenario's controller."""
 
     name = "control"
     urgent = True
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Create the service that runs one controller: it reads the robot's state in every tick, and sends setpoints.
 
         Args:
@@ -62,14 +62,14 @@ class Control(Service):
 
         # Inputs of every controller.
         self._joint_feed = client.subscribe(keys.JOINTS, JointState)
-        self._world_feed = client.subscribe(keys.WORLD, World)
+        self._world_feed = client.subscribe(keys.WORLD, WorldModel)
         self._trajectory_feed = client.subscribe(keys.TRAJECTORY, Trajectory)
-        self._status_reader = client.session.declare_reader(keys.STATUS, Status)
+        self._status_reader = client.session.declare_reader(keys.STATUS, RobotStatus)
         self._last_clock: Clock | None = None
 
         # Inputs of a controller that requests sensor samples.
         self._task: Task | None = None  # None if the controller requests no samples
-        self._sensor_feeds: dict[str, Feed[Message]] = {}
+        self._sensor_feeds: dict[str, SampleFeed[Message]] = {}
         self._sensor_samples: dict[str, Message] = {}  # the newest of each key
         if self._parameters.uses_sensors:
             self._task = Task.from_config(config)
@@ -90,7 +90,7 @@ class Control(Service):
             if is_mounted[key]:
                 self._sensor_feeds[key] = self._client.subscribe(key, message_type)
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         """Prepare to command this robot. Raises ControllerError if the robot cannot do what the controller needs."""
         missing = find_missing_capability(robot.joints, self._parameters.controller_class, self._config.controller)
         if missing is not None:
@@ -209,7 +209,7 @@ class Control(Service):
             raise
         return _list_state_messages(state)
 
-    def _read_fresh_plan(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
+    def _read_fresh_plan(self, clock: Clock) -> tuple[WorldModel | None, Trajectory | None, str]:
         """Read the newest world model and trajectory, and replace those that are too old by None.
 
         Args:

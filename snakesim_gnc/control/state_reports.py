@@ -6,7 +6,7 @@ from snakesim_gnc.control.advance import RecentAdvance
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.states import determine_locomotion_state
 from snakesim_hal.controller import Telemetry
-from snakesim_hal.wire.messages import Clock, ControlState, Description, LocomotionState, World
+from snakesim_hal.wire.messages import Clock, ControlState, LocomotionState, RobotDescription, WorldModel
 from snakesim_hal.wire.outgoing import describe_invalid_field
 
 TELEMETRY_PERIOD_S = 0.05  # period of the messages while the state does not change
@@ -19,7 +19,7 @@ MAX_NAME_LENGTH = (
 class StateReports:
     """Makes a message of control's state when one is due."""
 
-    def __init__(self, controller: str, robot: Description) -> None:
+    def __init__(self, controller: str, robot: RobotDescription) -> None:
         """Prepare the reports about a controller that control publishes, before the first one is due.
 
         Args:
@@ -40,7 +40,7 @@ class StateReports:
 
         self._decoder = msgspec.msgpack.Decoder(ControlState)
 
-    def add_world(self, world: World) -> None:
+    def add_world(self, world: WorldModel) -> None:
         """Add the position of the body and its contact forces from a world model that is fresh."""
         self._measured_contacts.add_world(world)
         if world.center_w is not None:

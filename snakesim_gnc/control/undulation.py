@@ -17,7 +17,7 @@ from snakesim_gnc.control.standstill import StandstillDetector
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 STEERING_DISTANCE_M = 1.0  # how far ahead on the path the head steers for
@@ -67,7 +67,7 @@ class LateralUndulation(Controller[LateralUndulationParameters]):
 
     Parameters = LateralUndulationParameters
 
-    def __init__(self, robot: Description, parameters: LateralUndulationParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: LateralUndulationParameters) -> None:
         super().__init__(robot, parameters)
         self._body = PlanarBody(robot)
         self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
@@ -177,7 +177,7 @@ class CompliantUndulation(HeadSteeredUndulation):
     Parameters = CompliantUndulationParameters
     required_measurements = ("torque",)
 
-    def __init__(self, robot: Description, parameters: CompliantUndulationParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: CompliantUndulationParameters) -> None:
         super().__init__(robot, parameters)
         self._yielded_amplitude_rad = parameters.amplitude_rad
         # Resolving jams; None if jams are not resolved.

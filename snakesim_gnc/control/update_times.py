@@ -3,7 +3,7 @@
 A run that is not in real time has no deadlines, and would not show that the controller misses them.
 """
 
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 # A busy computer delays some updates: so many late ones are accepted.
 MAX_LATE_FRACTION = 0.1
@@ -13,7 +13,7 @@ MAX_LATE_UPDATES = 2
 class UpdateTimes:
     """The wall-clock times of one controller's updates."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         """Start without any update."""
         self._period_s = robot.period_ns * 1e-9
         self._lease_s = robot.lease_ns * 1e-9

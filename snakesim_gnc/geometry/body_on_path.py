@@ -10,7 +10,7 @@ import numpy as np
 from snakesim_gnc.control.climb import compute_path_height_m
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route, find_arc_length_at_distance
-from snakesim_hal.wire.messages import Rise
+from snakesim_hal.wire.messages import PathRise
 
 POSE_SPACING_M = 0.01  # of the cached poses; the interpolation error is 0.005 rad on paths that bend once in 0.15 m
 CHORD_SPACING_M = 0.005  # of the cached chords
@@ -20,7 +20,7 @@ REFINE_ITERATIONS = 2  # corrections from a good first guess
 
 
 @dataclass(frozen=True)
-class BodyPose:
+class PathBodyPose:
     """Pose of the body on the path with its tail end at `tail_s_m`.
 
     Its body points are the tail end, the joints that bend, and the head end: all on the path.
@@ -38,7 +38,7 @@ class BodyOnPath:
     A cached pose is an array of its angles, the points' x, the points' y, and the points' arc lengths.
     """
 
-    def __init__(self, route: Route, segments_m: list[float], rises: Sequence[Rise] = ()) -> None:
+    def __init__(self, route: Route, segments_m: list[float], rises: Sequence[PathRise] = ()) -> None:
         """Prepare to lay a body on a path, with empty caches.
 
         Args:
@@ -57,10 +57,10 @@ class BodyOnPath:
         self._poses: dict[int, Floats] = {}
         self._chord_ends: dict[float, dict[int, float]] = {length: {} for length in segments_m}
 
-    def compute_pose_at(self, tail_s_m: float) -> BodyPose:
+    def compute_pose_at(self, tail_s_m: float) -> PathBodyPose:
         """Return the body with its tail end at an arc length, which may be before the path's start or after its end."""
         pose, _ = self._interpolate_pose(tail_s_m)
-        return BodyPose(
+        return PathBodyPose(
             tail_s_m=tail_s_m,
             angles_rad=pose[: self._yaw_joint_count],
             body_points_w=pose[self._points_slice].reshape(2, self._point_count),

@@ -8,12 +8,12 @@ from statistics import median
 
 import numpy as np
 
-from snakesim_gnc.geometry.body_on_path import BodyPose, compute_chain_points, compute_heading_rad
+from snakesim_gnc.geometry.body_on_path import PathBodyPose, compute_chain_points, compute_heading_rad
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_body_points_w
 from snakesim_hal.model.route import compute_yaw_segments_m
 from snakesim_hal.model.solids import GRAVITY_M_S2
-from snakesim_hal.wire.messages import Description, World
+from snakesim_hal.wire.messages import RobotDescription, WorldModel
 
 MAX_HISTORY_TICKS = 128  # of joint angles: more than the latency of any pose
 
@@ -21,7 +21,7 @@ MAX_HISTORY_TICKS = 128  # of joint angles: more than the latency of any pose
 class PlanarBody:
     """Lengths, limits and indices of a robot. Its body points are the tail end, the yaw joints, and the head end."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         """Derive from a description the lengths, limits and indices that planar computations use.
 
         Joints with another axis than yaw are rigid in the plane: the links on both sides of them are one segment.
@@ -51,7 +51,7 @@ class PlanarBody:
         # Indices of the body points among the tail end (0), all joints (joint i is i + 1) and the head end.
         self._body_point_rows = [0, *(i + 1 for i in self.yaw_joints), len(lengths)]
 
-    def expand_joint_angles(self, body_pose: BodyPose) -> Floats:
+    def expand_joint_angles(self, body_pose: PathBodyPose) -> Floats:
         """Return the angles of all joints, (n_joints,): those of the pose for yaw joints, and 0 for all others."""
         if self._are_all_yaw_joints:
             return body_pose.angles_rad
@@ -59,7 +59,7 @@ class PlanarBody:
         angles_rad[self.yaw_joints] = body_pose.angles_rad
         return angles_rad
 
-    def compute_body_points_w(self, world: World, angles_rad: Sequence[float]) -> Floats:
+    def compute_body_points_w(self, world: WorldModel, angles_rad: Sequence[float]) -> Floats:
         """Compute the points of the measured body on the ground.
 
         Args:
@@ -77,7 +77,7 @@ class PlanarBody:
         heading_rad = compute_heading_rad(world.base_orientation_wxyz)
         return compute_chain_points(world.base_position_w[:2], heading_rad, bend_angles_rad, self.segments_m)
 
-    def compute_joint_positions_w(self, body_pose: BodyPose) -> Floats:
+    def compute_joint_positions_w(self, body_pose: PathBodyPose) -> Floats:
         """Compute the positions of all joints of a body on its path, (n_joints, 2) in m."""
         if self._are_all_yaw_joints:
             return body_pose.body_points_w[:, 1:-1].T
@@ -120,7 +120,7 @@ class JointAngleHistory:
         return nearest_rad
 
 
-def get_pose_time_ns(world: World) -> int:
+def get_pose_time_ns(world: WorldModel) -> int:
     """Return when the body was at the world's base pose.
 
     A measured pose has the timestamp of the sensor. A dead-reckoned pose has that of the world model itself.

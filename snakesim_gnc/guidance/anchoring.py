@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from snakesim_gnc.guidance.body_history import BodyFrames
-from snakesim_gnc.guidance.localization import Localizer
+from snakesim_gnc.guidance.localization import PoseLocalizer
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Contact, Description, Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import Contact, KnownObstacle, RobotDescription
 
 MIN_FORCE_N = 1.0  # a weaker push may be noise
 MAX_CONTACT_DISTANCE_LINKS = 1.5  # along the body, in link lengths: how far an estimated contact may be from its place
@@ -45,14 +45,14 @@ ESTIMATED_CONTACT_TRUST = GapTrust(0.003, 0.002)
 class ObstacleAnchors:
     """The known obstacles, which correct the pose of one robot."""
 
-    def __init__(self, robot: Description, known_obstacles: Sequence[Obstacle]) -> None:
-        self._outlines = Outlines.from_obstacles(known_obstacles)
+    def __init__(self, robot: RobotDescription, known_obstacles: Sequence[KnownObstacle]) -> None:
+        self._outlines = ObstacleOutlines.from_obstacles(known_obstacles)
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._radii_m = np.array([link.radius_m for link in robot.links])
         self._point_fractions = (np.arange(POINTS_PER_LINK) + 0.5) / POINTS_PER_LINK  # of each link's length
 
     def correct_pose(
-        self, localizer: Localizer, angles_rad: Floats, contacts: Sequence[Contact], trust: GapTrust
+        self, localizer: PoseLocalizer, angles_rad: Floats, contacts: Sequence[Contact], trust: GapTrust
     ) -> None:
         """Correct an estimated base pose by the known obstacles near the body.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 HISTORY_NS = 1_000_000_000
 MAX_AHEAD_NS = 50_000_000  # a sample may be this much newer than the newest joint state, which is used then
@@ -58,7 +58,7 @@ class BodyFrames:
 class BodyHistory:
     """Stores base poses and joint angles by timestamp."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         self._axes = [joint.axis for joint in robot.joints]
         self._link_lengths_m = [link.length_m for link in robot.links]
         self._timestamps_ns: list[int] = []

@@ -41,7 +41,7 @@ HIGH_SIDE = 1.0
 
 
 @dataclass(frozen=True)
-class Boxes:
+class FittedBoxes:
     """Boxes in the world, one a row."""
 
     center_w: Floats  # (b, 2)
@@ -75,7 +75,7 @@ class _RotatedPoints:
 Faces = list[Floats]  # positions of the four faces along their axes: low and high of axis 0, low and high of axis 1
 
 
-def fit_boxes(points: Floats, weights: Floats, directions_to_sensor: Floats) -> Boxes:
+def fit_boxes(points: Floats, weights: Floats, directions_to_sensor: Floats) -> FittedBoxes:
     """Fit a box to the points of each obstacle.
 
     The heading of a box is searched in three rounds: among coarse candidates, among fine candidates around the best
@@ -215,7 +215,9 @@ def _interpolate_best_yaw_offset_rad(fit_cost: Floats, best_candidate: NDArray[n
     return np.where(center_candidate == best_candidate, np.clip(offset, -0.5, 0.5) * step_rad, 0.0)
 
 
-def _complete_boxes(points: _RotatedPoints, weights: Floats, yaw_rad: Floats, faces: Faces, fit_cost: Floats) -> Boxes:
+def _complete_boxes(
+    points: _RotatedPoints, weights: Floats, yaw_rad: Floats, faces: Faces, fit_cost: Floats
+) -> FittedBoxes:
     """Return complete boxes from the faces that the sensor saw, with assumed faces on the sides that it did not see.
 
     A sensor sees at most two faces of a box: one on each axis. The ends along both axes give the center and the size in
@@ -250,7 +252,7 @@ def _complete_boxes(points: _RotatedPoints, weights: Floats, yaw_rad: Floats, fa
     sine = np.sin(yaw_rad)
     center_x = cosine * center_box_m[:, 0] - sine * center_box_m[:, 1]
     center_y = sine * center_box_m[:, 0] + cosine * center_box_m[:, 1]
-    return Boxes(
+    return FittedBoxes(
         center_w=np.stack([center_x, center_y], axis=1),
         yaw_rad=yaw_rad,
         half_m=half_m,
@@ -263,7 +265,7 @@ def _complete_boxes(points: _RotatedPoints, weights: Floats, yaw_rad: Floats, fa
 
 
 @dataclass(frozen=True)
-class _Extents:
+class _BoxExtents:
     """What was seen of each obstacle, in the axes of its box: lists by axis or by face, of arrays (b,)."""
 
     low_m: list[Floats]  # by axis: where the points begin
@@ -272,7 +274,7 @@ class _Extents:
     information: list[Floats]  # by face, in 1 / m²
 
 
-def _measure_extents(points: _RotatedPoints, weights: Floats, faces: Faces) -> _Extents:
+def _measure_extents(points: _RotatedPoints, weights: Floats, faces: Faces) -> _BoxExtents:
     """Find the faces that the sensor saw, and the range of the points along both axes of each box.
 
     A face was seen if the points on it extend over more than MIN_FACE_M.
@@ -285,7 +287,7 @@ def _measure_extents(points: _RotatedPoints, weights: Floats, faces: Faces) -> _
     Returns:
         Ranges for both axes, and whether each face was seen and with which information.
     """
-    extents = _Extents([], [], [], [])
+    extents = _BoxExtents([], [], [], [])
     _, is_first_axis = _assign_points_to_faces(points, faces)
     is_point = weights > 0
     for axis in (0, 1):
@@ -304,7 +306,7 @@ def _measure_extents(points: _RotatedPoints, weights: Floats, faces: Faces) -> _
 
 
 def _find_box_ends(
-    axis: int, extents: _Extents, faces: Faces, assumed_depth_m: Floats
+    axis: int, extents: _BoxExtents, faces: Faces, assumed_depth_m: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Find the low end and the high end of b boxes along one axis.
 

@@ -24,7 +24,7 @@ SHAPE_MODEL_SD_M = 0.0015  # of real surfaces from a circle or box, and of point
 
 
 @dataclass(frozen=True)
-class Circles:
+class FittedCircles:
     """Circles in the world, one a row."""
 
     center_w: Floats  # (b, 2)
@@ -35,7 +35,7 @@ class Circles:
 
 def fit_circles(
     points_w: Floats, weights: Floats, outward_directions: Floats, normal_weights: Floats, initial_centers_w: Floats
-) -> Circles:
+) -> FittedCircles:
     """Fit a circle with center c and radius r to the points q of each obstacle.
 
     Minimizes the sum of w (|q - c| - r)² with Huber weights, of (r - r_0)² / sd_0², and of v (a . (q - c))²: the
@@ -68,7 +68,7 @@ def fit_circles(
     surplus_points = np.maximum((weights > 0).sum(axis=1) - 3, 1)
     # If the points scatter more than their weights imply, the covariance is larger by that ratio.
     excess = np.maximum(fit_cost / surplus_points, 1.0)
-    return Circles(centers_w, radii_m, np.linalg.inv(information) * excess[:, None, None], fit_cost)
+    return FittedCircles(centers_w, radii_m, np.linalg.inv(information) * excess[:, None, None], fit_cost)
 
 
 def soften_weights(weights: Floats) -> Floats:

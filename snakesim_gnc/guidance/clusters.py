@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.scan import Scan
+from snakesim_gnc.guidance.scan import AzimuthScan
 from snakesim_hal.base.arrays import Floats
 
 Indices = NDArray[np.intp]
@@ -22,7 +22,7 @@ MIN_SPLIT_POINTS = 5  # a shorter run is not cut
 MIN_CHORD_M = 1e-6
 
 
-def find_clusters(scan: Scan) -> list[Indices]:
+def find_clusters(scan: AzimuthScan) -> list[Indices]:
     """Divide a scan into clusters of bins that show one surface.
 
     A cluster ends at a missing stretch of bins, at a gap that is too wide for a surface seen at a grazing angle, and at
@@ -54,7 +54,7 @@ def find_clusters(scan: Scan) -> list[Indices]:
     return clusters
 
 
-def _split_at_corners(surface_bins: Indices, scan: Scan) -> list[Indices]:
+def _split_at_corners(surface_bins: Indices, scan: AzimuthScan) -> list[Indices]:
     """Split the bins of one surface where the surface is concave as seen from the sensor.
 
     Obstacles are convex, so a concave corner is between two obstacles.

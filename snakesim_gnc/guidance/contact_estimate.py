@@ -37,7 +37,7 @@ from snakesim_gnc.guidance.planar_dynamics import (
 )
 from snakesim_gnc.guidance.sparse_fit import MIN_SIGNIFICANCE_SD, fit_fewest_columns
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Description, Imu, Pose
+from snakesim_hal.wire.messages import Imu, Pose, RobotDescription
 from snakesim_hal.wire.quantities import Vector
 
 # Standard deviations of the measurements; of the shipped robots.
@@ -73,7 +73,7 @@ class _CandidatePush:
 
 
 def estimate_pushes(
-    robot: Description,
+    robot: RobotDescription,
     angles_rad: Sequence[float],
     velocities_rad_s: Sequence[float],
     torques_nm: Sequence[float],

@@ -8,16 +8,16 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import (
     Contact,
     Contacts,
-    Description,
     JointState,
-    Obstacle,
+    KnownObstacle,
     Pose,
-    World,
+    RobotDescription,
     WorldContact,
+    WorldModel,
 )
 
 POSE_CONFIDENCE_DECAY_TIME_S = 0.5  # confidence in a pose falls to 1/e after this time without a new one
@@ -27,7 +27,9 @@ MAX_CONTACT_GAP_M = 0.03  # a contact farther from every known obstacle belongs 
 class SurveyedWorld:
     """Makes world models from the newest sample of each sensor."""
 
-    def __init__(self, robot: Description, known_obstacles: Sequence[Obstacle], *, map_radius_m: float = 0.5) -> None:
+    def __init__(
+        self, robot: RobotDescription, known_obstacles: Sequence[KnownObstacle], *, map_radius_m: float = 0.5
+    ) -> None:
         """Prepare to make world models of a robot among surveyed obstacles.
 
         Args:
@@ -44,10 +46,10 @@ class SurveyedWorld:
         self._mass_fractions = masses_kg / masses_kg.sum()
         # The map.
         self._known_obstacles = list(known_obstacles)
-        self._outlines = Outlines.from_obstacles(known_obstacles)
+        self._outlines = ObstacleOutlines.from_obstacles(known_obstacles)
         self._map_radius_m = map_radius_m
 
-    def update(self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> World:
+    def update(self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> WorldModel:
         """Compute the world model from the newest samples, with contacts and center of mass in the world frame.
 
         Args:
@@ -66,7 +68,7 @@ class SurveyedWorld:
         )
         link_centers_w = link_origins_w + self._half_lengths_m[:, None] * rotations[:, :, 0]
         pose_age_s = max(now_ns - pose.timestamp_ns, 0) * 1e-9
-        return World(
+        return WorldModel(
             tick=tick,
             timestamp_ns=joints.timestamp_ns,
             base_position_w=pose.position_w,
@@ -118,7 +120,7 @@ class SurveyedWorld:
             return self._known_obstacles[nearest_index].name
         return None
 
-    def _find_obstacles_near_body(self, origins_w: Floats) -> list[Obstacle]:
+    def _find_obstacles_near_body(self, origins_w: Floats) -> list[KnownObstacle]:
         """Return the known obstacles within the map radius of the links' origins (n, 3)."""
         x, y = (self._outlines.center_w[:, None] - origins_w[:, :2]).transpose(2, 0, 1)
         gaps_m = np.hypot(x, y).min(axis=1) - self._outlines.bounding_radius_m

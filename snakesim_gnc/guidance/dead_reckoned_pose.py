@@ -10,9 +10,9 @@ import numpy as np
 
 from snakesim_gnc.guidance.anchoring import ESTIMATED_CONTACT_TRUST, MEASURED_CONTACT_TRUST, ObstacleAnchors
 from snakesim_gnc.guidance.body_history import BasePose
-from snakesim_gnc.guidance.localization import Localizer, PoseNoise
+from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
 from snakesim_gnc.guidance.perceived_world import compute_confidence, quaternion_from_rotation
-from snakesim_hal.wire.messages import Contacts, Description, JointState, Obstacle, Pose, World
+from snakesim_hal.wire.messages import Contacts, JointState, KnownObstacle, Pose, RobotDescription, WorldModel
 
 MAX_POSITION_SD_M = 1e3  # upper limits of what is reported
 MAX_YAW_SD_RAD = 10.0
@@ -21,7 +21,7 @@ MAX_YAW_SD_RAD = 10.0
 class DeadReckonedPose:
     """Computes poses from joint states and contacts."""
 
-    def __init__(self, robot: Description, start: BasePose, known_obstacles: Sequence[Obstacle]) -> None:
+    def __init__(self, robot: RobotDescription, start: BasePose, known_obstacles: Sequence[KnownObstacle]) -> None:
         """Create a dead-reckoned pose that starts at a known pose.
 
         Args:
@@ -29,7 +29,7 @@ class DeadReckonedPose:
             start: Base pose at the start.
             known_obstacles: The surveyed obstacles, against which contacts correct the pose.
         """
-        self._localizer = Localizer(robot, start, PoseNoise())
+        self._localizer = PoseLocalizer(robot, start, PoseNoise())
         self._anchors = ObstacleAnchors(robot, known_obstacles)
         self._timestamp_ns = -1
 
@@ -61,7 +61,7 @@ class DeadReckonedPose:
             angular_velocity_w=(0.0, 0.0, 0.0),
         )
 
-    def mark_dead_reckoned(self, world: World) -> World:
+    def mark_dead_reckoned(self, world: WorldModel) -> WorldModel:
         """Return a copy of a world model that is marked as dead-reckoned, with the uncertainty of the pose."""
         position_sd_m = min(self._localizer.position_sd_m, MAX_POSITION_SD_M)
         return msgspec.structs.replace(

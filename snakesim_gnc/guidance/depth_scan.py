@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.ground import MAX_FIT_RANGE_M, compute_tolerance_m, refine_plane
-from snakesim_gnc.guidance.scan import MAX_RANGE_M, OBSTACLE_BAND_M, RangeNoise, Scan
+from snakesim_gnc.guidance.scan import MAX_RANGE_M, OBSTACLE_BAND_M, AzimuthScan, RangeNoise
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage
 
@@ -35,7 +35,7 @@ GROUND_PIXEL_STRIDE = 7  # one pixel in so many is used for the ground's plane
 
 
 @dataclass(frozen=True)
-class Intrinsics:
+class CameraIntrinsics:
     """Intrinsics of a camera; pixel (u, v) sees along (1, -(u - cx) / fx, -(v - cy) / fy) in its frame."""
 
     width: int
@@ -46,9 +46,9 @@ class Intrinsics:
     cy_px: float
 
     @staticmethod
-    def from_image(image: DepthImage) -> "Intrinsics":
+    def from_image(image: DepthImage) -> "CameraIntrinsics":
         """Return the intrinsics of the image's camera."""
-        return Intrinsics(image.width, image.height, image.fx_px, image.fy_px, image.cx_px, image.cy_px)
+        return CameraIntrinsics(image.width, image.height, image.fx_px, image.fy_px, image.cx_px, image.cy_px)
 
     def compute_rays(self) -> Float32Array:
         """Compute the direction of each pixel in the camera's frame, (height * width, 3), row by row from the top.
@@ -74,7 +74,7 @@ def decode_depth_m(image: DepthImage) -> Float32Array:
 
 
 @dataclass(frozen=True)
-class _Pixels:
+class _DepthPixels:
     """Pixels that may show an obstacle; m is their number."""
 
     bins: NDArray[np.int32]  # (m,) of azimuth
@@ -86,7 +86,7 @@ class _Pixels:
 class DepthScanner:
     """Makes scans from the images of one camera."""
 
-    def __init__(self, intrinsics: Intrinsics, noise: RangeNoise) -> None:
+    def __init__(self, intrinsics: CameraIntrinsics, noise: RangeNoise) -> None:
         self.intrinsics = intrinsics
         self._rays = intrinsics.compute_rays()
         self._noise = noise
@@ -95,7 +95,7 @@ class DepthScanner:
 
     def make_scan(
         self, depth_m: Float32Array, timestamp_ns: int, position_w: Floats, rotation: Floats, plane: Floats
-    ) -> Scan:
+    ) -> AzimuthScan:
         """Convert a depth image into a scan of the upright surfaces around the robot.
 
         The ground plane is fitted first. Pixels on it show free space, and pixels in a band of heights above it show
@@ -135,7 +135,7 @@ class DepthScanner:
         band_pixels = np.flatnonzero(is_valid & (heights_m > lowest_m) & (heights_m < highest_m))
         free_m = np.zeros(bin_count)
         np.maximum.at(free_m, bins[is_ground], ranges_m[is_ground])
-        pixels = _Pixels(bins[band_pixels], points[band_pixels], ranges_m[band_pixels], heights_m[band_pixels])
+        pixels = _DepthPixels(bins[band_pixels], points[band_pixels], ranges_m[band_pixels], heights_m[band_pixels])
         return self._make_scan_from_pixels(timestamp_ns, position_w[:2], first_azimuth_rad, free_m, pixels)
 
     def _compute_view(self, rotation: Floats) -> tuple[float, float]:
@@ -147,8 +147,8 @@ class DepthScanner:
         return heading_rad, min(2 * half_fov_rad + 2 * self._step_rad, 2 * math.pi)
 
     def _make_scan_from_pixels(
-        self, timestamp_ns: int, origin_w: Floats, first_azimuth_rad: float, free_m: Floats, pixels: _Pixels
-    ) -> Scan:
+        self, timestamp_ns: int, origin_w: Floats, first_azimuth_rad: float, free_m: Floats, pixels: _DepthPixels
+    ) -> AzimuthScan:
         """Return the scan whose points are the mean of the pixels of the nearest upright surface in each bin.
 
         Args:
@@ -173,7 +173,7 @@ class DepthScanner:
         top_m = np.full(bin_count, -np.inf)
         np.maximum.at(top_m, bins, pixels.heights_m[is_on_surface])
         mean_sd_m = pixel_sd_m / np.sqrt(np.maximum(pixel_count, 1.0))
-        return Scan(
+        return AzimuthScan(
             timestamp_ns=timestamp_ns,
             origin_w=origin_w,
             first_azimuth_w=first_azimuth_rad,
@@ -185,7 +185,7 @@ class DepthScanner:
             top_m=np.where(has_surface, top_m, np.nan),
         )
 
-    def _find_upright_range_m(self, pixels: _Pixels, bin_count: int) -> Floats:
+    def _find_upright_range_m(self, pixels: _DepthPixels, bin_count: int) -> Floats:
         """Find the nearest upright surface in each bin of azimuth.
 
         Args:
@@ -212,7 +212,9 @@ class DepthScanner:
         return np.where(is_upright.any(axis=1), range_m, np.nan)
 
 
-def _average_ranges(pixels: _Pixels, first_range_m: Floats, pixel_sd_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _average_ranges(
+    pixels: _DepthPixels, first_range_m: Floats, pixel_sd_m: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Average the ranges of the pixels of the surface in each bin.
 
     The pixels near the range of their bin are selected, and the range of the bin is set to their mean. This is done

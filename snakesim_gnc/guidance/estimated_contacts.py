@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.model.kinematics import compute_contact_tangents
-from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState, Pose, World
+from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, Pose, RobotDescription, WorldModel
 
 NO_IMU = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
 
@@ -25,7 +25,7 @@ class ContactEstimator:
     A joint without a torque measurement would hide all contacts ahead of it: see `can_estimate_contacts`.
     """
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
 
     def estimate_contacts(self, joints: JointState, imu: Imu | None, pose: Pose | None) -> EstimatedContacts | None:
@@ -75,12 +75,12 @@ class ContactEstimator:
         )
 
 
-def can_estimate_contacts(robot: Description) -> bool:
+def can_estimate_contacts(robot: RobotDescription) -> bool:
     """Return whether all joints of the robot measure their torque."""
     return all("torque" in joint.measures for joint in robot.joints)
 
 
-def mark_estimated(world: World, estimated: EstimatedContacts) -> World:
+def mark_estimated(world: WorldModel, estimated: EstimatedContacts) -> WorldModel:
     """Return a world made with estimated contacts, marked as such, with the confidence of each contact.
 
     A push where the known map has no obstacle is noise, and left out.

@@ -12,10 +12,10 @@ from typing import TypeVar
 import numpy as np
 
 from snakesim_gnc.guidance.body_history import BasePose, BodyHistory, make_rotation_about_z, wrap_angle
-from snakesim_gnc.guidance.odometry import Odometry, OdometryStep
+from snakesim_gnc.guidance.odometry import ChainOdometry, OdometryStep
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
-from snakesim_hal.wire.messages import Contacts, Description, Imu, JointState, Pose
+from snakesim_hal.wire.messages import Contacts, Imu, JointState, Pose, RobotDescription
 
 MessageT = TypeVar("MessageT", Contacts, Imu)
 
@@ -46,10 +46,10 @@ class PoseNoise:
     angle_rad: float = 0.002
 
 
-class Localizer:
+class PoseLocalizer:
     """Estimates the base pose of one robot."""
 
-    def __init__(self, robot: Description, start: BasePose, noise: PoseNoise) -> None:
+    def __init__(self, robot: RobotDescription, start: BasePose, noise: PoseNoise) -> None:
         """Create an estimator of the base pose that starts at a known pose.
 
         Args:
@@ -61,7 +61,7 @@ class Localizer:
         self.base = start
         self.covariance = np.diag(START_SD**2)  # (3, 3) of x, y and heading
         self.history = BodyHistory(robot)
-        self._odometry = Odometry(robot)
+        self._odometry = ChainOdometry(robot)
         self._mean_specific_force_b: Floats | None = None  # (3,) averaged specific force of the tail link
 
         # The pose sensor.

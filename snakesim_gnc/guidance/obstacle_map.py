@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.circle_fit import PRIOR_RADIUS_M, PRIOR_RADIUS_SD_M
 from snakesim_gnc.guidance.clusters import find_clusters
-from snakesim_gnc.guidance.scan import MAX_RANGE_M, Scan
+from snakesim_gnc.guidance.scan import MAX_RANGE_M, AzimuthScan
 from snakesim_gnc.guidance.surfaces import MAX_SEEN_THROUGH_COUNT
 from snakesim_gnc.guidance.tracks import (
     HIT_LOG_ODDS,
@@ -23,17 +23,17 @@ from snakesim_gnc.guidance.tracks import (
     MIN_REPORTED_LOG_ODDS,
     MISS_LOG_ODDS,
     TOUCH_LOG_ODDS,
-    Track,
+    ObstacleTrack,
     fit_shapes,
     get_position_sds_m,
     make_outlines,
 )
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import KnownObstacle
 
 Indices = NDArray[np.intp]
-TrackClaim = tuple[Track, Indices]  # a track, and the bins of a scan that belong to it
+TrackClaim = tuple[ObstacleTrack, Indices]  # a track, and the bins of a scan that belong to it
 
 # Which obstacle a point belongs to.
 BASE_GATE_M = 0.02  # distance from an outline, in addition to what the standard deviations allow
@@ -74,7 +74,7 @@ class ObstacleMap:
     """The obstacles that are known so far."""
 
     def __init__(self) -> None:
-        self.tracks: list[Track] = []
+        self.tracks: list[ObstacleTrack] = []
         self.current_variance_m2 = 0.0  # variance of the robot's position now
         self._track_count = 0  # of all that there ever were
         self._total_drift_m2 = 0.0
@@ -83,7 +83,7 @@ class ObstacleMap:
         """Record that the robot's position has become less certain, relative to all that was mapped before."""
         self._total_drift_m2 += variance_m2
 
-    def list_obstacles(self, now_ns: int, ground_z_m: float) -> list[Obstacle]:
+    def list_obstacles(self, now_ns: int, ground_z_m: float) -> list[KnownObstacle]:
         """Return the obstacles with enough evidence that they exist.
 
         Args:
@@ -96,7 +96,7 @@ class ObstacleMap:
             if track.compute_log_odds_at(now_ns) > MIN_REPORTED_LOG_ODDS
         ]
 
-    def add_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
+    def add_scan(self, scan: AzimuthScan, sd_m: float = 0.0) -> None:
         """Add the points of a scan to the tracks that they belong to, and start new tracks for the others.
 
         Tracks that the scan sees through lose confidence, and duplicate tracks are merged.
@@ -108,8 +108,8 @@ class ObstacleMap:
         nearby_tracks = [track for track in self.tracks if _is_in_range(track, scan)]
         outlines = make_outlines(nearby_tracks)
         bins_by_track: dict[int, list[Indices]] = {}  # by the track's number
-        seen_track_by_number: dict[int, Track] = {}  # by the track's number
-        adjacent_pairs: list[tuple[Track, Track]] = []  # tracks side by side in one cluster
+        seen_track_by_number: dict[int, ObstacleTrack] = {}  # by the track's number
+        adjacent_pairs: list[tuple[ObstacleTrack, ObstacleTrack]] = []  # tracks side by side in one cluster
         for cluster in find_clusters(scan):
             claims = self._assign_cluster_to_tracks(cluster, scan, nearby_tracks, outlines, sd_m)
             for track, bins in claims:
@@ -132,7 +132,7 @@ class ObstacleMap:
             touches: For each contact, the position (2,) on the surface and the normal (2,) into the body, in the world.
             timestamp_ns: Time of the contacts.
         """
-        touched_track_by_number: dict[int, Track] = {}
+        touched_track_by_number: dict[int, ObstacleTrack] = {}
         for position_w, normal_w in touches:
             track = self.find_track(position_w)
             if track is None:
@@ -148,7 +148,7 @@ class ObstacleMap:
             touched_track_by_number[track.number] = track
         fit_shapes(list(touched_track_by_number.values()))
 
-    def find_track(self, position_w: Floats) -> Track | None:
+    def find_track(self, position_w: Floats) -> ObstacleTrack | None:
         """Return the track whose outline is at a position (2,) within its uncertainty; None if there is none."""
         if not self.tracks:
             return None
@@ -174,7 +174,7 @@ class ObstacleMap:
         min_distance_m = radius_m - MAX_OVERLAP_WITH_BODY_M - 2 * sd_m
         left_w = np.gradient(axis_w, axis=0) @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # (n, 2)
         left_w = left_w / np.maximum(np.hypot(left_w[:, 0], left_w[:, 1]), 1e-9)[:, None]
-        changed_tracks: list[Track] = []
+        changed_tracks: list[ObstacleTrack] = []
         for index in np.flatnonzero(gaps_m.min(axis=0) < min_distance_m):
             is_in_body = gaps_m[:, index] < min_distance_m
             _remove_surface_in_body(tracks_with_surface[index], axis_w, left_w, is_in_body, radius_m, min_distance_m)
@@ -197,7 +197,12 @@ class ObstacleMap:
         self.tracks = sorted(near_tracks[:MAX_TRACKS], key=lambda track: track.number)
 
     def _assign_cluster_to_tracks(
-        self, cluster: Indices, scan: Scan, nearby_tracks: Sequence[Track], outlines: Outlines, sd_m: float
+        self,
+        cluster: Indices,
+        scan: AzimuthScan,
+        nearby_tracks: Sequence[ObstacleTrack],
+        outlines: ObstacleOutlines,
+        sd_m: float,
     ) -> list[TrackClaim]:
         """Divide the bins of a cluster among tracks. New tracks are started as needed.
 
@@ -242,7 +247,7 @@ class ObstacleMap:
         claims = [(track, bins) for track, bins in claims if len(bins)]
         return sorted(claims, key=lambda claim: int(claim[1][0]))
 
-    def _start_track_for_cluster(self, cluster: Indices, scan: Scan) -> list[TrackClaim]:
+    def _start_track_for_cluster(self, cluster: Indices, scan: AzimuthScan) -> list[TrackClaim]:
         """Start a track for a whole cluster.
 
         A cluster with fewer than MIN_CLUSTER_POINTS gets no track, except in a scan with a single beam.
@@ -254,7 +259,7 @@ class ObstacleMap:
             return []
         return [(self._start_seen_track(), cluster)]
 
-    def _add_scan_points(self, track: Track, scan: Scan, bins: Indices) -> None:
+    def _add_scan_points(self, track: ObstacleTrack, scan: AzimuthScan, bins: Indices) -> None:
         """Add the points in some bins of a scan to the surface of a track, as evidence that its obstacle exists."""
         self._apply_drift(track)
         towards_sensor = scan.origin_w - scan.points_w[bins]
@@ -265,7 +270,7 @@ class ObstacleMap:
         track.top_m = max(track.top_m, float(np.nanmax(scan.top_m[bins])))
 
     def _lower_belief_in_seen_through_surfaces(
-        self, nearby_tracks: Sequence[Track], scan: Scan, seen_numbers: set[int]
+        self, nearby_tracks: Sequence[ObstacleTrack], scan: AzimuthScan, seen_numbers: set[int]
     ) -> None:
         """Lower the belief in surfaces that a scan sees through, and remove cells that several scans saw through.
 
@@ -290,7 +295,9 @@ class ObstacleMap:
             if track.number not in seen_numbers and np.count_nonzero(is_seen_through) > SEEN_THROUGH_RATIO * visible:
                 track.add_evidence(MISS_LOG_ODDS)
 
-    def _merge_duplicates(self, seen_tracks: Sequence[Track], adjacent_pairs: Sequence[tuple[Track, Track]]) -> None:
+    def _merge_duplicates(
+        self, seen_tracks: Sequence[ObstacleTrack], adjacent_pairs: Sequence[tuple[ObstacleTrack, ObstacleTrack]]
+    ) -> None:
         """Merge tracks that overlap, and adjacent tracks that one shape explains as well as two shapes.
 
         Args:
@@ -308,7 +315,7 @@ class ObstacleMap:
                 merged_numbers.add(newer_track.number)
         self.tracks = [track for track in self.tracks if track.number not in merged_numbers]
 
-    def _find_overlaps(self, seen_tracks: Sequence[Track]) -> list[tuple[Track, Track]]:
+    def _find_overlaps(self, seen_tracks: Sequence[ObstacleTrack]) -> list[tuple[ObstacleTrack, ObstacleTrack]]:
         """Find tracks that may be the same obstacle, because one covers a large part of the other's surface.
 
         Args:
@@ -321,7 +328,7 @@ class ObstacleMap:
         if not seen_tracks:
             return []
         outlines = make_outlines(self.tracks)
-        pairs: list[tuple[Track, Track]] = []
+        pairs: list[tuple[ObstacleTrack, ObstacleTrack]] = []
         for track in seen_tracks:
             offset = outlines.center_w - track.center_w
             apart_m = np.hypot(offset[:, 0], offset[:, 1]) - outlines.bounding_radius_m
@@ -335,7 +342,7 @@ class ObstacleMap:
                     pairs.append((track, other))
         return pairs
 
-    def _merge_if_plausible(self, older: Track, newer: Track, *, overlaps: bool) -> bool:
+    def _merge_if_plausible(self, older: ObstacleTrack, newer: ObstacleTrack, *, overlaps: bool) -> bool:
         """Merge a newer track into an older one, unless two shapes explain their points better than one.
 
         Args:
@@ -346,7 +353,7 @@ class ObstacleMap:
         Returns:
             Whether the tracks were merged.
         """
-        merged = Track(older.number, older.name)
+        merged = ObstacleTrack(older.number, older.name)
         self._apply_drift(older)
         self._apply_drift(newer)
         merged.surface.add_surface(older.surface)
@@ -365,16 +372,16 @@ class ObstacleMap:
         fit_shapes([older])
         return True
 
-    def _apply_drift(self, track: Track) -> None:
+    def _apply_drift(self, track: ObstacleTrack) -> None:
         """Add the drift of the robot's position since a track was last updated to the uncertainty of its surface."""
         if self._total_drift_m2 > track.position_variance_m2 and len(track.surface):
             track.surface.add_variance(self._total_drift_m2 - track.position_variance_m2)
         track.position_variance_m2 = self._total_drift_m2
 
-    def _start_seen_track(self) -> Track:
+    def _start_seen_track(self) -> ObstacleTrack:
         return self._start_track("seen")
 
-    def _start_touched_track(self, position_w: Floats, normal_w: Floats) -> Track:
+    def _start_touched_track(self, position_w: Floats, normal_w: Floats) -> ObstacleTrack:
         """Start a track at a touch, with its center PRIOR_RADIUS_M behind the touched point.
 
         Args:
@@ -386,10 +393,10 @@ class ObstacleMap:
         track.position_sd_m = PRIOR_RADIUS_SD_M
         return track
 
-    def _start_track(self, sense: str) -> Track:
+    def _start_track(self, sense: str) -> ObstacleTrack:
         self._track_count += 1
         name = f"{sense}_{self._track_count}"
-        track = Track(
+        track = ObstacleTrack(
             self._track_count,
             name,
             initial_variance_m2=self.current_variance_m2,
@@ -403,7 +410,12 @@ class ObstacleMap:
 
 
 def _remove_surface_in_body(
-    track: Track, axis_w: Floats, left_w: Floats, is_in_body: NDArray[np.bool_], radius_m: float, min_distance_m: float
+    track: ObstacleTrack,
+    axis_w: Floats,
+    left_w: Floats,
+    is_in_body: NDArray[np.bool_],
+    radius_m: float,
+    min_distance_m: float,
 ) -> None:
     """Remove the part of a track's surface that is in the body, or move the surface to the body's skin.
 
@@ -434,19 +446,19 @@ def _remove_surface_in_body(
     surface.add(skin_w, np.full(len(indices_in_body), SKIN_SD_M), -towards_surface)
 
 
-def _is_in_range(track: Track, scan: Scan) -> bool:
+def _is_in_range(track: ObstacleTrack, scan: AzimuthScan) -> bool:
     return math.hypot(*(track.center_w - scan.origin_w)) < MAX_RANGE_M + SCAN_MARGIN_M
 
 
-def _is_well_known_circle(track: Track) -> bool:
+def _is_well_known_circle(track: ObstacleTrack) -> bool:
     return track.shape == "cylinder" and track.position_sd_m < WELL_KNOWN_SD_M and len(track.surface) > WELL_KNOWN_CELLS
 
 
-def _compute_distance_m(track: Track, axis_w: Floats) -> float:
+def _compute_distance_m(track: ObstacleTrack, axis_w: Floats) -> float:
     """Return the distance from a track's center to the body's axis (n, 2)."""
     offset = axis_w - track.center_w
     return float(np.hypot(offset[:, 0], offset[:, 1]).min())
 
 
-def _get_radius_m(track: Track) -> float:
+def _get_radius_m(track: ObstacleTrack) -> float:
     return track.radius_m if track.shape == "cylinder" else float(track.half_size_m.max())

@@ -20,7 +20,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames
-from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState
+from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, RobotDescription
 
 # Standard deviations of speeds.
 ALONG_NORMAL_SD_M_S = 0.005  # of a body along the normal of a contact
@@ -56,7 +56,7 @@ class _LinkFrames:
     rotations: Floats  # (n, 3, 3)
 
 
-class _Equations(NamedTuple):
+class _MotionEquations(NamedTuple):
     """Linear equations `rows @ motion = values` for the motion of the base."""
 
     rows: Floats  # (m, 3)
@@ -64,10 +64,10 @@ class _Equations(NamedTuple):
     standard_deviations: Floats  # (m,) standard deviations
 
 
-class Odometry:
+class ChainOdometry:
     """Computes steps from joint state to joint state."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         self._axes = [joint.axis for joint in robot.joints]
         self._link_lengths_m = [link.length_m for link in robot.links]
         self._half_lengths_m = 0.5 * np.array(self._link_lengths_m)
@@ -108,7 +108,7 @@ class Odometry:
         equations = self._make_sliding_equations(previous, current, rms_joint_velocity_rad_s)
         if contacts is not None:
             contact_equations = _make_contact_equations(previous, current, contacts.contacts)
-            equations = _Equations(
+            equations = _MotionEquations(
                 rows=np.concatenate([equations.rows, contact_equations.rows]),
                 values=np.concatenate([equations.values, contact_equations.values]),
                 standard_deviations=np.concatenate(
@@ -138,7 +138,7 @@ class Odometry:
 
     def _make_sliding_equations(
         self, previous: _LinkFrames, current: _LinkFrames, rms_joint_velocity_rad_s: float
-    ) -> _Equations:
+    ) -> _MotionEquations:
         """Make the equations that the middles of the links do not move sideways.
 
         Args:
@@ -155,14 +155,16 @@ class Odometry:
         left = current.rotations[:, :2, 1]
         left = left / np.maximum(np.hypot(left[:, 0], left[:, 1]), 1e-6)[:, None]
         sd_m_s = SIDEWAYS_SD_M_S + SIDEWAYS_SD_M_PER_RAD * rms_joint_velocity_rad_s
-        return _Equations(
+        return _MotionEquations(
             rows=_make_step_rows(left, middles[:, :2]),
             values=-np.einsum("ij,ij->i", left, moved),
             standard_deviations=np.ones(len(moved)) * sd_m_s,
         )
 
 
-def _make_contact_equations(previous: _LinkFrames, current: _LinkFrames, contacts: Sequence[Contact]) -> _Equations:
+def _make_contact_equations(
+    previous: _LinkFrames, current: _LinkFrames, contacts: Sequence[Contact]
+) -> _MotionEquations:
     """Make the equations that no contact moves along its normal.
 
     Contacts whose normal is nearly vertical are left out, because the body lies on those obstacles.
@@ -189,7 +191,7 @@ def _make_contact_equations(previous: _LinkFrames, current: _LinkFrames, contact
         position_before = (previous.origins[link] + previous.rotations[link] @ position_l)[:2]
         rows.append(_make_step_rows(normal[None], position[None]))
         values.append(-float(normal @ (position - position_before)))
-    return _Equations(np.vstack(rows), np.array(values), np.full(len(values), ALONG_NORMAL_SD_M_S))
+    return _MotionEquations(np.vstack(rows), np.array(values), np.full(len(values), ALONG_NORMAL_SD_M_S))
 
 
 def _measure_base_rotation(

@@ -11,23 +11,23 @@ import numpy as np
 
 from snakesim_gnc.guidance.body_history import BasePose, BodyFrames
 from snakesim_gnc.guidance.core import transform_contact
-from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, decode_depth_m
+from snakesim_gnc.guidance.depth_scan import CameraIntrinsics, DepthScanner, decode_depth_m
 from snakesim_gnc.guidance.ground import fit_plane_under_body
-from snakesim_gnc.guidance.localization import Localizer, PoseNoise
+from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.scan import RangeNoise, RangingSample, Scan, make_scan
+from snakesim_gnc.guidance.scan import AzimuthScan, RangeNoise, RangingSample, make_scan
 from snakesim_gnc.guidance.scan_match import match_scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire.messages import (
     Contacts,
     DepthImage,
-    Description,
     Imu,
     JointState,
     Pose,
-    World,
+    RobotDescription,
     WorldContact,
+    WorldModel,
 )
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 
@@ -45,7 +45,7 @@ MAX_YAW_SD_RAD = 10.0
 class PerceivedWorld:
     """Makes world models from sensor samples."""
 
-    def __init__(self, robot: Description, start: BasePose, pose_noise: PoseNoise) -> None:
+    def __init__(self, robot: RobotDescription, start: BasePose, pose_noise: PoseNoise) -> None:
         """Create an empty map and an estimate of the base pose, which the samples of sensors then update.
 
         Args:
@@ -63,13 +63,13 @@ class PerceivedWorld:
 
         # The estimates.
         self.map = ObstacleMap()
-        self.localizer = Localizer(robot, start, pose_noise)
+        self.localizer = PoseLocalizer(robot, start, pose_noise)
         self._variance_at_last_scan_m2 = 0.0  # of the position, after the last scan
 
         # Samples.
         self.rejected_sample_counts: Counter[str] = Counter()  # samples that could not be used, by reason
         self.depth_timestamp_ns: int | None = None  # of the newest image or ranges in the map
-        self._scanners: dict[tuple[Intrinsics, RangeNoise], DepthScanner] = {}
+        self._scanners: dict[tuple[CameraIntrinsics, RangeNoise], DepthScanner] = {}
         self._joints: JointState | None = None
         self._contacts: Contacts | None = None
         self._last_touch_ns = 0  # timestamp of the newest contacts in the map; 0 before the first ones
@@ -138,13 +138,13 @@ class PerceivedWorld:
         lowest_points_w = np.vstack([body.origins_w, body.head_end_w]) - [0.0, 0.0, self._radius_m]
         plane = fit_plane_under_body(lowest_points_w, position_w[:2])
         if isinstance(sample, DepthImage):
-            scanner = self._get_scanner(Intrinsics.from_image(sample), noise)
+            scanner = self._get_scanner(CameraIntrinsics.from_image(sample), noise)
             scan = scanner.make_scan(decode_depth_m(sample), sample.timestamp_ns, position_w, rotation, plane)
         else:
             scan = make_scan(sample, position_w, rotation, float(plane[0]), noise)
         self._add_scan_to_map(scan, body)
 
-    def make_world(self, tick: int, now_ns: int) -> World | None:
+    def make_world(self, tick: int, now_ns: int) -> WorldModel | None:
         """Return the world model at the newest joint state, after removing obstacles where the body is.
 
         Args:
@@ -169,7 +169,7 @@ class PerceivedWorld:
         if self._contacts is not None:
             contacts_timestamp_ns = self._contacts.timestamp_ns
             contacts_from = "sensor"
-        return World(
+        return WorldModel(
             tick=tick,
             timestamp_ns=joints.timestamp_ns,
             base_position_w=tuple(base.position_w.tolist()),
@@ -236,7 +236,7 @@ class PerceivedWorld:
             self.rejected_sample_counts[f"{sample_name} without a joint state of its time"] += 1
         return body
 
-    def _get_scanner(self, intrinsics: Intrinsics, noise: RangeNoise) -> DepthScanner:
+    def _get_scanner(self, intrinsics: CameraIntrinsics, noise: RangeNoise) -> DepthScanner:
         """Return the scanner of a camera; it is created at the first call for the camera's intrinsics and noise."""
         key = (intrinsics, noise)
         scanner = self._scanners.get(key)
@@ -245,7 +245,7 @@ class PerceivedWorld:
             self._scanners[key] = scanner
         return scanner
 
-    def _add_scan_to_map(self, scan: Scan, body: BodyFrames) -> None:
+    def _add_scan_to_map(self, scan: AzimuthScan, body: BodyFrames) -> None:
         """Add a scan to the map. Without a recent pose, first correct the base by matching the scan to the map.
 
         Args:
@@ -264,7 +264,7 @@ class PerceivedWorld:
         self.map.add_scan(scan, min(self.localizer.position_sd_m, MAX_SCAN_SD_M))
         self._variance_at_last_scan_m2 = self._compute_position_variance_m2()
 
-    def _correct_base_by_scan(self, scan: Scan) -> Scan:
+    def _correct_base_by_scan(self, scan: AzimuthScan) -> AzimuthScan:
         """Correct the base by matching a scan to the map, and return the scan moved to the corrected base.
 
         If the scan does not match, the base and the scan stay as they are.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.model.solids import GRAVITY_M_S2
-from snakesim_hal.wire.messages import Description, Imu, Pose
+from snakesim_hal.wire.messages import Imu, Pose, RobotDescription
 
 FRICTION_SLIP_SPEED_M_S = 0.01  # a slower link is held by friction as much as it is braked
 LOAD_SHARING_SD = 0.06  # of each link's weight, in each direction: the ground does not carry all links alike
@@ -42,7 +42,7 @@ class ChainDynamics:
     rotor_inertias_kg_m2: Floats  # (n,) inertia of the yaw joints' rotors; zero for others
 
     @classmethod
-    def from_robot(cls, robot: Description, angles_rad: Sequence[float]) -> "ChainDynamics":
+    def from_robot(cls, robot: RobotDescription, angles_rad: Sequence[float]) -> "ChainDynamics":
         """Return the chain at joint angles, (n,) tail to head."""
         axes = [joint.axis for joint in robot.joints]
         lengths = [link.length_m for link in robot.links]

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import DepthImage, Ranges
+from snakesim_hal.wire.messages import DepthImage, RangeScan
 
 OBSTACLE_BAND_M = (0.02, 0.12)  # height above the ground of what a snake's body can touch
 MAX_RANGE_M = 4.0  # farther surfaces are too coarse to be mapped
 DEFAULT_STEP_RAD = 1e-3  # of a range finder with one beam
 
-RangingSample = DepthImage | Ranges  # the messages that the map is made of
+RangingSample = DepthImage | RangeScan  # the messages that the map is made of
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class RangeNoise:
 
 
 @dataclass(frozen=True)
-class Scan:
+class AzimuthScan:
     """One measurement in n bins of equal width in azimuth, counter-clockwise from `first_azimuth_w`."""
 
     timestamp_ns: int
@@ -71,7 +71,7 @@ class Scan:
         neighbors_m = np.minimum(padded_m[:-2], padded_m[2:])
         return np.minimum(neighbors_m, seen_m)
 
-    def mask_bins(self, is_masked: NDArray[np.bool_]) -> "Scan":
+    def mask_bins(self, is_masked: NDArray[np.bool_]) -> "AzimuthScan":
         """Return a copy without the points and the free space of some bins, such as those that show the own body.
 
         Args:
@@ -84,7 +84,7 @@ class Scan:
             free_m=np.where(is_masked, 0.0, self.free_m),
         )
 
-    def move_to_base(self, old_base_w: Floats, new_base_w: Floats) -> "Scan":
+    def move_to_base(self, old_base_w: Floats, new_base_w: Floats) -> "AzimuthScan":
         """Return a copy of the scan that is moved with the base, after a correction of the base pose.
 
         Args:
@@ -103,7 +103,9 @@ class Scan:
         )
 
 
-def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: float, noise: RangeNoise) -> Scan:
+def make_scan(
+    ranges: RangeScan, position_w: Floats, rotation: Floats, ground_z_m: float, noise: RangeNoise
+) -> AzimuthScan:
     """Project the ranges of a range finder or lidar onto the ground, as a scan in the world.
 
     A beam that ends within the band of heights in which obstacles concern the body is a hit. Other beams show only free
@@ -134,7 +136,7 @@ def make_scan(ranges: Ranges, position_w: Floats, rotation: Floats, ground_z_m: 
     is_in_range = (range_m <= MAX_RANGE_M) & (measured_m < ranges.range_max_m)
     is_hit = is_in_range & (height_m > OBSTACLE_BAND_M[0]) & (height_m < OBSTACLE_BAND_M[1])
     points_w = position_w[:2] + measured_m[:, None] * beam_directions[:, :2]
-    return Scan(
+    return AzimuthScan(
         timestamp_ns=ranges.timestamp_ns,
         origin_w=position_w[:2],
         first_azimuth_w=math.atan2(beam_directions[0, 1], beam_directions[0, 0]) - 0.5 * abs(step_rad),

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.scan import Scan
-from snakesim_gnc.guidance.tracks import Track, get_position_sds_m, make_outlines
+from snakesim_gnc.guidance.scan import AzimuthScan
+from snakesim_gnc.guidance.tracks import ObstacleTrack, get_position_sds_m, make_outlines
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import ObstacleOutlines
 
 # Obstacles that the scan is matched to.
 MIN_LOG_ODDS = 1.0  # seen a few times
@@ -39,7 +39,7 @@ class PoseMeasurement:
 
 
 @dataclass(frozen=True)
-class _Residuals:
+class _ScanResiduals:
     """Distances of m scan points from the nearest outlines for one pose correction, as terms of a Gauss-Newton step."""
 
     nearest: NDArray[np.intp]  # (m,) index of the nearest outline
@@ -49,7 +49,7 @@ class _Residuals:
     inlier_count: int
 
 
-def match_scan(scan: Scan, tracks: Sequence[Track], predicted_w: Floats) -> PoseMeasurement | None:
+def match_scan(scan: AzimuthScan, tracks: Sequence[ObstacleTrack], predicted_w: Floats) -> PoseMeasurement | None:
     """Estimate the base pose by aligning a range scan with known obstacles.
 
     Gauss-Newton with Huber weights on the distance from each scan point to the nearest obstacle outline (iterative
@@ -71,7 +71,7 @@ def match_scan(scan: Scan, tracks: Sequence[Track], predicted_w: Floats) -> Pose
     landmark_sd_m = get_position_sds_m(landmarks)
     offsets_from_base_w = scan.points_w[hits] - predicted_w[:2]
     correction = np.zeros(3)
-    residuals: _Residuals | None = None
+    residuals: _ScanResiduals | None = None
     for _ in range(ITERATIONS):
         residuals = _compute_residuals(
             offsets_from_base_w, scan.sd_m[hits], outlines, landmark_sd_m, predicted_w, correction
@@ -91,11 +91,11 @@ def match_scan(scan: Scan, tracks: Sequence[Track], predicted_w: Floats) -> Pose
 def _compute_residuals(
     offsets_from_base_w: Floats,
     sd_m: Floats,
-    outlines: Outlines,
+    outlines: ObstacleOutlines,
     landmark_sd_m: Floats,
     predicted_w: Floats,
     correction: Floats,
-) -> _Residuals:
+) -> _ScanResiduals:
     """Compute the distances e of scan points from the nearest outlines, and the terms of a Gauss-Newton step.
 
     With J the derivatives of e by the correction, and W the Huber weights, the information is J^T W J and the gradient
@@ -133,7 +133,7 @@ def _compute_residuals(
     is_inlier = np.abs(distance_m) < MAX_MATCH_DISTANCE_M
     huber_factors = np.minimum(1.0, HUBER_THRESHOLD_SD * distance_sd_m / np.maximum(np.abs(distance_m), 1e-9))
     weights = is_inlier / distance_sd_m**2 * huber_factors
-    return _Residuals(
+    return _ScanResiduals(
         nearest=nearest,
         weight=weights,
         information=jacobian.T @ (jacobian * weights[:, None]),
@@ -142,7 +142,7 @@ def _compute_residuals(
     )
 
 
-def _is_landmark(track: Track) -> bool:
+def _is_landmark(track: ObstacleTrack) -> bool:
     return (
         track.log_odds >= MIN_LOG_ODDS
         and track.position_sd_m < MAX_LANDMARK_SD_M

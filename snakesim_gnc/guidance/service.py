@@ -20,25 +20,25 @@ from snakesim_gnc.guidance.scan import RangeNoise, RangingSample
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.scenario import RunConfig, compute_start_pose, get_noisy_obstacle_map
 from snakesim_hal.model.sensors import DepthCamera, DistanceSensor
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Clock,
     Contacts,
-    Description,
     Imu,
     JointState,
+    KnownObstacle,
     Message,
-    Obstacle,
     Pose,
-    World,
+    RobotDescription,
+    WorldModel,
 )
 
 MIN_RANGE_NOISE_M = 0.001  # of a ranging sensor; one without noise in the robot's file is not trusted without limit
 
 
-class Guidance(Service):
+class GuidanceService(Service):
     """Makes world models from sensor samples.
 
     With `map = "known"` the obstacles of the scene are known as from a survey. Otherwise guidance does not use them.
@@ -46,7 +46,7 @@ class Guidance(Service):
 
     name = "guidance"
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Subscribe to the sensors of the robot."""
         self._source: _WorldSource
         if config.mission.map == "perceived":
@@ -54,7 +54,7 @@ class Guidance(Service):
         else:
             self._source = _SurveyedSource(client, config)
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         """Create the model for this robot."""
         self._source.configure(robot)
 
@@ -69,11 +69,11 @@ class Guidance(Service):
 class _WorldSource(Protocol):
     """Makes world models, either from a surveyed map or from the sensors alone."""
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         """Create the model for this robot."""
         ...
 
-    def make_world(self, clock: Clock) -> World | None:
+    def make_world(self, clock: Clock) -> WorldModel | None:
         """Return the world model at this tick, from the newest samples; None while it is unknown."""
         ...
 
@@ -81,7 +81,7 @@ class _WorldSource(Protocol):
 class _SurveyedSource:
     """Uses the scene's map. Dead reckoning replaces a missing pose sensor, an estimate missing contact sensors."""
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Subscribe to the sensors, and read the surveyed obstacles of the scene.
 
         Args:
@@ -91,7 +91,7 @@ class _SurveyedSource:
         sensors = config.robot.sensors
         self._client = client
         self._config = config
-        self._surveyed_obstacles: Sequence[Obstacle] = get_noisy_obstacle_map(config)
+        self._surveyed_obstacles: Sequence[KnownObstacle] = get_noisy_obstacle_map(config)
 
         # Subscriptions.
         self._joint_feed = client.subscribe(keys.JOINTS, JointState)
@@ -104,7 +104,7 @@ class _SurveyedSource:
         self._dead_reckoned_pose: DeadReckonedPose | None = None  # for a robot without a pose sensor
         self._estimator: ContactEstimator | None = None  # for a robot without contact sensors
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         self._model = SurveyedWorld(robot, self._surveyed_obstacles)
         self._dead_reckoned_pose = None
         if self._config.uses_dead_reckoning(robot):
@@ -118,7 +118,7 @@ class _SurveyedSource:
             self._estimator = ContactEstimator(robot)
             print_stderr("no contact sensors: contacts are estimated from the torques of the joints")
 
-    def make_world(self, clock: Clock) -> World | None:
+    def make_world(self, clock: Clock) -> WorldModel | None:
         """Return the world model of surveyed obstacles, from the newest samples.
 
         Without a contact sensor contacts are estimated, and without a pose sensor the pose is dead-reckoned. The world
@@ -168,7 +168,7 @@ class _SurveyedSource:
 class _PerceivedSource:
     """Uses only what the sensors measure, and the pose in which the robot starts."""
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Subscribe to the sensors from which the map and the pose are estimated.
 
         Args:
@@ -202,11 +202,11 @@ class _PerceivedSource:
         self._model: PerceivedWorld | None = None
         self._last_used_ns_by_key: dict[str, int] = {}  # timestamp of the newest sample that was used, by key
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         self._model = PerceivedWorld(robot, self._start, self._pose_noise)
         self._last_used_ns_by_key.clear()
 
-    def make_world(self, clock: Clock) -> World | None:
+    def make_world(self, clock: Clock) -> WorldModel | None:
         """Update the perceived world by the newest samples, and return the world model.
 
         Each sample of contacts, cameras and range finders is used once.

@@ -27,7 +27,7 @@ def _make_empty_array(*shape: int) -> Floats:
 
 
 @dataclass
-class Surface:
+class SurfaceCells:
     """Cells in the world; n is their number."""
 
     points_w: Floats = field(default_factory=lambda: _make_empty_array(0, 2))  # (n, 2)
@@ -79,7 +79,7 @@ class Surface:
                 self.seen_through_counts,
             )
 
-    def add_surface(self, other: "Surface") -> None:
+    def add_surface(self, other: "SurfaceCells") -> None:
         """Add the cells of another surface."""
         self.add(other.points_w, 1.0 / np.sqrt(other.weights), other.outward_directions_w, other.normal_weights)
 
@@ -142,7 +142,7 @@ class Surface:
         np.minimum.at(self.seen_through_counts, cell_indices, seen_through_counts)
 
 
-def stack_surfaces(surfaces: list[Surface]) -> tuple[Floats, Floats, Floats, Floats]:
+def stack_surfaces(surfaces: list[SurfaceCells]) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the cells of b surfaces as arrays, padded to the largest number of cells p.
 
     Args:

@@ -12,12 +12,12 @@ from typing import Literal
 
 import numpy as np
 
-from snakesim_gnc.guidance.box_fit import Boxes, fit_boxes
-from snakesim_gnc.guidance.circle_fit import PRIOR_RADIUS_M, Circles, fit_circles
-from snakesim_gnc.guidance.surfaces import Surface, stack_surfaces
+from snakesim_gnc.guidance.box_fit import FittedBoxes, fit_boxes
+from snakesim_gnc.guidance.circle_fit import PRIOR_RADIUS_M, FittedCircles, fit_circles
+from snakesim_gnc.guidance.surfaces import SurfaceCells, stack_surfaces
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import KnownObstacle
 
 # Circle or box.
 MIN_BOX_CELLS = 5  # a surface of fewer cells is a circle
@@ -44,14 +44,14 @@ MAX_SD_M = 10.0  # upper limit of what is reported
 
 
 @dataclass
-class Track:
+class ObstacleTrack:
     """An obstacle under observation. Its name stays, even if the obstacle turns out to be something else."""
 
     # Identity.
     number: int
     name: str
     # What was measured.
-    surface: Surface = field(default_factory=Surface)
+    surface: SurfaceCells = field(default_factory=SurfaceCells)
     is_touched: bool = False  # the body has touched it
     log_odds: float = 0.0
     last_seen_ns: int = 0
@@ -84,7 +84,7 @@ class Track:
         age_ns = max(now_ns - self.last_seen_ns, 0)
         return self.log_odds * math.exp(-age_ns * 1e-9 / LOG_ODDS_DECAY_TIME_S)
 
-    def to_obstacle(self, now_ns: int, ground_z_m: float) -> Obstacle:
+    def to_obstacle(self, now_ns: int, ground_z_m: float) -> KnownObstacle:
         """Return the track as an obstacle of a world model, with its shape, size, confidence and uncertainty.
 
         Args:
@@ -101,7 +101,7 @@ class Track:
             half_size_m = (float(self.half_size_m[0]), float(self.half_size_m[1]), height_m / 2)
         else:
             radius_m = self.radius_m
-        return Obstacle(
+        return KnownObstacle(
             name=self.name,
             shape=self.shape,
             position_w=(x, y, ground_z_m + height_m / 2),
@@ -116,7 +116,7 @@ class Track:
             touched=self.is_touched,
         )
 
-    def set_circle(self, circles: Circles, row: int, cost: float) -> None:
+    def set_circle(self, circles: FittedCircles, row: int, cost: float) -> None:
         """Take the shape from a row of a circle fit."""
         covariance = circles.covariance[row]
         self.shape = "cylinder"
@@ -126,7 +126,7 @@ class Track:
         self.position_sd_m = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
         self.size_sd_m = math.sqrt(float(covariance[2, 2]))
 
-    def set_box(self, boxes: Boxes, row: int, cost: float) -> None:
+    def set_box(self, boxes: FittedBoxes, row: int, cost: float) -> None:
         """Take the shape from a row of a box fit."""
         self.shape = "box"
         self.penalized_cost = cost
@@ -137,7 +137,7 @@ class Track:
         self.size_sd_m = float(boxes.half_size_sd_m[row].max())
 
 
-def fit_shapes(tracks: Sequence[Track]) -> None:
+def fit_shapes(tracks: Sequence[ObstacleTrack]) -> None:
     """Fit a circle or a box to the surface of each track, in one vectorized computation.
 
     The shape with the lower cost is used: the misfit plus a penalty for each parameter (Bayesian information
@@ -159,7 +159,7 @@ def fit_shapes(tracks: Sequence[Track]) -> None:
 
     box_cost = np.full(len(tracks), np.inf)
     box_row_by_track: dict[int, int] = {}  # row in `boxes`, by index of the track
-    boxes: Boxes | None = None
+    boxes: FittedBoxes | None = None
     candidates = np.flatnonzero(
         (cell_counts >= MIN_BOX_CELLS) & (circles.fit_cost > MAX_GOOD_CIRCLE_COST_PER_CELL * cell_counts)
     )
@@ -181,26 +181,26 @@ def fit_shapes(tracks: Sequence[Track]) -> None:
             track.set_box(boxes, box_row_by_track[index], float(box_cost[index]))
 
 
-def _find_initial_center(track: Track) -> Floats:
+def _find_initial_center(track: ObstacleTrack) -> Floats:
     """Return the center from which a circle fit begins; NaN without an earlier one."""
     if track.shape == "cylinder" and track.is_fitted:
         return track.center_w
     return NO_CENTER
 
 
-def _compute_circle_preference(track: Track) -> float:
+def _compute_circle_preference(track: ObstacleTrack) -> float:
     """Return by how much a circle may cost more than a box. It favors the shape that the track has."""
     if not track.is_fitted:
         return 0.0
     return SHAPE_CHANGE_COST if track.shape == "cylinder" else -SHAPE_CHANGE_COST
 
 
-def make_outlines(tracks: Sequence[Track]) -> Outlines:
+def make_outlines(tracks: Sequence[ObstacleTrack]) -> ObstacleOutlines:
     """Return the shapes of tracks, for distances to all of them."""
     is_box = np.array([track.shape == "box" for track in tracks], dtype=bool)
     yaw_rad = np.array([track.yaw_rad for track in tracks], dtype=np.float64)
     half_m = np.array([track.half_size_m for track in tracks], dtype=np.float64).reshape(-1, 2)
-    return Outlines(
+    return ObstacleOutlines(
         center_w=np.array([track.center_w for track in tracks], dtype=np.float64).reshape(-1, 2),
         direction=np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad)]),
         half_m=np.where(is_box[:, None], half_m, 0.0),
@@ -208,6 +208,6 @@ def make_outlines(tracks: Sequence[Track]) -> Outlines:
     )
 
 
-def get_position_sds_m(tracks: Sequence[Track]) -> Floats:
+def get_position_sds_m(tracks: Sequence[ObstacleTrack]) -> Floats:
     """Return the standard deviations of the positions of tracks, (n,)."""
     return np.array([track.position_sd_m for track in tracks], dtype=np.float64)

@@ -35,18 +35,18 @@ from snakesim_gnc.navigation.plan import (
     SHIFTED,
     START,
     STUCK,
-    Plan,
     PlanningTask,
+    PushPlan,
     compute_limited_heading_rad,
     make_straight_path,
     search_plan,
 )
 from snakesim_gnc.navigation.planning_goal import PlanningGoal
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
-from snakesim_hal.wire.messages import Obstacle, Trajectory, World
+from snakesim_hal.wire.messages import KnownObstacle, Trajectory, WorldModel
 
 NODES_PER_S = 250_000  # of robot time: two fifths of what a core expands, see docs/concepts/path-planning.md
 
@@ -78,7 +78,7 @@ class ClutterPlanner:
     def __init__(
         self,
         goal: HeadingGoal | WaypointGoal,
-        known_obstacles: Sequence[Obstacle] | None,
+        known_obstacles: Sequence[KnownObstacle] | None,
         *,
         search_parameters: SearchParameters,
         update_period_s: float = 0.2,
@@ -104,7 +104,7 @@ class ClutterPlanner:
         self._planning_duration_s = (replan_nodes / self._nodes_per_update + 1) * update_period_s
 
         # The path that is followed.
-        self._plan: Plan | None = None
+        self._plan: PushPlan | None = None
         self._plan_time_ns = 0
         self._planned_heading_rad: float | None = None  # None if the path was not planned for a direction
         self._planned_obstacle_shapes = np.empty((0, 5))  # obstacles around the head when it was planned
@@ -113,7 +113,7 @@ class ClutterPlanner:
         self._last_tick = -1
 
         # The plan that is being searched.
-        self._running_plan: Generator[int, None, Plan] | None = None
+        self._running_plan: Generator[int, None, PushPlan] | None = None
         self._search_reason = ""  # why it is searched; empty if none is
         self._next_step_cost_nodes = 0  # cost of its next step, in nodes to expand
         self._saved_node_budget = 0  # left over from updates that could not afford the next step
@@ -142,7 +142,7 @@ class ClutterPlanner:
             route: The route to follow. A path that is planned later begins on it.
             push_points: Names of the obstacles that the body pushes off on it.
         """
-        self._plan = Plan(route, push_points)
+        self._plan = PushPlan(route, push_points)
         self._published_path_id = 0
         self._planned_heading_rad = None
         self._discard_running_plan()
@@ -151,7 +151,7 @@ class ClutterPlanner:
         self._failed_w.clear()
         self._trail_w.clear()
 
-    def update(self, tick: int, world: World, body_points_w: Floats, desired: DesiredMotion) -> Trajectory:
+    def update(self, tick: int, world: WorldModel, body_points_w: Floats, desired: DesiredMotion) -> Trajectory:
         """Return the trajectory of this tick, and expand at most a fixed number of nodes of the running path search.
 
         Until a new plan is complete, the last complete plan is returned.
@@ -201,7 +201,7 @@ class ClutterPlanner:
             return desired.speed_m_s * -BACK_OUT_SPEED_RATIO, reason
         return desired.speed_m_s, reason
 
-    def _start_or_continue_plan(self, body_w: Floats, world: World, desired: DesiredMotion) -> None:
+    def _start_or_continue_plan(self, body_w: Floats, world: WorldModel, desired: DesiredMotion) -> None:
         """Start a search if another path is needed, and continue the running search by the work of one update.
 
         At the first call the plan becomes a straight line ahead of the body, so that there is always one afterwards.
@@ -214,7 +214,7 @@ class ClutterPlanner:
         self.expanded_nodes = 0
         self._update_tail_trail(body_w[0])
         if self._plan is None:
-            self._plan = Plan(Route(make_straight_path(body_w)), [])
+            self._plan = PushPlan(Route(make_straight_path(body_w)), [])
             self._published_path_id = 0
             self._start_plan(START, body_w, world, 0.0)
         elif self._goal.is_reached or desired.speed_m_s == 0.0:
@@ -229,7 +229,7 @@ class ClutterPlanner:
         if self._running_plan is not None:
             self._continue_plan(self._running_plan, world.timestamp_ns)
 
-    def _start_plan(self, reason: str, body_w: Floats, world: World, committed_m: float) -> None:
+    def _start_plan(self, reason: str, body_w: Floats, world: WorldModel, committed_m: float) -> None:
         """Start to plan a path from the current position of the body; later updates continue it.
 
         Args:
@@ -256,7 +256,7 @@ class ClutterPlanner:
         self._search_reason = reason
         self._next_step_cost_nodes = next(self._running_plan)
 
-    def _continue_plan(self, running_plan: Generator[int, None, Plan], now_ns: int) -> None:
+    def _continue_plan(self, running_plan: Generator[int, None, PushPlan], now_ns: int) -> None:
         """Do the steps of the running search that this update can afford, and use the plan when it is complete.
 
         Args:
@@ -274,7 +274,7 @@ class ClutterPlanner:
                 return
         self._saved_node_budget = 0 if self.expanded_nodes else node_budget
 
-    def _replace_plan(self, plan: Plan, now_ns: int) -> None:
+    def _replace_plan(self, plan: PushPlan, now_ns: int) -> None:
         """Follow a new plan from now on, under a new path number."""
         self._plan = plan
         self._plan_time_ns = now_ns
@@ -313,7 +313,7 @@ class ClutterPlanner:
         return float(np.hypot(*(middle_w - oldest_w)))
 
     def _find_replanning_reason(
-        self, plan: Plan, body_w: Floats, world: World, moved_m: float | None, committed_m: float
+        self, plan: PushPlan, body_w: Floats, world: WorldModel, moved_m: float | None, committed_m: float
     ) -> str:
         """Return why another path is needed, or an empty string. It also starts and ends the backing out of a jam.
 
@@ -373,7 +373,7 @@ class ClutterPlanner:
         heading_rad = compute_limited_heading_rad(body_w, self._goal.direction_w)
         return abs(math.remainder(heading_rad - self._planned_heading_rad, math.tau)) > MIN_GOAL_TURN_RAD
 
-    def _has_map_changed(self, head_w: Floats, obstacles: Sequence[Obstacle]) -> bool:
+    def _has_map_changed(self, head_w: Floats, obstacles: Sequence[KnownObstacle]) -> bool:
         """Return whether the map around the head differs from the one that the current path was planned on."""
         planned = self._planned_obstacle_shapes
         shapes = _describe_obstacle_shapes_near(head_w, obstacles)
@@ -422,9 +422,9 @@ class ClutterPlanner:
         del trail[: -2 * MAX_TRAIL_POINTS]
 
 
-def _describe_obstacle_shapes_near(head_w: Floats, obstacles: Sequence[Obstacle]) -> Floats:
+def _describe_obstacle_shapes_near(head_w: Floats, obstacles: Sequence[KnownObstacle]) -> Floats:
     """Return center x, y, half sizes and rounding of the k obstacles near the head, (k, 5) in m."""
-    outlines = Outlines.from_obstacles(obstacles)
+    outlines = ObstacleOutlines.from_obstacles(obstacles)
     offset = outlines.center_w - head_w
     is_near = np.hypot(offset[:, 0], offset[:, 1]) < MAP_RADIUS_M
     return np.column_stack([outlines.center_w, outlines.half_m, outlines.rounding_m])[is_near]

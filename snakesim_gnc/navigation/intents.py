@@ -5,7 +5,7 @@ Pure except for its own state. All times are robot time.
 
 from dataclasses import dataclass
 
-from snakesim_hal.wire.messages import Intent
+from snakesim_hal.wire.messages import LocomotionIntent
 
 MAX_VALIDITY_NS = 5_000_000_000  # an intent expires after this, whatever validity it asks for
 MAX_SPEED_M_S = 10.0  # as for a scenario's mission
@@ -22,7 +22,7 @@ class DesiredMotion:
     heading_w_rad: float | None = None  # direction of travel; None for the mission's
 
 
-class Intents:
+class IntentTracker:
     """Follows the newest valid intent until it expires, and then stops.
 
     The mission does not resume: an operator whose connection breaks must not set the robot in motion.
@@ -31,7 +31,7 @@ class Intents:
     def __init__(self, mission_speed_m_s: float) -> None:
         """Follow the mission's speed until the first intent arrives."""
         self._mission_speed_m_s = mission_speed_m_s
-        self._followed_intent: Intent | None = None
+        self._followed_intent: LocomotionIntent | None = None
         self._stop_reason = ""  # why the robot stands after an intent; empty before the first one
         self._heading_w_rad: float | None = None  # stays during a stop, so that a stop causes no other path
         self._newest_timestamp_by_requester: dict[
@@ -44,7 +44,7 @@ class Intents:
         if self._followed_intent is not None:
             self._stop_following(f"the intent of {self._followed_intent.requester} was for another start of the robot")
 
-    def choose_motion(self, newest_intent: Intent | None, now_ns: int) -> DesiredMotion:
+    def choose_motion(self, newest_intent: LocomotionIntent | None, now_ns: int) -> DesiredMotion:
         """Choose the desired motion at a robot time, and start or stop to follow an intent.
 
         Args:
@@ -65,13 +65,13 @@ class Intents:
             return DesiredMotion(speed_m_s, rejection or self._stop_reason, self._heading_w_rad)
         return self._make_motion(self._followed_intent)
 
-    def _make_motion(self, intent: Intent) -> DesiredMotion:
+    def _make_motion(self, intent: LocomotionIntent) -> DesiredMotion:
         if not intent.go:
             return DesiredMotion(0.0, f"{intent.requester} wants it to stop", self._heading_w_rad)
         speed_m_s = self._mission_speed_m_s if intent.speed_m_s is None else intent.speed_m_s
         return DesiredMotion(speed_m_s, f"as {intent.requester} wants it", self._heading_w_rad)
 
-    def _start_following(self, intent: Intent) -> None:
+    def _start_following(self, intent: LocomotionIntent) -> None:
         self._followed_intent = intent
         self._stop_reason = ""
         if intent.go:
@@ -83,7 +83,7 @@ class Intents:
             oldest_sender = next(iter(self._newest_timestamp_by_requester))
             del self._newest_timestamp_by_requester[oldest_sender]
 
-    def _find_reordering_reason(self, intent: Intent) -> str:
+    def _find_reordering_reason(self, intent: LocomotionIntent) -> str:
         """Return why an intent is rejected that was sent before one that is followed already; empty if it was not.
 
         The network may delay an intent. A sender that has asked for a stop must not be set in motion by an intent that
@@ -99,7 +99,7 @@ class Intents:
         self._stop_reason = f"{reason}; send a new one to go on"
 
 
-def _find_rejection_reason(intent: Intent, now_ns: int) -> str:
+def _find_rejection_reason(intent: LocomotionIntent, now_ns: int) -> str:
     """Return why an intent is rejected at a robot time; an empty text if it is valid."""
     age_ns = now_ns - intent.timestamp_ns
     valid_ns = min(intent.valid_for_ns, MAX_VALIDITY_NS)

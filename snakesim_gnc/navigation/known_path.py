@@ -7,7 +7,7 @@ import numpy as np
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle, Trajectory, World
+from snakesim_hal.wire.messages import KnownObstacle, Trajectory, WorldModel
 
 MAX_PUSH_DISTANCE_M = 0.15  # the body can push on an obstacle whose outline is nearer to the path than this
 PUSH_POINTS_AHEAD_M = 3.0  # length of path whose push-points are reported
@@ -17,7 +17,9 @@ MAX_REASON_LENGTH = 500
 class KnownPath:
     """Follows one route at the desired speed."""
 
-    def __init__(self, route: Route, obstacles: Sequence[Obstacle], assumed_obstacle_friction: float = 0.0) -> None:
+    def __init__(
+        self, route: Route, obstacles: Sequence[KnownObstacle], assumed_obstacle_friction: float = 0.0
+    ) -> None:
         """Prepare to follow a route, and find the push-points beside it.
 
         Args:
@@ -31,7 +33,7 @@ class KnownPath:
         self._push_points = _find_push_points_beside_route(route, obstacles)
         self._tail_s_m: float | None = None
 
-    def update(self, tick: int, world: World | None, desired: DesiredMotion) -> Trajectory:
+    def update(self, tick: int, world: WorldModel | None, desired: DesiredMotion) -> Trajectory:
         """Return the trajectory along the route from the current position of the body.
 
         Args:
@@ -63,7 +65,7 @@ class KnownPath:
         return [name for s_m, name in self._push_points if tail_s_m <= s_m <= tail_s_m + PUSH_POINTS_AHEAD_M]
 
 
-def _find_push_points_beside_route(route: Route, obstacles: Sequence[Obstacle]) -> list[tuple[float, str]]:
+def _find_push_points_beside_route(route: Route, obstacles: Sequence[KnownObstacle]) -> list[tuple[float, str]]:
     """Return arc length in m and name of the obstacles beside a route, in order along it."""
     push_points: list[tuple[float, str]] = []
     for obstacle in obstacles:

@@ -16,8 +16,8 @@ from snakesim_gnc.navigation.path_search.native_library import (
     load_library,
 )
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import KnownObstacle
 
 Ints = NDArray[np.int64]
 
@@ -44,12 +44,12 @@ class ObstacleGrid:
     Where gaps between obstacles are wider than the body, the body can touch no other obstacle than the nearest one.
     """
 
-    def __init__(self, obstacles: Sequence[Obstacle]) -> None:
+    def __init__(self, obstacles: Sequence[KnownObstacle]) -> None:
         for _ in self._compute_nearest_obstacles_incrementally(obstacles):
             pass
 
     @classmethod
-    def build_in_steps(cls, obstacles: Sequence[Obstacle]) -> "Generator[int, None, ObstacleGrid]":
+    def build_in_steps(cls, obstacles: Sequence[KnownObstacle]) -> "Generator[int, None, ObstacleGrid]":
         """Build a grid step by step and return it.
 
         Yields:
@@ -59,7 +59,9 @@ class ObstacleGrid:
         yield from grid._compute_nearest_obstacles_incrementally(obstacles)
         return grid
 
-    def _compute_nearest_obstacles_incrementally(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
+    def _compute_nearest_obstacles_incrementally(
+        self, obstacles: Sequence[KnownObstacle]
+    ) -> Generator[int, None, None]:
         """Compute the distance field: the nearest obstacle of each cell, and its distance.
 
         The computation is a generator, whose steps a planner can spread over several ticks.
@@ -73,7 +75,7 @@ class ObstacleGrid:
             Cost of the following step, in units of one expanded node of the path search.
         """
         self.obstacles = list(obstacles)
-        self.outlines = Outlines.from_obstacles(self.obstacles)
+        self.outlines = ObstacleOutlines.from_obstacles(self.obstacles)
         if not self.obstacles:
             self._fill_empty()
             return

@@ -18,7 +18,7 @@ from snakesim_gnc.navigation.path_search.search_parameters import MIN_PUSH, STEP
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 
 # Reasons for a plan; `Trajectory.searching` shows them.
 START = "the first path"
@@ -55,7 +55,7 @@ NODES_PER_FITTED_POINT = 12  # nodes that could be expanded in the time that the
 
 
 @dataclass(frozen=True)
-class Plan:
+class PushPlan:
     """A path, and the obstacles that the body pushes off on it."""
 
     route: Route
@@ -69,14 +69,14 @@ class PlanningTask:
     reason: str
     body_w: Floats  # (n, 2) evenly spaced, tail to head
     goal_w: Floats  # (2,) unit vector
-    obstacles: ObstacleGrid | Sequence[Obstacle]
+    obstacles: ObstacleGrid | Sequence[KnownObstacle]
     route: Route  # the current one
     committed_m: float  # length of the current route ahead of the head that stays
     failed_w: Floats | None  # (k, 2) points of paths on which the body got stuck here
     trail_w: list[Floats]  # (2,) each: where the tail was, the newest last
 
 
-def search_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[int, None, Plan]:
+def search_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[int, None, PushPlan]:
     """Search a path for the reason of a task, fit it to the obstacles beside it, and return it with its push-points.
 
     It is a generator, so that a planner can spread the work over several ticks. If no path is found, the plan goes
@@ -108,7 +108,7 @@ def search_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[i
         points_w = fit_path(points_w, fixed_point_count, grid, task.goal_w, fit_parameters)
     points_w = _prepend_trail(points_w, task.trail_w)
     push_points = _find_push_points(points_w, grid, task.goal_w, parameters.radius_m)
-    return Plan(Route(points_w), push_points)
+    return PushPlan(Route(points_w), push_points)
 
 
 def make_straight_path(body_w: Floats) -> Floats:

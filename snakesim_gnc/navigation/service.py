@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_gnc.geometry.planar_body import JointAngleHistory, PlanarBody, get_pose_time_ns
 from snakesim_gnc.navigation.clutter import ClutterPlanner
-from snakesim_gnc.navigation.intents import DesiredMotion, Intents
+from snakesim_gnc.navigation.intents import DesiredMotion, IntentTracker
 from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.platform_rises import PlatformRises
@@ -20,15 +20,24 @@ from snakesim_hal.model.scenario import (
     get_noisy_obstacle_map,
 )
 from snakesim_hal.model.scene import make_route
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Description, Intent, JointState, Message, Obstacle, Trajectory, World
+from snakesim_hal.wire.messages import (
+    Clock,
+    JointState,
+    KnownObstacle,
+    LocomotionIntent,
+    Message,
+    RobotDescription,
+    Trajectory,
+    WorldModel,
+)
 
 DEFAULT_ROUTE_LENGTH_M = 100.0  # of the straight line that a scene without a route gets
 
 
-class Navigation(Service):
+class NavigationService(Service):
     """Makes trajectories from the mission and intents.
 
     Without a goal the robot follows the scene's route, or a straight line from its start. For a mission with a goal, or
@@ -37,16 +46,16 @@ class Navigation(Service):
 
     name = "navigation"
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         """Subscribe to the world model, intents and joint states."""
         self._config = config
         self._client = client
-        self._world_feed = client.subscribe(keys.WORLD, World)
-        self._intent_feed = client.subscribe(keys.INTENT, Intent)
+        self._world_feed = client.subscribe(keys.WORLD, WorldModel)
+        self._intent_feed = client.subscribe(keys.INTENT, LocomotionIntent)
         self._joint_feed = client.subscribe(keys.JOINTS, JointState)
-        self._intents = Intents(config.mission.speed_m_s)
+        self._intents = IntentTracker(config.mission.speed_m_s)
 
-    def configure(self, robot: Description) -> None:
+    def configure(self, robot: RobotDescription) -> None:
         """Create the planners for a robot, after a start or a reconnection, when the robot's position is unknown.
 
         Args:
@@ -105,7 +114,7 @@ class Navigation(Service):
             return None
         return [(keys.TRAJECTORY, self._add_rises(trajectory))]
 
-    def _plan_trajectory(self, clock: Clock, world: World | None, desired: DesiredMotion) -> Trajectory | None:
+    def _plan_trajectory(self, clock: Clock, world: WorldModel | None, desired: DesiredMotion) -> Trajectory | None:
         """Return the trajectory of the clutter planner; None without a world model or while time waits for a path."""
         if world is None or not self._recent_angles:
             return None
@@ -125,7 +134,7 @@ class Navigation(Service):
         return msgspec.structs.replace(trajectory, rises=rises)
 
 
-def _find_platforms(config: RunConfig, robot: Description) -> Sequence[Obstacle]:
+def _find_platforms(config: RunConfig, robot: RobotDescription) -> Sequence[KnownObstacle]:
     """Return the surveyed platforms that the robot may climb; an empty list without pitch joints or a known map."""
     can_pitch = any(joint.axis == "pitch" for joint in robot.joints)
     if config.mission.map != "known" or not can_pitch:
@@ -134,7 +143,7 @@ def _find_platforms(config: RunConfig, robot: Description) -> Sequence[Obstacle]
     return [platform for platform in platforms if platform.height_m <= config.mission.max_climb_m]
 
 
-def _make_known_path(config: RunConfig, known_obstacles: Sequence[Obstacle]) -> KnownPath:
+def _make_known_path(config: RunConfig, known_obstacles: Sequence[KnownObstacle]) -> KnownPath:
     """Return the path along the scene's route, or straight ahead from the start if it has none."""
     route = make_route(config.scene)
     if route is None:

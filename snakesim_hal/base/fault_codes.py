@@ -1,7 +1,7 @@
 """The words on the wire for faults and refusals, explained as `error_codes` explains errors.
 
 `FAULT_CODES` has each `Fault.what`. `REFUSAL_CODES` has each `Answer.refusal`, and the reasons by which
-`Status.commands_rejected` counts. `docs/reference/errors.md` is made of them.
+`RobotStatus.commands_rejected` counts. `docs/reference/errors.md` is made of them.
 """
 
 from snakesim_hal.base.error_codes import ErrorCode

@@ -122,7 +122,7 @@ class ErrorReporter:
                 print_stderr(f"{self._name}:   {line.strip()}")
 
 
-class Worker:
+class BackgroundThread:
     """A thread that is started before it is needed, and runs queued jobs one after another."""
 
     def __init__(self, name: str) -> None:

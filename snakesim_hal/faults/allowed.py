@@ -13,14 +13,14 @@ from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Query
+from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Clock, Description, LifecycleState
+from snakesim_hal.wire.messages import Answer, Clock, LifecycleState, RobotDescription
 
 HOW_TO_ALLOW = "something real moves here; to allow it set `allow_fault_injection = true` in the scenario"
 
 
-class Faults(Protocol):
+class InjectedFaults(Protocol):
     """The injected faults of one part. The part's own thread makes every call, once in each cycle of its loop."""
 
     @property
@@ -84,13 +84,13 @@ class NoFaults:
     def close(self) -> None:
         """Do nothing: no message is delayed."""
 
-    def _refuse_request(self, query: Query) -> None:
+    def _refuse_request(self, query: IncomingQuery) -> None:
         """Refuse a request, in Zenoh's thread."""
         reason = f"fault injection is not allowed: {HOW_TO_ALLOW}"
         query.reply(Answer(ok=False, reason=reason, refusal="not_allowed", lifecycle=self._lifecycle))
 
 
-def create_host_faults(config: RunConfig, backend: Backend, session: Session) -> tuple[Backend, Faults]:
+def create_host_faults(config: RunConfig, backend: Backend, session: Session) -> tuple[Backend, InjectedFaults]:
     """Return the backend that the host should use, and the object that injects faults into the host.
 
     Args:
@@ -110,8 +110,12 @@ def create_host_faults(config: RunConfig, backend: Backend, session: Session) ->
 
 
 def create_service_faults(
-    name: str, config: RunConfig, session: Session, robot: Description, read_newest_clock: Callable[[], Clock | None]
-) -> Faults:
+    name: str,
+    config: RunConfig,
+    session: Session,
+    robot: RobotDescription,
+    read_newest_clock: Callable[[], Clock | None],
+) -> InjectedFaults:
     """Return the object that injects faults into a service, or one that refuses all faults if they are not allowed.
 
     Args:
@@ -126,11 +130,11 @@ def create_service_faults(
     """
     if not _are_faults_allowed(config, robot):
         return NoFaults(name, config, session)
-    from snakesim_hal.faults.injector import Injector
+    from snakesim_hal.faults.injector import FaultInjector
 
-    return Injector(name, config, session, read_newest_clock=read_newest_clock)
+    return FaultInjector(name, config, session, read_newest_clock=read_newest_clock)
 
 
-def _are_faults_allowed(config: RunConfig, robot: Description) -> bool:
+def _are_faults_allowed(config: RunConfig, robot: RobotDescription) -> bool:
     """Return whether faults may be injected: nothing real moves, or the configuration allows them."""
     return robot.emulated or config.allow_fault_injection

@@ -9,7 +9,7 @@ import struct
 from collections import deque
 from math import inf
 
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 
 MAX_REPEATS_PER_CALL = 256  # of a flood; after a delay of this process, more repeats are skipped
 MAX_BURST_BYTES = 64  # inserted, or copied from elsewhere in the message
@@ -30,7 +30,7 @@ class MessageDisturbance:
         self._newest_payload: bytes | None = None  # the writer's last message
         self._next_repeat_time_s = inf  # time of the next repeat of a flood
 
-    def start_fault(self, injection: Injection, now_s: float) -> None:
+    def start_fault(self, injection: FaultInjection, now_s: float) -> None:
         """Start a fault. If a fault of its kind is active already, the new amount replaces the old one."""
         assert injection.amount is not None, f"{injection} was not checked"
         self._amount_by_kind[injection.kind] = injection.amount

@@ -12,8 +12,8 @@ import msgspec
 
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState
+from snakesim_hal.model.fault_kinds import FaultInjection
+from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, RobotDescription
 
 # Kinds of faults that are applied to samples here, see `fault_kinds`.
 MUTE = "mute"  # the joint sends nothing: its last state is repeated as invalid, and its age grows
@@ -30,11 +30,11 @@ class FaultyBackend(Backend):
         self._inner = inner
         self._description = inner.describe()
         # Faults that are applied here: by joint index, then by kind.
-        self._active_faults: dict[int, dict[str, Injection]] = {}
+        self._active_faults: dict[int, dict[str, FaultInjection]] = {}
         self._last_state: JointState | None = None  # as returned, with the faults; None before the first sample
         self._speed_ratio: float | None = None  # of real time, for a slowed simulator; None: not slowed
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end a fault, in the wrapped backend if it supports the kind of fault, otherwise here.
 
         Args:
@@ -60,7 +60,7 @@ class FaultyBackend(Backend):
             code="injection/not-supported",
         )
 
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         """Return the backend's description."""
         return self._description
 
@@ -94,7 +94,7 @@ class FaultyBackend(Backend):
 
     # --- faults applied here ---------------------------------------------------------------------------------
 
-    def _set_slowdown(self, injection: Injection, begins: bool) -> None:
+    def _set_slowdown(self, injection: FaultInjection, begins: bool) -> None:
         """Start or end a slowdown of the simulator. Raises ConfigError for a backend that is no simulator."""
         if not self._description.emulated:
             raise ConfigError(
@@ -103,7 +103,7 @@ class FaultyBackend(Backend):
             )
         self._speed_ratio = injection.amount if begins else None
 
-    def _set_sample_fault(self, injection: Injection, begins: bool) -> None:
+    def _set_sample_fault(self, injection: FaultInjection, begins: bool) -> None:
         """Start or end a fault that is applied to the samples of one joint. Raises ConfigError for a missing joint."""
         joint_index = injection.target_index
         joint_count = len(self._description.joints)

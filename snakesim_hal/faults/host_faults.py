@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from snakesim_hal.backend import Backend
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.faults.injector import Injector
+from snakesim_hal.faults.injector import FaultInjector
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
@@ -13,7 +13,7 @@ from snakesim_hal.wire.messages import LifecycleState
 MAX_NOTES = 10_000  # so that the memory stays bounded, however long the run
 
 
-class HostFaults(Injector):
+class HostFaults(FaultInjector):
     """Carries out the injected faults of the host, in the host's thread. Use `backend` instead of the original one."""
 
     def __init__(self, config: RunConfig, backend: Backend, session: Session) -> None:

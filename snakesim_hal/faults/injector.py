@@ -18,13 +18,18 @@ import msgspec
 from snakesim_hal.base.errors import BackendError, ConfigError, WireError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.faults.message_faults import MessageFaults
-from snakesim_hal.model.fault_kinds import FaultTransition, Injection, InjectionPlan, validate_and_complete_injection
+from snakesim_hal.model.fault_kinds import (
+    FaultInjection,
+    FaultTransition,
+    InjectionPlan,
+    validate_and_complete_injection,
+)
 from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Query
+from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
 
 TIME_TOLERANCE_S = 0.5e-9  # half of the resolution of timestamps
@@ -34,10 +39,10 @@ MAX_REASON_LENGTH = 500  # characters, as the message Answer allows
 class ApplyFault(Protocol):
     """Starts or ends a fault. Raises ConfigError if that is not possible."""
 
-    def __call__(self, injection: Injection, *, begins: bool) -> object: ...
+    def __call__(self, injection: FaultInjection, *, begins: bool) -> object: ...
 
 
-def refuse_fault(injection: Injection, *, begins: bool) -> None:
+def refuse_fault(injection: FaultInjection, *, begins: bool) -> None:
     """Refuse a fault, in a part that supports only message faults and `hang`."""
     raise ConfigError(
         f"{injection.executing_part} cannot do {injection.kind} to {injection.target}", code="injection/not-supported"
@@ -49,7 +54,7 @@ def print_event(text: str, now_s: float) -> None:
     print_stderr(f"{now_s:.3f} s: injected: {text}")
 
 
-class Injector:
+class FaultInjector:
     """Injects the planned and requested faults of one part of a run. Call `update` once in every cycle of its loop."""
 
     def __init__(
@@ -86,11 +91,11 @@ class Injector:
             injection for injection in parse_planned_faults(config) if injection.executing_part == part
         )
         self._new_refusals: list[str] = []  # planned faults that are not possible; the next `update` returns them
-        self._scheduled_ends: list[tuple[float, Injection]] = []  # end in robot time (s), and the requested fault
-        self._active_faults: dict[tuple[str, str], Injection] = {}  # by kind and target
+        self._scheduled_ends: list[tuple[float, FaultInjection]] = []  # end in robot time (s), and the requested fault
+        self._active_faults: dict[tuple[str, str], FaultInjection] = {}  # by kind and target
         # Requests.
-        self._decoder = Decoder(FaultRequest)
-        self._request_queue: SimpleQueue[Query] = SimpleQueue()
+        self._decoder = MessageDecoder(FaultRequest)
+        self._request_queue: SimpleQueue[IncomingQuery] = SimpleQueue()
         # The robot.
         self._first_armed_s: float | None = None
         self._lifecycle: LifecycleState = "disarmed"
@@ -191,7 +196,7 @@ class Injector:
             answer = self._handle_query(query, now_s)
             query.reply(msgspec.structs.replace(answer, lifecycle=self._lifecycle))
 
-    def _handle_query(self, query: Query, now_s: float) -> Answer:
+    def _handle_query(self, query: IncomingQuery, now_s: float) -> Answer:
         """Decode a request, start or end its fault, and return the answer. Every error becomes a refusal."""
         try:
             request = self._decoder.decode(query.payload, query.encoding)
@@ -218,7 +223,7 @@ class Injector:
         start_s = self._compute_time_since_arming_s(now_s)
         duration_s = inf if request.for_s is None else request.for_s
         injection = validate_and_complete_injection(
-            Injection(request.kind, request.target, start_s, start_s + duration_s, request.amount)
+            FaultInjection(request.kind, request.target, start_s, start_s + duration_s, request.amount)
         )
         fault_name = f"{injection.kind} of {injection.target}"
         if injection.executing_part != self.part:
@@ -230,7 +235,7 @@ class Injector:
             self._scheduled_ends.append((now_s + duration_s, injection))
         return Answer(ok=True, reason=f"{fault_name} has begun, at {now_s:.3f} s of robot time")
 
-    def _end_requested_fault(self, injection: Injection, now_s: float) -> Answer:
+    def _end_requested_fault(self, injection: FaultInjection, now_s: float) -> Answer:
         """End the active fault of this kind and target, or return a refusal if there is none."""
         fault_name = f"{injection.kind} of {injection.target}"
         active = self._active_faults.get((injection.kind, injection.target))
@@ -242,7 +247,7 @@ class Injector:
 
     # --- faults ----------------------------------------------------------------------------------------------
 
-    def _start_fault(self, injection: Injection, now_s: float) -> None:
+    def _start_fault(self, injection: FaultInjection, now_s: float) -> None:
         """Start a fault and report it. Raises ConfigError or BackendError if it is not possible."""
         match injection.target_type:
             case "key":
@@ -257,7 +262,7 @@ class Injector:
             self._active_faults[injection.kind, injection.target] = injection
             self._record_event(f"{injection} begins", now_s)
 
-    def _end_fault(self, injection: Injection, now_s: float) -> None:
+    def _end_fault(self, injection: FaultInjection, now_s: float) -> None:
         """End a fault and report it, unless a newer fault has replaced it, or a request has ended it."""
         fault_key = injection.kind, injection.target
         if self._active_faults.get(fault_key) is not injection:

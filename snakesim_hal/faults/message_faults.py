@@ -15,7 +15,7 @@ from math import inf
 
 from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.faults.disturbance import MessageDisturbance
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.network.session import Session
 
 MIN_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not block the interpreter
@@ -46,7 +46,7 @@ class MessageFaults:
         self._delay_thread: threading.Thread | None = None  # sends delayed messages; None: nothing is delayed
         self._closed = False
 
-    def begin(self, injection: Injection) -> None:
+    def begin(self, injection: FaultInjection) -> None:
         """Start a fault of the key that is its target."""
         with self._changed:
             key = injection.target
@@ -58,7 +58,7 @@ class MessageFaults:
             disturbed.disturbance.start_fault(injection, time.monotonic())
             self._release_or_wake(disturbed)
 
-    def end(self, injection: Injection) -> None:
+    def end(self, injection: FaultInjection) -> None:
         """End a fault; pending messages are still sent."""
         with self._changed:
             disturbed = self._disturbed_by_key.get(injection.target)

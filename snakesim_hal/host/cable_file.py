@@ -19,7 +19,7 @@ from snakesim_hal.host.outbox import SerialWorker
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.safety.cables import REVOLUTION_RAD, CableJoint, CableTracker
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import Description, JointState
+from snakesim_hal.wire.messages import JointState, RobotDescription
 
 CABLE_FILENAME = "cables.json"
 MAX_DECLARATION_AGE_S = 3600.0  # maximum age of `cable_unwound` in a robot file, for a host that has no stored angle
@@ -47,7 +47,7 @@ class StoredCable(msgspec.Struct, frozen=True, kw_only=True):
 class CableFile:
     """The file of one robot. `cables` counts the angles."""
 
-    def __init__(self, folder: Path, joints: Sequence[Joint], robot: Description, now_s: float) -> None:
+    def __init__(self, folder: Path, joints: Sequence[Joint], robot: RobotDescription, now_s: float) -> None:
         """Read the stored angles of the joints with cables, and start to count from them.
 
         Args:
@@ -123,7 +123,7 @@ class CableFile:
             return f"{self._path} cannot be read"
 
 
-def open_cable_file(folder: Path, joints: Sequence[Joint], robot: Description) -> CableFile | None:
+def open_cable_file(folder: Path, joints: Sequence[Joint], robot: RobotDescription) -> CableFile | None:
     """Return the cable file of a robot; None if it is emulated, or if each of its joints has end stops."""
     if robot.emulated or all(joint.limits.cable_turns is None and not _lacks_end_stop_room(joint) for joint in joints):
         return None

@@ -3,7 +3,7 @@
 from snakesim_hal.run_log.host_record import Ending
 
 
-class RunEnding:
+class RequestedEnding:
     """The end of one run, once it has been requested. The first reason counts."""
 
     def __init__(self) -> None:

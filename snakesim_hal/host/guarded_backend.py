@@ -16,10 +16,10 @@ from typing import Any, TypeVar
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.base.step_limit import StepTooLongError, describe_interrupted_line
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
-from snakesim_hal.wire.messages import Description, Fault, LifecycleState
+from snakesim_hal.wire.messages import Fault, LifecycleState, RobotDescription
 from snakesim_hal.wire.outgoing import encode_checked, encode_unchecked
 
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
@@ -61,7 +61,7 @@ class GuardedBackend(Backend):
         self._custom_messages: dict[str, CustomMessage] = {}  # custom messages, by key
 
     @_convert_exceptions
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         return self._inner.describe()
 
     @_convert_exceptions
@@ -103,7 +103,7 @@ class GuardedBackend(Backend):
         self._inner.close()
 
     @_convert_exceptions
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Begin or end a fault that the backend injects itself; return False if it does not support the fault."""
         return self._inner.inject(injection, begins=begins)
 

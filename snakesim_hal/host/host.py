@@ -21,17 +21,17 @@ import msgspec
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.base.arithmetic import measure_arithmetic
 from snakesim_hal.base.errors import BackendError, WireError
-from snakesim_hal.faults.allowed import Faults, NoFaults
+from snakesim_hal.faults.allowed import InjectedFaults, NoFaults
 from snakesim_hal.host.cable_file import CableFile
 from snakesim_hal.host.control_cycle import ControlCycle
 from snakesim_hal.host.host_clock import HostClock
 from snakesim_hal.host.host_state import HostState
-from snakesim_hal.host.inbox import Inbox
+from snakesim_hal.host.inbox import HostInbox
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.host.network_watch import NetworkWatch
-from snakesim_hal.host.outbox import Outbox, Outgoing
-from snakesim_hal.host.participants import Participants
-from snakesim_hal.host.readiness import Readiness
+from snakesim_hal.host.outbox import HostOutbox, Outgoing
+from snakesim_hal.host.participants import LockstepParticipants
+from snakesim_hal.host.readiness import ServiceReadiness
 from snakesim_hal.host.request_handler import Reply, Request, RequestHandler
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.status_messages import make_applied_command
@@ -44,18 +44,18 @@ from snakesim_hal.network.run_key import add_proof, read_own_run_key
 from snakesim_hal.network.session import Session
 from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.run_log.host_record import Ending
-from snakesim_hal.safety.authority import Authority
+from snakesim_hal.safety.authority import CommandAuthority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
     ClockMode,
-    Description,
     EstopRequest,
     Fault,
     JointCommand,
     LifecycleRequest,
-    Status,
+    RobotDescription,
+    RobotStatus,
 )
 
 STANDBY_PERIOD_NS = 20_000_000  # between two looks at the services, in lockstep before the first arming
@@ -88,7 +88,9 @@ class HostOptions:
     realtime_warnings: Sequence[str] = ()  # real-time measures that the operating system refused
 
     # The robot.
-    faults: Faults | None = None  # injected ones, as `create_host_faults` returns them; None: requests are refused
+    faults: InjectedFaults | None = (
+        None  # injected ones, as `create_host_faults` returns them; None: requests are refused
+    )
     unchecked_reason: str = ""  # why only an explicit word arms it, as `why_unchecked` returns it
     cable_file: CableFile | None = None  # of joints without end stops
 
@@ -123,12 +125,12 @@ class Host:
         description = msgspec.structs.replace(
             backend.describe(), host=secrets.token_hex(8), arithmetic=measure_arithmetic()
         )
-        self.description: Description = add_proof(description, read_own_run_key())
+        self.description: RobotDescription = add_proof(description, read_own_run_key())
         self.black_box = BlackBox(self.description)
         self._state = HostState(
             config=config,
             description=self.description,
-            authority=Authority(
+            authority=CommandAuthority(
                 self.description,
                 first_epoch=time.time_ns() // 1_000_000,
                 awaits_reports=config.clock_mode == "realtime",
@@ -138,7 +140,7 @@ class Host:
             clock=HostClock(config, self.description),
             backend_time=BackendTimer(self.description.backend, config.period_ns),
             faults=options.faults or NoFaults(HAL, config, session),
-            participants=Participants(config.services),
+            participants=LockstepParticipants(config.services),
         )
         self._cycle = ControlCycle(backend, self._state.authority)
         self._published = PublishTimes()
@@ -151,13 +153,13 @@ class Host:
         self._ended_ns = 0
 
         self._restore_estop()
-        self._outbox = Outbox(
+        self._outbox = HostOutbox(
             session, self.description, encode_config(config), lockstep=config.clock_mode == "lockstep"
         )
-        readiness = Readiness(config, self._state.participants, session)
+        readiness = ServiceReadiness(config, self._state.participants, session)
         self._status = StatusReporter(self._state, readiness, self._outbox, starter, options.realtime_warnings)
         self._requests = RequestHandler(self._state, readiness, self._status, self._latch, self._outbox)
-        self._inbox = Inbox(session, self, config.services, self._outbox.send_answer)
+        self._inbox = HostInbox(session, self, config.services, self._outbox.send_answer)
         self._network_watch = NetworkWatch(self._state, session, self._outbox)
         starter.send(HostMessage(description=self.description))
         starter.start_serving(self.submit_request)
@@ -165,7 +167,7 @@ class Host:
     # --- for the process that runs the host ------------------------------------------------------------------
 
     @property
-    def authority(self) -> Authority:
+    def authority(self) -> CommandAuthority:
         """The safety core of this host."""
         return self._state.authority
 
@@ -175,12 +177,12 @@ class Host:
         return self._state.statistics
 
     @property
-    def participants(self) -> Participants:
+    def participants(self) -> LockstepParticipants:
         """The services of the run."""
         return self._state.participants
 
     @property
-    def faults(self) -> Faults:
+    def faults(self) -> InjectedFaults:
         """The injected faults."""
         return self._state.faults
 
@@ -206,7 +208,7 @@ class Host:
             return 0.0
         return ((self._ended_ns or time.monotonic_ns()) - self._armed_at_ns) * 1e-9
 
-    def build_status(self) -> Status:
+    def build_status(self) -> RobotStatus:
         """Return the present status of the robot."""
         return self._status.build_status()
 

@@ -3,9 +3,9 @@
 import time
 
 from snakesim_hal.host.simulated_time import SimulatedTime
-from snakesim_hal.host.timing import Deadlines
+from snakesim_hal.host.timing import TickDeadlines
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import ClockMode, Description
+from snakesim_hal.wire.messages import ClockMode, RobotDescription
 
 
 class HostClock:
@@ -14,12 +14,12 @@ class HostClock:
     `clock_mode` is the run's, except after a fault: then the host no longer waits for services.
     """
 
-    def __init__(self, config: RunConfig, description: Description) -> None:
+    def __init__(self, config: RunConfig, description: RobotDescription) -> None:
         self.tick = 0
         self.period_ns = config.period_ns
         self.clock_mode: ClockMode = config.clock_mode
         self.simulated = SimulatedTime(description, config.clock_mode, time.monotonic_ns)
-        self.deadlines = Deadlines(config.period_ns)
+        self.deadlines = TickDeadlines(config.period_ns)
 
     @property
     def timestamp_ns(self) -> int:

@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass, field
 
-from snakesim_hal.faults.allowed import Faults
-from snakesim_hal.host.ending import RunEnding
+from snakesim_hal.faults.allowed import InjectedFaults
+from snakesim_hal.host.ending import RequestedEnding
 from snakesim_hal.host.host_clock import HostClock
-from snakesim_hal.host.participants import Participant, Participants
+from snakesim_hal.host.participants import LockstepParticipant, LockstepParticipants
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.timing import BackendTimer
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.safety.authority import Authority
-from snakesim_hal.wire.messages import Answer, Description
+from snakesim_hal.safety.authority import CommandAuthority
+from snakesim_hal.wire.messages import Answer, RobotDescription
 
 
 @dataclass
@@ -19,24 +19,24 @@ class HostState:
 
     # Constant during a run.
     config: RunConfig
-    description: Description
+    description: RobotDescription
 
     # The robot.
-    authority: Authority
+    authority: CommandAuthority
     clock: HostClock
     backend_time: BackendTimer
-    faults: Faults  # injected ones
+    faults: InjectedFaults  # injected ones
 
     # The services.
-    participants: Participants
+    participants: LockstepParticipants
     newest_answered_tick: int = -1  # by an accepted command
     waiting_since_ns: int | None = None  # monotonic; for the services' answers that end this tick
 
     # The run.
     statistics: RunStatistics = field(default_factory=RunStatistics)
-    ending: RunEnding = field(default_factory=RunEnding)
+    ending: RequestedEnding = field(default_factory=RequestedEnding)
 
-    def find_lease_holder(self) -> Participant | None:
+    def find_lease_holder(self) -> LockstepParticipant | None:
         """Return the service that holds the lease, if it is one of the run."""
         return self.participants.get(self.authority.lease.holder or "")
 

@@ -16,17 +16,17 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.host.request_handler import Reply, Request
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival, Query
+from snakesim_hal.network.streams import IncomingQuery, ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.messages import (
     Answer,
-    Done,
     EstopRequest,
     JointCommand,
     LeaseRequest,
     LifecycleRequest,
     SimulatorRequest,
+    TickDone,
 )
 
 # Indices of the lanes, the most urgent first.
@@ -36,10 +36,15 @@ SAMPLES = 2
 REQUESTS = 3
 LIMITS = (64, None, 4096, 64)  # presence comes from known services only, so its lane needs no bound
 
-RequestDecoder = Decoder[LeaseRequest] | Decoder[LifecycleRequest] | Decoder[EstopRequest] | Decoder[SimulatorRequest]
+RequestDecoder = (
+    MessageDecoder[LeaseRequest]
+    | MessageDecoder[LifecycleRequest]
+    | MessageDecoder[EstopRequest]
+    | MessageDecoder[SimulatorRequest]
+)
 
 
-class Receiver(Protocol):
+class InputReceiver(Protocol):
     """Handles the input, in the host's thread."""
 
     def on_command(self, command: JointCommand, monotonic_ns: int) -> None:
@@ -66,7 +71,7 @@ class Receiver(Protocol):
 class QueuedInput(Protocol):
     """One item of a lane."""
 
-    def deliver(self, receiver: Receiver) -> None:
+    def deliver(self, receiver: InputReceiver) -> None:
         """Decode the item and hand it to the receiver. Raises WireError."""
         ...
 
@@ -75,10 +80,10 @@ class QueuedInput(Protocol):
 class CommandArrival:
     """A joint command that came over Zenoh."""
 
-    arrival: Arrival
-    decoder: Decoder[JointCommand]
+    arrival: ReceivedSample
+    decoder: MessageDecoder[JointCommand]
 
-    def deliver(self, receiver: Receiver) -> None:
+    def deliver(self, receiver: InputReceiver) -> None:
         # Not `arrival.decode`, whose message readers in this process share: one of them might change it.
         command = self.decoder.decode(self.arrival.payload, self.arrival.encoding)
         receiver.on_command(command, self.arrival.monotonic_ns)
@@ -86,10 +91,10 @@ class CommandArrival:
 
 @dataclass(frozen=True)
 class _DoneArrival:
-    arrival: Arrival
-    decoder: Decoder[Done]
+    arrival: ReceivedSample
+    decoder: MessageDecoder[TickDone]
 
-    def deliver(self, receiver: Receiver) -> None:
+    def deliver(self, receiver: InputReceiver) -> None:
         done = self.arrival.decode(self.decoder)
         receiver.on_tick_done(keys.parse_service(self.arrival.key), done.tick)
 
@@ -99,7 +104,7 @@ class _PresenceChange:
     service: str
     present: bool
 
-    def deliver(self, receiver: Receiver) -> None:
+    def deliver(self, receiver: InputReceiver) -> None:
         receiver.on_service_presence(self.service, self.present)
 
 
@@ -110,7 +115,7 @@ class _LocalRequest:
     request: Request
     reply: Reply
 
-    def deliver(self, receiver: Receiver) -> None:
+    def deliver(self, receiver: InputReceiver) -> None:
         receiver.on_request(self.request, self.reply)
 
 
@@ -118,11 +123,11 @@ class _LocalRequest:
 class _RemoteRequest:
     """A request that came over Zenoh."""
 
-    query: Query
+    query: IncomingQuery
     decoder: RequestDecoder
-    send_answer: Callable[[Query, Answer], None]
+    send_answer: Callable[[IncomingQuery, Answer], None]
 
-    def deliver(self, receiver: Receiver) -> None:
+    def deliver(self, receiver: InputReceiver) -> None:
         try:
             request = self.decoder.decode(self.query.payload, self.query.encoding)
         except WireError as error:
@@ -131,15 +136,15 @@ class _RemoteRequest:
             receiver.on_request(request, lambda answer: self.send_answer(self.query, answer))
 
 
-class Inbox:
+class HostInbox:
     """Lanes that other threads fill and the host empties."""
 
     def __init__(
         self,
         session: Session,
-        receiver: Receiver,
+        receiver: InputReceiver,
         services: Collection[str],
-        send_answer: Callable[[Query, Answer], None],
+        send_answer: Callable[[IncomingQuery, Answer], None],
     ) -> None:
         """Declare all subscriptions and queryables of the host.
 
@@ -150,21 +155,21 @@ class Inbox:
             send_answer: Function that sends the answer to a query.
         """
         # The receiver owns its inbox. A reference back that counts would keep a whole run in memory after its end.
-        self._receiver: Receiver = weakref.proxy(receiver)
+        self._receiver: InputReceiver = weakref.proxy(receiver)
         self._services = frozenset(services)
         self._queue: Mailbox[QueuedInput] = Mailbox(LIMITS)
         self.dropped = 0
 
-        self._command_decoder = Decoder(JointCommand)
-        self._done_decoder = Decoder(Done)
+        self._command_decoder = MessageDecoder(JointCommand)
+        self._done_decoder = MessageDecoder(TickDone)
         self._send_answer = send_answer
 
         session.on_urgent_arrival(keys.JOINT_COMMAND, self._queue_command)
         session.on_urgent_arrival(keys.DONE_ALL, self._queue_done)
-        session.on_query(keys.ESTOP, partial(self._queue_stop_request, Decoder(EstopRequest)))
-        session.on_query(keys.LEASE, partial(self._queue_request, Decoder(LeaseRequest)))
-        session.on_query(keys.LIFECYCLE, partial(self._queue_request, Decoder(LifecycleRequest)))
-        session.on_query(keys.SIMULATOR, partial(self._queue_request, Decoder(SimulatorRequest)))
+        session.on_query(keys.ESTOP, partial(self._queue_stop_request, MessageDecoder(EstopRequest)))
+        session.on_query(keys.LEASE, partial(self._queue_request, MessageDecoder(LeaseRequest)))
+        session.on_query(keys.LIFECYCLE, partial(self._queue_request, MessageDecoder(LifecycleRequest)))
+        session.on_query(keys.SIMULATOR, partial(self._queue_request, MessageDecoder(SimulatorRequest)))
         session.on_token_change(self._queue_presence)
 
     def waiting(self) -> int:
@@ -213,20 +218,20 @@ class Inbox:
 
     # --- in Zenoh's threads ----------------------------------------------------------------------------------
 
-    def _queue_command(self, arrival: Arrival) -> None:
+    def _queue_command(self, arrival: ReceivedSample) -> None:
         self._queue_sample(CommandArrival(arrival, self._command_decoder))
 
-    def _queue_done(self, arrival: Arrival) -> None:
+    def _queue_done(self, arrival: ReceivedSample) -> None:
         self._queue_sample(_DoneArrival(arrival, self._done_decoder))
 
     def _queue_sample(self, item: QueuedInput) -> None:
         self.dropped += self._queue.is_full(SAMPLES)
         self._queue.put(item, SAMPLES)
 
-    def _queue_stop_request(self, decoder: Decoder[EstopRequest], query: Query) -> None:
+    def _queue_stop_request(self, decoder: MessageDecoder[EstopRequest], query: IncomingQuery) -> None:
         self._queue.put(_RemoteRequest(query, decoder, self._send_answer), STOP_LANE)
 
-    def _queue_request(self, decoder: RequestDecoder, query: Query) -> None:
+    def _queue_request(self, decoder: RequestDecoder, query: IncomingQuery) -> None:
         self.dropped += self._queue.is_full(REQUESTS)  # the requester gets no answer, and may ask again
         self._queue.put(_RemoteRequest(query, decoder, self._send_answer), REQUESTS)
 

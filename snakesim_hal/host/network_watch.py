@@ -1,7 +1,7 @@
 """Notices what is wrong with the network of a host."""
 
 from snakesim_hal.host.host_state import HostState
-from snakesim_hal.host.outbox import Outbox
+from snakesim_hal.host.outbox import HostOutbox
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault
@@ -10,7 +10,7 @@ from snakesim_hal.wire.messages import Fault
 class NetworkWatch:
     """Notes a second host of the same robot, and a network that accepts no message."""
 
-    def __init__(self, state: HostState, session: Session, outbox: Outbox) -> None:
+    def __init__(self, state: HostState, session: Session, outbox: HostOutbox) -> None:
         self._state = state
         self._outbox = outbox
         self._own_host = state.description.host

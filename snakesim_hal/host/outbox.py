@@ -16,10 +16,10 @@ from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Publisher, Query
+from snakesim_hal.network.streams import IncomingQuery, Publisher
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES
-from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status
+from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Message, RobotDescription, RobotStatus, RunConfiguration
 
 MAX_QUEUED_ACTIONS = 64  # queued actions; each sends one message, or all messages of a tick; the oldest are dropped
 MAX_QUEUED_IMAGES = 8
@@ -74,10 +74,10 @@ class SerialWorker:
             self._action_start_ns = 0
 
 
-class Outbox:
+class HostOutbox:
     """The output of one host. The host's threads put messages and answers into it."""
 
-    def __init__(self, session: Session, description: Description, config: bytes, *, lockstep: bool) -> None:
+    def __init__(self, session: Session, description: RobotDescription, config: bytes, *, lockstep: bool) -> None:
         """Publish the description and the effective configuration, and declare the host's liveliness tokens.
 
         Args:
@@ -89,7 +89,7 @@ class Outbox:
         self._session = session
         self._lockstep = lockstep
         self._publishers: dict[str, Publisher[Any]] = {
-            keys.STATUS: session.declare_latched_publisher(keys.STATUS, Status)
+            keys.STATUS: session.declare_latched_publisher(keys.STATUS, RobotStatus)
         }
         # Threads. Without a camera, images need no thread of their own.
         self._streams = SerialWorker("streams")
@@ -97,10 +97,10 @@ class Outbox:
         has_camera = any(keys.find_message(sensor.key) in IMAGE_MESSAGE_TYPES for sensor in description.sensors)
         self._images = SerialWorker("images", MAX_QUEUED_IMAGES) if has_camera else self._streams
         # Latched messages and liveliness tokens.
-        session.declare_latched_publisher(keys.DESCRIPTION, Description).put(description)
+        session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(description)
         if len(config) <= MAX_CONFIG:
-            configuration = Configuration(config_hash=description.config_hash, content=config.decode())
-            session.declare_latched_publisher(keys.CONFIG, Configuration).put(configuration)
+            configuration = RunConfiguration(config_hash=description.config_hash, content=config.decode())
+            session.declare_latched_publisher(keys.CONFIG, RunConfiguration).put(configuration)
         session.declare_alive(HAL)
         if description.host is not None:
             session.declare_token(keys.host_key(description.host))
@@ -121,7 +121,7 @@ class Outbox:
         for key, message, encoded in messages:
             self._get_publisher(key, type(message)).put(message, encoded)
 
-    def send_answer(self, query: Query, answer: Answer) -> None:
+    def send_answer(self, query: IncomingQuery, answer: Answer) -> None:
         """Send the answer to a query in another thread, because the requester may be slow."""
         self._answers.submit(lambda: query.reply(answer))
 

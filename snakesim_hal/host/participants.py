@@ -12,7 +12,7 @@ NOT_ANSWERED = -1
 
 
 @dataclass
-class Participant:
+class LockstepParticipant:
     """A service that a lockstep run waits for."""
 
     service: ServiceSchedule
@@ -29,12 +29,12 @@ class Participant:
         return awaited_tick >= self.first_tick and awaited_tick > self.done_tick
 
 
-class Participants(dict[str, Participant]):
+class LockstepParticipants(dict[str, LockstepParticipant]):
     """All services of the scenario, by name."""
 
     def __init__(self, services: Mapping[str, ServiceSchedule]) -> None:
         """Start with services that are not connected yet."""
-        super().__init__({name: Participant(service) for name, service in services.items()})
+        super().__init__({name: LockstepParticipant(service) for name, service in services.items()})
 
     def find_services_behind(self, tick: int) -> list[str]:
         """Return the services for which the end of `tick` has to wait."""

@@ -1,16 +1,16 @@
 """Which services a host waits for before it can be armed."""
 
-from snakesim_hal.host.participants import Participants
+from snakesim_hal.host.participants import LockstepParticipants
 from snakesim_hal.host.status_messages import describe_wait
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, make_own_entry, publish_process_entry
 from snakesim_hal.network.session import Session
 
 
-class Readiness:
+class ServiceReadiness:
     """Compares the services that are connected with those that the run needs."""
 
-    def __init__(self, config: RunConfig, participants: Participants, session: Session) -> None:
+    def __init__(self, config: RunConfig, participants: LockstepParticipants, session: Session) -> None:
         self._participants = participants
         self._requires_answers = config.clock_mode == "lockstep"  # tick 0, without which lockstep cannot begin
         self._own_entry = make_own_entry(HOST, config)

@@ -6,8 +6,8 @@ import msgspec
 
 from snakesim_hal.host.host_state import HostState
 from snakesim_hal.host.latch import EstopLatch, make_storage_callback
-from snakesim_hal.host.outbox import Outbox
-from snakesim_hal.host.readiness import Readiness
+from snakesim_hal.host.outbox import HostOutbox
+from snakesim_hal.host.readiness import ServiceReadiness
 from snakesim_hal.host.simulated_time import SimulatorRefusal
 from snakesim_hal.host.status_reporter import StatusReporter
 from snakesim_hal.wire.messages import (
@@ -30,10 +30,10 @@ class RequestHandler:
     def __init__(
         self,
         state: HostState,
-        readiness: Readiness,
+        readiness: ServiceReadiness,
         status: StatusReporter,
         latch: EstopLatch,
-        outbox: Outbox,
+        outbox: HostOutbox,
     ) -> None:
         self.log: list[str] = []  # each request except those for the lease: from whom, and the result
         self.simulator_requests: list[tuple[SimulatorRequest, Reply]] = []  # until the next tick begins

@@ -5,7 +5,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from itertools import accumulate
 
-from snakesim_hal.wire.messages import Timing
+from snakesim_hal.wire.messages import TimingStatistics
 
 MAX_PUBLISHED_BINS = 16  # at most, in a published histogram
 MAX_DURATION_US = 1e7
@@ -43,7 +43,7 @@ class DurationHistogram:
             return None
         return self._find_percentile_us(list(accumulate(self._bins)), percent)
 
-    def timing(self) -> Timing | None:
+    def timing(self) -> TimingStatistics | None:
         """Return percentiles and a coarse histogram of the durations, from their logarithmic bins.
 
         Returns:
@@ -59,7 +59,7 @@ class DurationHistogram:
         end_bin = bisect_left(cumulative, count) + 1  # the bin after the last one that is not empty
         merged_count = -(-(end_bin - first_bin) // MAX_PUBLISHED_BINS)  # bins per published bin, rounded up
         merged_bins = [sum(bins[i : i + merged_count]) for i in range(first_bin, end_bin, merged_count)]
-        return Timing(
+        return TimingStatistics(
             count=count,
             median_us=self._find_percentile_us(cumulative, 50),
             p99_us=self._find_percentile_us(cumulative, 99),
@@ -92,7 +92,7 @@ class TickTimes:
         default_factory=_make_coarse_histogram
     )  # the backend takes setpoints, and lets the tick pass
 
-    def timings(self) -> dict[str, Timing]:
+    def timings(self) -> dict[str, TimingStatistics]:
         """Return the timing of each part that was measured, by its name."""
         timings = {
             "cycle": self.cycle.timing(),

@@ -10,7 +10,7 @@ Pure; the monotonic clock is passed in. The host's thread makes every call.
 from collections.abc import Callable
 from typing import NamedTuple
 
-from snakesim_hal.wire.messages import ClockMode, Description, SimulatorRequest
+from snakesim_hal.wire.messages import ClockMode, RobotDescription, SimulatorRequest
 
 FACTOR_MEASUREMENT_NS = 1_000_000_000  # wall time over which the real-time factor is measured
 MIN_SPEED_RATIO = 0.95  # of the requested speed; below, the status reports that it is not reached
@@ -40,7 +40,9 @@ class SimulatedTime:
     If the time of the robot is not simulated, every request is refused, and the time never pauses.
     """
 
-    def __init__(self, description: Description, clock_mode: ClockMode, read_monotonic_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, description: RobotDescription, clock_mode: ClockMode, read_monotonic_ns: Callable[[], int]
+    ) -> None:
         """Initialize the clock; simulated time runs in real time until a client changes its speed.
 
         Args:

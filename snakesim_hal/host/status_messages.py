@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, Description
+from snakesim_hal.wire.messages import AppliedCommand, RobotDescription
 
 # How a run can do without a message, by its key.
 WAYS_OUT = {keys.POSE: "mission.localization=dead_reckoning does without, and so does a robot without [sensors.pose]"}
 
 
-def make_applied_command(description: Description, tick: int, tick_output: TickOutput) -> AppliedCommand:
+def make_applied_command(description: RobotDescription, tick: int, tick_output: TickOutput) -> AppliedCommand:
     """Return the message with the applied setpoints of a tick."""
     setpoints = tick_output.setpoints
     return AppliedCommand(

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from snakesim_hal.host.host_state import HostState
-from snakesim_hal.host.outbox import Outbox
-from snakesim_hal.host.readiness import Readiness
+from snakesim_hal.host.outbox import HostOutbox
+from snakesim_hal.host.readiness import ServiceReadiness
 from snakesim_hal.network.private_channel import HostEnd, HostMessage
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import LifecycleState, Status
+from snakesim_hal.wire.messages import LifecycleState, RobotStatus
 
 STATUS_PERIOD_NS = 200_000_000
 MIN_STATUS_PERIOD_NS = 10_000_000  # for frequent changes, such as a contested lease
@@ -32,8 +32,8 @@ class StatusReporter:
     def __init__(
         self,
         state: HostState,
-        readiness: Readiness,
-        outbox: Outbox,
+        readiness: ServiceReadiness,
+        outbox: HostOutbox,
         starter: HostEnd,
         realtime_warnings: Sequence[str],
     ) -> None:
@@ -70,7 +70,7 @@ class StatusReporter:
         self._outbox.publish((keys.STATUS, status, None))
         self._starter.send(HostMessage(status=status))
 
-    def build_status(self) -> Status:
+    def build_status(self) -> RobotStatus:
         """Return the present status of the robot."""
         state = self._state
         authority = state.authority
@@ -87,7 +87,7 @@ class StatusReporter:
             waits = self._readiness.describe_missing(missing)
             why = "; ".join([why, *slow_backend, *differing, *waits, *refusals])[:500]
 
-        return Status(
+        return RobotStatus(
             # The robot and its time.
             tick=clock.tick,
             timestamp_ns=clock.tick * robot.period_ns,

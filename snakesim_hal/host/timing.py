@@ -14,7 +14,7 @@ SETTLED_TICKS = 30  # after which a smoothed duration is meaningful
 MAX_PERIOD_RATIO = 0.8  # of a period, for the backend; the rest is for answers
 
 
-class Deadlines:
+class TickDeadlines:
     """Absolute deadlines: a late tick does not delay the next ones, unless it is much too late."""
 
     def __init__(self, period_ns: int) -> None:

@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import MAX_JOINTS, from_zero
 
 START_CHECK_CONTROLLER = (
@@ -72,7 +72,7 @@ def compute_mounting_digest(joints: Sequence[Joint]) -> str:
     return hashlib.sha256(encoded).hexdigest()[:16]
 
 
-def find_unchecked_reason(checked: StartCheckRecord | None, joints: Sequence[Joint], robot: Description) -> str:
+def find_unchecked_reason(checked: StartCheckRecord | None, joints: Sequence[Joint], robot: RobotDescription) -> str:
     """Find the reason why a robot counts as not checked.
 
     Args:
@@ -110,7 +110,7 @@ def find_unchecked_reason(checked: StartCheckRecord | None, joints: Sequence[Joi
     return ""
 
 
-def _describe_replaced_drives(checked: StartCheckRecord, robot: Description) -> list[str]:
+def _describe_replaced_drives(checked: StartCheckRecord, robot: RobotDescription) -> list[str]:
     """Return a sentence for each joint whose drive has another serial number than at the check."""
     checked_serials = checked.serials or [""] * len(robot.joints)
     sentences: list[str] = []

@@ -29,7 +29,7 @@ EXECUTOR_DESCRIPTIONS: Mapping[FaultExecutor, str] = {
     "simulator": "the simulator",
 }
 
-# Parts of a run, as `Injection.part` returns them; other parts are services, by name.
+# Parts of a run, as `FaultInjection.part` returns them; other parts are services, by name.
 RUN = "run"
 HAL = "hal"
 CONTROL = "control"
@@ -144,7 +144,7 @@ FAULT_KINDS: Mapping[TargetType, Mapping[str, FaultKind]] = {
 
 
 @dataclass(frozen=True)
-class Injection:
+class FaultInjection:
     """One fault that is injected for some time. Make it with `parse` or `checked`, which know what is allowed."""
 
     kind: str
@@ -236,7 +236,7 @@ def _is_written_by_run(row: keys.KeyRow) -> bool:
     return row.kind in ("stream", "latched") and row.writer not in EXTERNAL_WRITERS
 
 
-def parse_injection(text: str) -> Injection:
+def parse_injection(text: str) -> FaultInjection:
     """Parse the text form of an injected fault, such as `mute:joint_3@2-3.5`, and validate the fault.
 
     Args:
@@ -273,10 +273,10 @@ def parse_injection(text: str) -> Injection:
             f"fault {text!r}: it ends at {end_s:g} s, which must be later than its start, {start_s:g} s",
             code="injection/unknown-fault",
         )
-    return validate_and_complete_injection(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
+    return validate_and_complete_injection(FaultInjection(match["kind"], match["target"], start_s, end_s, amount), text)
 
 
-def validate_and_complete_injection(injection: Injection, given_text: str | None = None) -> Injection:
+def validate_and_complete_injection(injection: FaultInjection, given_text: str | None = None) -> FaultInjection:
     """Check that an injected fault is allowed, and return it with the default of its amount filled in.
 
     Args:
@@ -309,7 +309,7 @@ def validate_and_complete_injection(injection: Injection, given_text: str | None
     return replace(injection, amount=amount)
 
 
-def _unknown_kind_error(injection: Injection, text: str) -> ConfigError:
+def _unknown_kind_error(injection: FaultInjection, text: str) -> ConfigError:
     """Return the error for a kind that the target does not have; it names the targets that have this kind."""
     sort = injection.target_type
     others = [other for other in get_args(TargetType) if injection.kind in FAULT_KINDS[other]]
@@ -323,7 +323,7 @@ def _unknown_kind_error(injection: Injection, text: str) -> ConfigError:
 
 
 def validate_injection_targets(
-    injections: Iterable[Injection], *, services: Iterable[str], joints: int, buses: int
+    injections: Iterable[FaultInjection], *, services: Iterable[str], joints: int, buses: int
 ) -> None:
     """Raise ConfigError unless a run has every target of its injected faults.
 
@@ -351,7 +351,7 @@ def validate_injection_targets(
                 pass
 
 
-def _validate_target_index(injection: Injection, target_type: str, count: int) -> None:
+def _validate_target_index(injection: FaultInjection, target_type: str, count: int) -> None:
     """Raise ConfigError if there is no joint or bus of this number."""
     if injection.target_index >= count:
         available = f"{target_type}_1 to {target_type}_{count}" if count else f"no {target_type}"
@@ -361,7 +361,7 @@ def _validate_target_index(injection: Injection, target_type: str, count: int) -
         )
 
 
-def _validate_target_process(injection: Injection, processes: list[str]) -> None:
+def _validate_target_process(injection: FaultInjection, processes: list[str]) -> None:
     """Raise ConfigError if the run has no such process, or if the router does not support the fault."""
     if injection.target not in processes:
         raise ConfigError(
@@ -376,7 +376,7 @@ def _validate_target_process(injection: Injection, processes: list[str]) -> None
         )
 
 
-def _validate_key_writer(injection: Injection, processes: list[str]) -> None:
+def _validate_key_writer(injection: FaultInjection, processes: list[str]) -> None:
     """Raise ConfigError if the run does not start the process that writes the key."""
     writer = injection.executing_part
     if writer not in processes and writer != HAL:
@@ -391,19 +391,19 @@ class FaultTransition:
     """The time at which an injected fault starts or ends."""
 
     time_s: float
-    injection: Injection
+    injection: FaultInjection
     is_start: bool
 
 
 class InjectionPlan:
     """The starts and ends of injected faults, in the order of time."""
 
-    def __init__(self, injections: Iterable[Injection] = ()) -> None:
+    def __init__(self, injections: Iterable[FaultInjection] = ()) -> None:
         self._transitions: list[FaultTransition] = []
         for injection in injections:
             self.add(injection)
 
-    def add(self, injection: Injection) -> None:
+    def add(self, injection: FaultInjection) -> None:
         """Add an injected fault to the plan."""
         self._transitions.append(FaultTransition(injection.start_s, injection, True))
         if injection.end_s != inf and not injection.kind_info.is_instantaneous:

@@ -3,14 +3,14 @@
 from collections.abc import Collection
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import HAL, RUN, Injection, parse_injection, validate_injection_targets
+from snakesim_hal.model.fault_kinds import HAL, RUN, FaultInjection, parse_injection, validate_injection_targets
 from snakesim_hal.model.files import ConfigTable
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_BUSES = 8
 
 
-def parse_planned_faults(config: RunConfig, table: ConfigTable | None = None) -> list[Injection]:
+def parse_planned_faults(config: RunConfig, table: ConfigTable | None = None) -> list[FaultInjection]:
     """Parse the injected faults that a run configuration plans.
 
     Args:
@@ -20,7 +20,7 @@ def parse_planned_faults(config: RunConfig, table: ConfigTable | None = None) ->
     Raises:
         ConfigError: The text of a fault is not valid. The error has its index.
     """
-    injections: list[Injection] = []
+    injections: list[FaultInjection] = []
     for i, text in enumerate(config.faults):
         try:
             injections.append(parse_injection(text))
@@ -73,7 +73,7 @@ def validate_faults_without_supervisor(config: RunConfig, table: ConfigTable | N
 
 def parse_and_validate_planned_faults(
     config: RunConfig, table: ConfigTable | None = None, buses: int = MAX_BUSES
-) -> list[Injection]:
+) -> list[FaultInjection]:
     """Parse the injected faults that a run configuration plans, and check that the run has all their targets.
 
     Args:

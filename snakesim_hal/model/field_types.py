@@ -10,7 +10,7 @@ from msgspec import inspect
 
 
 @dataclass(frozen=True)
-class Violation:
+class TypeViolation:
     """The first part of a value that its expected type does not allow."""
 
     kind: Literal["unknown", "missing", "wrong"]
@@ -21,7 +21,7 @@ class Violation:
     known_fields: Sequence[str] = ()  # the allowed fields beside an unknown one
 
 
-def find_first_violation(value: Any, expected_type: Any, key_path: Sequence[str] = ()) -> Violation | None:
+def find_first_violation(value: Any, expected_type: Any, key_path: Sequence[str] = ()) -> TypeViolation | None:
     """Return the innermost part of a value that is wrong by itself, or None if the value has the expected type.
 
     Args:
@@ -43,10 +43,12 @@ def find_first_violation(value: Any, expected_type: Any, key_path: Sequence[str]
         violation = find_first_violation(part, part_type, [*key_path, step])
         if violation is not None:
             return violation
-    return Violation("wrong", list(key_path), value, expected_type, reason)
+    return TypeViolation("wrong", list(key_path), value, expected_type, reason)
 
 
-def _find_section_violation(section: dict[str, Any], expected_type: Any, key_path: Sequence[str]) -> Violation | None:
+def _find_section_violation(
+    section: dict[str, Any], expected_type: Any, key_path: Sequence[str]
+) -> TypeViolation | None:
     """Return a violation by the names of the section's fields or its tag, or None if they are allowed."""
     structs = [option for option in _list_type_alternatives(expected_type) if _is_struct_type(option)]
     if not structs:
@@ -59,7 +61,7 @@ def _find_section_violation(section: dict[str, Any], expected_type: Any, key_pat
 
 def _find_field_violation(
     section: dict[str, Any], struct: type[msgspec.Struct], key_path: Sequence[str]
-) -> Violation | None:
+) -> TypeViolation | None:
     """Return the violation by an unknown field or a missing required field, or None if there is no such field."""
     config = struct.__struct_config__
     fields = msgspec.structs.fields(struct)
@@ -69,23 +71,23 @@ def _find_field_violation(
     if config.forbid_unknown_fields:
         for name in section:
             if name not in known:
-                return Violation("unknown", [*key_path, name], known_fields=known)
+                return TypeViolation("unknown", [*key_path, name], known_fields=known)
     for field in fields:
         if field.required and field.encode_name not in section:
-            return Violation("missing", [*key_path, field.encode_name], expected_type=field.type)
+            return TypeViolation("missing", [*key_path, field.encode_name], expected_type=field.type)
     return None
 
 
 def _make_tag_violation(
     section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], key_path: Sequence[str]
-) -> Violation:
+) -> TypeViolation:
     """Return the violation of a section whose tag is missing, or belongs to none of the Structs."""
     tag_field = str(structs[0].__struct_config__.tag_field)
     tags = tuple(struct.__struct_config__.tag for struct in structs)
     allowed_tags = Literal[tags]
     if tag_field not in section:
-        return Violation("missing", [*key_path, tag_field], expected_type=allowed_tags)
-    return Violation("wrong", [*key_path, tag_field], section[tag_field], allowed_tags, "there is no such kind")
+        return TypeViolation("missing", [*key_path, tag_field], expected_type=allowed_tags)
+    return TypeViolation("wrong", [*key_path, tag_field], section[tag_field], allowed_tags, "there is no such kind")
 
 
 def _iterate_parts(value: Any, expected_type: Any) -> Iterator[tuple[str, Any, Any]]:

@@ -12,7 +12,12 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, find_nearest_word, shorten, suggest_word
-from snakesim_hal.model.field_types import Violation, describe_type_in_words, find_declared_unit, find_first_violation
+from snakesim_hal.model.field_types import (
+    TypeViolation,
+    describe_type_in_words,
+    find_declared_unit,
+    find_first_violation,
+)
 from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
@@ -301,7 +306,7 @@ def decode_table(table: ConfigTable, struct_type: type[StructT], section_key: st
         ) from None
 
 
-def _choose_error_code(violation: Violation) -> str:
+def _choose_error_code(violation: TypeViolation) -> str:
     """Return the error code for a violation."""
     match violation.kind:
         case "unknown":
@@ -316,7 +321,7 @@ def _choose_error_code(violation: Violation) -> str:
             return "config/out-of-range" if is_out_of_range else "config/invalid-value"
 
 
-def _describe_violation(violation: Violation, table: ConfigTable, section_key: str) -> str:
+def _describe_violation(violation: TypeViolation, table: ConfigTable, section_key: str) -> str:
     """Return the error text for a violation. The section's key is empty for a whole file."""
     if section_key:
         *parents, name = [section_key, *violation.key_path]
@@ -334,7 +339,7 @@ def _describe_violation(violation: Violation, table: ConfigTable, section_key: s
             return _describe_wrong_value(violation, table, display_key)
 
 
-def _describe_unknown_field(violation: Violation, table: ConfigTable, display_key: str, full_key: str) -> str:
+def _describe_unknown_field(violation: TypeViolation, table: ConfigTable, display_key: str, full_key: str) -> str:
     """Return the error text for an unknown field.
 
     It suggests a field of the same section with a similar name, or else the same name in another section.
@@ -363,7 +368,7 @@ def _describe_unknown_field(violation: Violation, table: ConfigTable, display_ke
     return f"{origin}: unknown field `{display_key}`; {hint}"
 
 
-def _describe_wrong_value(violation: Violation, table: ConfigTable, display_key: str) -> str:
+def _describe_wrong_value(violation: TypeViolation, table: ConfigTable, display_key: str) -> str:
     """Return the error text for a value that is not allowed.
 
     Args:

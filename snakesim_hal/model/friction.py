@@ -45,7 +45,7 @@ class Surface(FileStruct, frozen=True, kw_only=True):
     """
 
 
-class Viscous(FileStruct, frozen=True, kw_only=True):
+class ViscousFriction(FileStruct, frozen=True, kw_only=True):
     """Viscous friction of the ground, in addition to dry friction.
 
     The force on a link is its normal force times coefficient times speed, separately along the link and across it.
@@ -93,7 +93,7 @@ class Skin(FileStruct, frozen=True, kw_only=True):
     """Coefficients that differ in single links, as sections such as `[skin.links.link_3]`; link_0 is the tail."""
 
 
-class Wheels(FileStruct, frozen=True, kw_only=True):
+class PassiveWheels(FileStruct, frozen=True, kw_only=True):
     """Passive wheels under every link, which roll along it. They are modeled as friction that depends on direction.
 
     A link that moves along its axis is braked by the bearings and by the rolling resistance, one that moves sideways
@@ -130,7 +130,7 @@ class Wheels(FileStruct, frozen=True, kw_only=True):
 
 
 def compute_surface_friction(
-    friction: float, surface: Surface | None, skin: Skin | None, wheels: Wheels | None
+    friction: float, surface: Surface | None, skin: Skin | None, wheels: PassiveWheels | None
 ) -> DirectionalFriction:
     """Compute the friction coefficients between a surface and the underside of a link without exceptions.
 
@@ -171,7 +171,7 @@ def compute_link_factors(skin: Skin | None, link_count: int) -> list[Directional
     return factors
 
 
-def validate_skin(skin: Skin | None, wheels: Wheels | None, link_names: Sequence[str]) -> None:
+def validate_skin(skin: Skin | None, wheels: PassiveWheels | None, link_names: Sequence[str]) -> None:
     """Raise ValueError if a skin has exceptions for a link that does not exist, or a robot has a skin and wheels."""
     if skin is None:
         return

@@ -34,7 +34,7 @@ Gear = Annotated[float, above(1e4, "1")]
 Backlash = Annotated[float, from_zero(0.5, "rad")]
 
 
-class Limits(FileStruct, frozen=True, kw_only=True):
+class MotionLimits(FileStruct, frozen=True, kw_only=True):
     """Limits of a joint. Enforced by the limiter and by the motor."""
 
     angle_rad: Annotated[float, above(MAX_TURN_RAD, "rad")]
@@ -111,7 +111,7 @@ class Limits(FileStruct, frozen=True, kw_only=True):
         return self.angle_rad if self.angle_max_rad is None else self.angle_max_rad
 
 
-class Motor(FileStruct, frozen=True, kw_only=True):
+class JointMotor(FileStruct, frozen=True, kw_only=True):
     """Motor of a joint, as seen at the joint: behind the gear."""
 
     # Gains: of position mode, and of velocity mode.
@@ -153,7 +153,7 @@ Modes = Annotated[list[DriveMode], Meta(max_length=3)]
 Measures = Annotated[list[Measurement], Meta(max_length=3)]
 
 
-class Drive(FileStruct, frozen=True, kw_only=True):
+class JointDrive(FileStruct, frozen=True, kw_only=True):
     """How a joint's drive is connected and mounted: drive angle = zero_rad + sign * gear * joint angle."""
 
     # Connection.
@@ -189,7 +189,7 @@ class Drive(FileStruct, frozen=True, kw_only=True):
             )
 
 
-class Heat(FileStruct, frozen=True, kw_only=True):
+class MotorHeat(FileStruct, frozen=True, kw_only=True):
     """How a motor warms up. The defaults are typical of a small geared servo. None was measured.
 
     Together they give 5 K/W from winding to water, a guess of the right order for a housing of 100 mm.
@@ -211,7 +211,7 @@ class Heat(FileStruct, frozen=True, kw_only=True):
     """Temperature rise of the electronics as a fraction of the winding's rise. The default is a guess."""
 
 
-class Supply(FileStruct, frozen=True, kw_only=True):
+class JointSupply(FileStruct, frozen=True, kw_only=True):
     """Electrical supply of a joint."""
 
     voltage_v: Annotated[float, above(1000, "V")] = 24.0
@@ -221,7 +221,7 @@ class Supply(FileStruct, frozen=True, kw_only=True):
     """Current that the electronics of one joint draw without a motor current."""
 
 
-class _Id(FileStruct, frozen=True, kw_only=True):
+class _DriveId(FileStruct, frozen=True, kw_only=True):
     id: Annotated[int, Meta(ge=0, lt=MAX_ID)] | None = None
     """Id of the drive on its bus. None: the joint's number, from 1 at the tail."""
 
@@ -230,20 +230,20 @@ class _Id(FileStruct, frozen=True, kw_only=True):
 # temperature is always the same for all.
 _exception_fields = [
     (field.name, field.type | None, None)
-    for section in (Limits, Motor, Drive, Heat, Supply)
+    for section in (MotionLimits, JointMotor, JointDrive, MotorHeat, JointSupply)
     for field in msgspec.structs.fields(section)
     if field.name != "ambient_c"
 ]
-_exceptions_base: Any = msgspec.defstruct("_OfOne", _exception_fields, bases=(_Id,), frozen=True, kw_only=True)
+_exceptions_base: Any = msgspec.defstruct("_OfOne", _exception_fields, bases=(_DriveId,), frozen=True, kw_only=True)
 
 
 class JointExceptions(_exceptions_base):
     """What differs in one joint from the sections for all: their fields, and the drive's id."""
 
-    exceptions_to = (Limits, Motor, Drive, Heat, Supply)
+    exceptions_to = (MotionLimits, JointMotor, JointDrive, MotorHeat, JointSupply)
 
 
-SectionT = TypeVar("SectionT", Limits, Motor, Drive, Heat, Supply)
+SectionT = TypeVar("SectionT", MotionLimits, JointMotor, JointDrive, MotorHeat, JointSupply)
 
 
 @dataclass(frozen=True)
@@ -253,11 +253,11 @@ class Joint:
     name: str
     axis: Axis
     id: int  # on its bus
-    limits: Limits
-    motor: Motor
-    drive: Drive
-    heat: Heat
-    supply: Supply
+    limits: MotionLimits
+    motor: JointMotor
+    drive: JointDrive
+    heat: MotorHeat
+    supply: JointSupply
 
     @property
     def rated_nm(self) -> float:
@@ -268,11 +268,11 @@ class Joint:
 def make_joints(
     axes: Sequence[Axis],
     exceptions: Mapping[str, JointExceptions],
-    limits: Limits,
-    motor: Motor,
-    drive: Drive,
-    heat: Heat,
-    supply: Supply,
+    limits: MotionLimits,
+    motor: JointMotor,
+    drive: JointDrive,
+    heat: MotorHeat,
+    supply: JointSupply,
 ) -> list[Joint]:
     """Return every joint as built, tail to head.
 
@@ -316,7 +316,7 @@ def make_joints(
     return joints
 
 
-def _apply_limit_exceptions(common: Limits, joint_exceptions: JointExceptions) -> Limits:
+def _apply_limit_exceptions(common: MotionLimits, joint_exceptions: JointExceptions) -> MotionLimits:
     """Return the limits of one joint. Its `angle_rad` replaces all angle limits of the section for all joints."""
     if joint_exceptions.angle_rad is not None:
         common = msgspec.structs.replace(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import Vector
 
 
@@ -116,7 +116,7 @@ def compute_link_frames(
 
 
 def compute_body_points_w(
-    robot: Description, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats
+    robot: RobotDescription, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats
 ) -> Floats:
     """Compute tail end, joints and head end of one pose in the world, (n_joints + 2, 3) in m.
 
@@ -139,7 +139,7 @@ class ForwardKinematics:
     The results are equal to those of the function `compute_body_points_w` to the last bit.
     """
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         """Read the lengths of the links and the axes of the joints."""
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._axes = [joint.axis for joint in robot.joints]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 # Positions along a link, as fractions of its length, at which its distance to obstacles is computed.
@@ -36,7 +36,7 @@ Point = tuple[Coordinate, Coordinate]
 
 
 @dataclass(frozen=True)
-class Outlines:
+class ObstacleOutlines:
     """The outlines of m obstacles as arrays, so that distances to all of them are computed at once."""
 
     center_w: Floats  # (m, 2), m
@@ -45,7 +45,7 @@ class Outlines:
     rounding_m: Floats  # (m,)
 
     @classmethod
-    def from_obstacles(cls, obstacles: Sequence[Obstacle]) -> Self:
+    def from_obstacles(cls, obstacles: Sequence[KnownObstacle]) -> Self:
         """Return the outlines of obstacles, in their order."""
         is_box = np.array([obstacle.shape == "box" for obstacle in obstacles], dtype=bool)
         center_w = np.array([obstacle.position_w[:2] for obstacle in obstacles], dtype=np.float64)
@@ -82,13 +82,15 @@ class Outlines:
     def __len__(self) -> int:
         return len(self.center_w)
 
-    def select(self, indices: NDArray[np.intp]) -> "Outlines":
+    def select(self, indices: NDArray[np.intp]) -> "ObstacleOutlines":
         """Return the outlines with these indices."""
-        return Outlines(self.center_w[indices], self.direction[indices], self.half_m[indices], self.rounding_m[indices])
+        return ObstacleOutlines(
+            self.center_w[indices], self.direction[indices], self.half_m[indices], self.rounding_m[indices]
+        )
 
-    def append(self, others: "Outlines") -> "Outlines":
+    def append(self, others: "ObstacleOutlines") -> "ObstacleOutlines":
         """Return these outlines and others after them."""
-        return Outlines(
+        return ObstacleOutlines(
             np.concatenate((self.center_w, others.center_w)),
             np.concatenate((self.direction, others.direction)),
             np.concatenate((self.half_m, others.half_m)),
@@ -172,14 +174,14 @@ class Outlines:
         return local_x, local_y
 
 
-def compute_gaps_m(single: Outlines, others: Outlines) -> Floats:
+def compute_gaps_m(single: ObstacleOutlines, others: ObstacleOutlines) -> Floats:
     """Return the gaps (m,) between a single outline and each of the others; exact while they do not overlap."""
     from_single = others.compute_distances_m(single.rims_w[0]).min(axis=0) - single.rounding_m[0]
     from_others = single.compute_distances_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
     return np.minimum(from_single, from_others)
 
 
-def has_gap_below(single: Outlines, others: Outlines, limit_m: float) -> bool:
+def has_gap_below(single: ObstacleOutlines, others: ObstacleOutlines, limit_m: float) -> bool:
     """Return whether the gap between a single outline and any of the others is below a limit, as `gaps_m` computes it.
 
     Most of the others are so far away that the circles around both show it, which is faster.
@@ -193,7 +195,9 @@ def has_gap_below(single: Outlines, others: Outlines, limit_m: float) -> bool:
     return bool(compute_gaps_m(single, others.select(near)).min() < limit_m)
 
 
-def find_nearest_points_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[NDArray[np.intp], Floats, Floats]:
+def find_nearest_points_on_chain(
+    nodes_w: Floats, outlines: ObstacleOutlines
+) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Return the point of a chain that is nearest to each outline, among `LINK_FRACTIONS` of every link.
 
     Args:
@@ -211,7 +215,7 @@ def find_nearest_points_on_chain(nodes_w: Floats, outlines: Outlines) -> tuple[N
     return nearest, points[nearest], distances[nearest, np.arange(len(outlines))]
 
 
-class Capsule(FileStruct, frozen=True, kw_only=True):
+class CapsuleOutline(FileStruct, frozen=True, kw_only=True):
     """Outline of a link on the ground, from above."""
 
     name: str
@@ -220,7 +224,7 @@ class Capsule(FileStruct, frozen=True, kw_only=True):
     radius_m: float
 
 
-def compute_outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
+def compute_outline_distance_m(obstacle: KnownObstacle, point: Floats) -> float:
     """Return the distance from a point on the ground to an obstacle's outline from above; negative inside."""
     offset = np.asarray(point, dtype=np.float64) - np.array(obstacle.position_w[:2])
     if obstacle.shape != "box":

@@ -11,7 +11,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.outlines import Capsule, Outlines
+from snakesim_hal.model.outlines import CapsuleOutline, ObstacleOutlines
 from snakesim_hal.model.random_field import (
     MAX_RANDOM_OBSTACLES,
     RandomField,
@@ -20,22 +20,22 @@ from snakesim_hal.model.random_field import (
 )
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scene import Box, Cylinder, PegsAlongRoute, SceneFile, Sphere, Step, Wall, make_route
-from snakesim_hal.model.solids import Solid, Upright, get_material_fields, make_block, make_peg
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.solids import SolidObstacle, UprightSolid, get_material_fields, make_block, make_peg
+from snakesim_hal.wire.messages import KnownObstacle
 
 SAMPLES_PER_LINK = 24  # points along a link's axis at which the distance to obstacles is computed
 OVERLAP_TOLERANCE_M = 1e-4  # a smaller overlap of an obstacle and a link is a rounding error
 MAX_OBSTACLES = 4096  # bound of the message World
 
 
-class PlacedObstacle(Upright, frozen=True, kw_only=True):
+class PlacedObstacle(UprightSolid, frozen=True, kw_only=True):
     """A placed obstacle, with parameters that only the simulator needs."""
 
-    obstacle: Obstacle
+    obstacle: KnownObstacle
     walkable: bool = False  # a step: part of the ground, so the snake does not push off from it
 
 
-def place_scene_obstacles(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[PlacedObstacle]:
+def place_scene_obstacles(scene: SceneFile, keep_clear: list[CapsuleOutline] | None = None) -> list[PlacedObstacle]:
     """Place all obstacles of a scene. Peg rows and random fields are expanded into single obstacles with unique names.
 
     Args:
@@ -86,7 +86,7 @@ def _validate_unique_names(scene: SceneFile, placed: list[PlacedObstacle]) -> No
         )
 
 
-def _add_material(obstacle: Obstacle, solid: Solid) -> PlacedObstacle:
+def _add_material(obstacle: KnownObstacle, solid: SolidObstacle) -> PlacedObstacle:
     """Return a placed obstacle with the material and the lean that its section in the scene file gives."""
     return PlacedObstacle(obstacle=obstacle, **get_material_fields(solid))
 
@@ -104,7 +104,7 @@ def _place_box(index: int, box: Box) -> PlacedObstacle:
 
 
 def _place_sphere(index: int, sphere: Sphere) -> PlacedObstacle:
-    obstacle = Obstacle(
+    obstacle = KnownObstacle(
         name=sphere.name or f"sphere_{index}",
         shape="sphere",
         position_w=(*sphere.position_m, sphere.center_height_m),
@@ -193,7 +193,7 @@ def _place_random_field(
     field: RandomField,
     route: Route | None,
     placed: list[PlacedObstacle],
-    keep_clear: list[Capsule],
+    keep_clear: list[CapsuleOutline],
 ) -> list[PlacedObstacle]:
     """Place the obstacles of one random field, with a gap to those that are placed already."""
     context = f"scene {scene.name!r}: `random_field.{index}`"
@@ -203,7 +203,7 @@ def _place_random_field(
     return [_add_material(obstacle, solid) for obstacle, solid in zip(obstacles, solids, strict=True)]
 
 
-def validate_start_clearance(scene: SceneFile, placed: list[PlacedObstacle], snake: list[Capsule]) -> None:
+def validate_start_clearance(scene: SceneFile, placed: list[PlacedObstacle], snake: list[CapsuleOutline]) -> None:
     """Raise ConfigError if an obstacle overlaps the snake at its start.
 
     Args:
@@ -229,25 +229,27 @@ def validate_start_clearance(scene: SceneFile, placed: list[PlacedObstacle], sna
         )
 
 
-def _compute_overlaps_m(snake: list[Capsule], obstacles: list[Obstacle]) -> Floats:
+def _compute_overlaps_m(snake: list[CapsuleOutline], obstacles: list[KnownObstacle]) -> Floats:
     """Return how far every link and obstacle overlap, (links, obstacles); negative where there is a gap.
 
     The distance of a link's axis from an obstacle's center is exact, which suffices for round obstacles. For boxes the
     distances from `SAMPLES_PER_LINK` points along the axis are taken, too, and the smallest one counts.
     """
-    outlines = Outlines.from_obstacles(obstacles)
+    outlines = ObstacleOutlines.from_obstacles(obstacles)
     rear_w = np.array([link.rear_m for link in snake])
     front_w = np.array([link.front_m for link in snake])
     radius_m = np.array([link.radius_m for link in snake])
     fractions = np.linspace(0.0, 1.0, SAMPLES_PER_LINK)[:, None]
     points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]  # (links, SAMPLES_PER_LINK, 2)
     from_points_m = outlines.compute_distances_m(points_w).min(axis=1)
-    from_axes_m = Outlines.from_segments(rear_w, front_w).compute_distances_m(outlines.center_w).T - outlines.rounding_m
+    from_axes_m = (
+        ObstacleOutlines.from_segments(rear_w, front_w).compute_distances_m(outlines.center_w).T - outlines.rounding_m
+    )
     gaps_m = np.minimum(from_points_m, from_axes_m)
     return radius_m[:, None] - gaps_m
 
 
-def _move_to_height(item: PlacedObstacle, height_m: float) -> Obstacle:
+def _move_to_height(item: PlacedObstacle, height_m: float) -> KnownObstacle:
     """Return an obstacle moved to where its axis, which may lean, is at a height above the ground."""
     x, y, z = item.obstacle.position_w
     offset_m = height_m * math.tan(item.lean_rad)

@@ -9,17 +9,24 @@ from msgspec import Meta
 from numpy.random import Generator
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.outlines import Capsule, Clearance, Outlines, Point, Size, has_gap_below
+from snakesim_hal.model.outlines import CapsuleOutline, Clearance, ObstacleOutlines, Point, Size, has_gap_below
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.solids import MAX_LEAN_RAD, Solid, Upright, get_material_fields, make_block, make_peg
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.solids import (
+    MAX_LEAN_RAD,
+    SolidObstacle,
+    UprightSolid,
+    get_material_fields,
+    make_block,
+    make_peg,
+)
+from snakesim_hal.wire.messages import KnownObstacle
 
 MAX_RANDOM_OBSTACLES = 1000
 MAX_TRIES_PER_OBSTACLE = 200  # random positions that are tried for each obstacle
 LEAN_SEED = 1  # third part of the seed of the leans, so that they do not change the positions
 
 
-class RandomField(Solid, frozen=True, kw_only=True):
+class RandomField(SolidObstacle, frozen=True, kw_only=True):
     """Randomly placed pegs and blocks, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
@@ -65,7 +72,7 @@ class RandomField(Solid, frozen=True, kw_only=True):
         return round(self.density_per_m2 * area_m2)
 
 
-def sample_materials_and_leans(field: RandomField, index: int, count: int) -> list[Upright]:
+def sample_materials_and_leans(field: RandomField, index: int, count: int) -> list[UprightSolid]:
     """Return the material and a random lean for every obstacle of a random field.
 
     Args:
@@ -77,7 +84,8 @@ def sample_materials_and_leans(field: RandomField, index: int, count: int) -> li
     leans = rng.uniform((0.0, -math.pi), (field.lean_up_to_rad, math.pi), (count, 2))
     material = get_material_fields(field)
     return [
-        Upright(**material, lean_rad=lean_rad, lean_towards_rad=towards_rad) for lean_rad, towards_rad in leans.tolist()
+        UprightSolid(**material, lean_rad=lean_rad, lean_towards_rad=towards_rad)
+        for lean_rad, towards_rad in leans.tolist()
     ]
 
 
@@ -86,9 +94,9 @@ def place_random_obstacles(
     context: str,
     index: int,
     route: Route | None,
-    existing_obstacles: Sequence[Obstacle],
-    snake_capsules: Sequence[Capsule],
-) -> list[Obstacle]:
+    existing_obstacles: Sequence[KnownObstacle],
+    snake_capsules: Sequence[CapsuleOutline],
+) -> list[KnownObstacle]:
     """Place the obstacles of a random field by rejection sampling.
 
     Args:
@@ -105,13 +113,13 @@ def place_random_obstacles(
     _validate_field(field, context, route)
     rng = np.random.default_rng([field.seed, index])
     exclusion_zones = _make_exclusion_zones(field, route, snake_capsules)
-    placed: list[Obstacle] = []
-    placed_outlines = Outlines.from_obstacles(existing_obstacles)
+    placed: list[KnownObstacle] = []
+    placed_outlines = ObstacleOutlines.from_obstacles(existing_obstacles)
     for _ in range(MAX_TRIES_PER_OBSTACLE * field.target_count):
         if len(placed) == field.target_count:
             return placed
         candidate = _sample_obstacle(field, rng, f"random_{index}_{len(placed)}")
-        outline = Outlines.from_obstacles([candidate])
+        outline = ObstacleOutlines.from_obstacles([candidate])
         if len(placed_outlines) and has_gap_below(outline, placed_outlines, field.clearance_m):
             continue
         if any(has_gap_below(outline, zone, 0.0) for zone in exclusion_zones):
@@ -127,16 +135,18 @@ def place_random_obstacles(
     return placed
 
 
-def _make_exclusion_zones(field: RandomField, route: Route | None, snake: Sequence[Capsule]) -> list[Outlines]:
+def _make_exclusion_zones(
+    field: RandomField, route: Route | None, snake: Sequence[CapsuleOutline]
+) -> list[ObstacleOutlines]:
     """Return the outlines that no obstacle may overlap: snake and route, each grown by its clearance."""
-    zones: list[Outlines] = []
+    zones: list[ObstacleOutlines] = []
     if snake:
         rear_w = np.array([link.rear_m for link in snake])
         front_w = np.array([link.front_m for link in snake])
         radius_m = max(link.radius_m for link in snake)
-        zones.append(Outlines.from_segments(rear_w, front_w, radius_m + field.clearance_m))
+        zones.append(ObstacleOutlines.from_segments(rear_w, front_w, radius_m + field.clearance_m))
     if route is not None and field.route_clearance_m is not None:
-        zones.append(Outlines.from_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
+        zones.append(ObstacleOutlines.from_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
     return zones
 
 
@@ -175,7 +185,7 @@ def _validate_field(field: RandomField, context: str, route: Route | None) -> No
         )
 
 
-def _sample_obstacle(field: RandomField, rng: Generator, name: str) -> Obstacle:
+def _sample_obstacle(field: RandomField, rng: Generator, name: str) -> KnownObstacle:
     """Sample a peg or a block at a random position in the field.
 
     The order of the random numbers is part of the result: a scene is the same for the same seed.

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.scenario import Override
+from snakesim_hal.model.scenario import KeyOverride
 
 
 class Randomization(FileStruct, frozen=True, kw_only=True):
@@ -30,7 +30,7 @@ class Randomization(FileStruct, frozen=True, kw_only=True):
         if not are_finite or self.low > self.high:
             raise ValueError(f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite")
 
-    def sample_overrides(self, scene_number: int, origin: str = "[[randomize]]") -> list[Override]:
+    def sample_overrides(self, scene_number: int, origin: str = "[[randomize]]") -> list[KeyOverride]:
         """Sample the random value for one scene, and return an override with it for every key.
 
         Only the number of the scene and the first key seed the value, so that an additional `Randomization` does not
@@ -43,7 +43,7 @@ class Randomization(FileStruct, frozen=True, kw_only=True):
         first_key = self.set[0]
         rng = np.random.default_rng([scene_number, *first_key.encode()])
         value = round(float(rng.uniform(self.low, self.high)), 6)
-        return [Override(key, value, origin) for key in self.set]
+        return [KeyOverride(key, value, origin) for key in self.set]
 
 
 def parse_randomizations(bounds_by_keys: Mapping[str, Sequence[Any]] | None) -> list[Randomization]:

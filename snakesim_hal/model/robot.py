@@ -15,28 +15,38 @@ from msgspec import Meta
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.checked import StartCheckRecord
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.friction import Skin, Wheels, validate_skin
-from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, make_joints
+from snakesim_hal.model.friction import PassiveWheels, Skin, validate_skin
+from snakesim_hal.model.joints import (
+    DriveMode,
+    Joint,
+    JointDrive,
+    JointExceptions,
+    JointMotor,
+    JointSupply,
+    MotionLimits,
+    MotorHeat,
+    make_joints,
+)
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.plugins import SENSORS, load_plugin, require_base_class
 from snakesim_hal.model.sensor_model import SensorModel
-from snakesim_hal.model.sensors import CustomSensor, LinkName, Mounted, Sensors
+from snakesim_hal.model.sensors import CustomSensor, LinkName, MountedSensor, SensorSections
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.custom_sample import make_message_schema
 from snakesim_hal.wire.messages import (
     Axis,
-    Description,
     JointDescription,
+    JointMode,
     LinkDescription,
     Measurement,
-    Mode,
+    RobotDescription,
     SensorDescription,
     StopMode,
 )
 from snakesim_hal.wire.quantities import MAX_JOINTS, above
 
 
-class Chain(FileStruct, frozen=True, kw_only=True):
+class ChainLayout(FileStruct, frozen=True, kw_only=True):
     """Number of modules, and axes of their joints."""
 
     modules: Annotated[int, Meta(ge=1, le=MAX_JOINTS)]
@@ -48,7 +58,7 @@ class Chain(FileStruct, frozen=True, kw_only=True):
     """
 
 
-class Module(FileStruct, frozen=True, kw_only=True):
+class ModuleBody(FileStruct, frozen=True, kw_only=True):
     """Body of one module."""
 
     length_m: Annotated[float, above(2, "m")]
@@ -61,7 +71,7 @@ class Module(FileStruct, frozen=True, kw_only=True):
     """Mass of one module with everything in it."""
 
 
-class Safety(FileStruct, frozen=True, kw_only=True):
+class SafetyParameters(FileStruct, frozen=True, kw_only=True):
     """Behavior of the joints in a fault, and limits of commands."""
 
     action: StopMode = "damp"
@@ -87,10 +97,10 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     """Description in one line, which lists of robots show."""
 
     # Body.
-    chain: Chain
+    chain: ChainLayout
     """Number of modules, and the axes of their joints."""
 
-    module: Module
+    module: ModuleBody
     """Size and mass of one module."""
 
     links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []
@@ -99,33 +109,33 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     skin: Skin | None = None
     """Scales or a skin that slide more easily in one direction; none: links rub equally in all directions."""
 
-    wheels: Wheels | None = None
+    wheels: PassiveWheels | None = None
     """Passive wheels under the links; none: the robot has no wheels."""
 
     # All joints.
-    limits: Limits
+    limits: MotionLimits
     """Limits of every joint."""
 
-    motor: Motor
+    motor: JointMotor
     """Motor of every joint."""
 
-    drive: Drive = Drive()
+    drive: JointDrive = JointDrive()
     """Connection, mounting and abilities of every joint's drive."""
 
-    heat: Heat = Heat()
+    heat: MotorHeat = MotorHeat()
     """How every motor warms up."""
 
-    supply: Supply = Supply()
+    supply: JointSupply = JointSupply()
     """Electrical supply of every joint."""
 
     # What differs in single joints, by name.
     joints: Annotated[dict[str, JointExceptions], Meta(max_length=MAX_JOINTS)] = {}
     """Values that differ in single joints, as sections such as `[joints.joint_3]`. `joint_1` is at the tail."""
 
-    safety: Safety = Safety()
+    safety: SafetyParameters = SafetyParameters()
     """Stop mode, and limits of commands."""
 
-    sensors: Sensors = Sensors()
+    sensors: SensorSections = SensorSections()
     """Sensors of the robot."""
 
     checked: StartCheckRecord | None = None
@@ -144,7 +154,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
         for sensor in (*self.sensors.depth, *self.sensors.range, *self.sensors.custom):
             self._validate_sensor_placement(sensor)
 
-    def _validate_sensor_placement(self, sensor: Mounted) -> None:
+    def _validate_sensor_placement(self, sensor: MountedSensor) -> None:
         """Raise ValueError if a sensor is on a link that does not exist, or would be inside of its link."""
         link = self.link_index(sensor.link)
         head = self.chain.modules
@@ -226,7 +236,7 @@ def _describe_joint(joint: Joint) -> JointDescription:
     """Return the description of one joint that the HAL publishes."""
     limits = joint.limits
     motor = joint.motor
-    drive_modes = [mode for mode in Mode if mode.name.lower() in joint.drive.modes]
+    drive_modes = [mode for mode in JointMode if mode.name.lower() in joint.drive.modes]
     measures: list[Measurement] = [quantity for quantity in get_args(Measurement) if quantity in joint.drive.measures]
     return JointDescription(
         name=joint.name,
@@ -247,7 +257,7 @@ def _describe_joint(joint: Joint) -> JointDescription:
         velocity_gain_nm_s_per_rad=motor.velocity_gain_nm_s_per_rad,
         rotor_kg_m2=motor.armature_kg_m2,
         # Drive.
-        modes=[Mode.PASSIVE, *drive_modes],
+        modes=[JointMode.PASSIVE, *drive_modes],
         measures=measures,
     )
 
@@ -287,7 +297,7 @@ def describe_robot(
     config_hash: str,
     emulated: bool = False,
     simulated_time: bool = False,
-) -> Description:
+) -> RobotDescription:
     """Return the description of a robot that the HAL publishes.
 
     Args:
@@ -303,7 +313,7 @@ def describe_robot(
         ConfigError: The class of a custom sensor cannot be loaded, or has no message.
     """
     joints = describe_joints(robot)
-    return Description(
+    return RobotDescription(
         robot=robot.name,
         # Host and run.
         backend=backend,
@@ -341,13 +351,13 @@ def _describe_sensors(robot: RobotFile, period_ns: int) -> list[SensorDescriptio
     sensors = [joint_sensor]
     for key, sensor in robot.sensors.iterate_published():
         delay_s = sensor.delay_s
-        if isinstance(sensor, Mounted):  # its sample arrives at least one period after the measurement
+        if isinstance(sensor, MountedSensor):  # its sample arrives at least one period after the measurement
             delay_s = max(delay_s, period_ns * 1e-9)
         sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, cycle_rate_hz), delay_s=delay_s))
     return sensors
 
 
-def add_drive_identities(robot: Description, serials: Sequence[str], firmware: Sequence[str]) -> Description:
+def add_drive_identities(robot: RobotDescription, serials: Sequence[str], firmware: Sequence[str]) -> RobotDescription:
     """Return a description with the serial number and the firmware version of every drive.
 
     Args:

@@ -11,11 +11,11 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.friction import Surface, Viscous
+from snakesim_hal.model.friction import Surface, ViscousFriction
 from snakesim_hal.model.outlines import Coordinate, Friction, Heading, Point, Size
 from snakesim_hal.model.random_field import RandomField
 from snakesim_hal.model.route import Route, sample_sine_curve
-from snakesim_hal.model.solids import GRAVITY_M_S2, Solid, Upright
+from snakesim_hal.model.solids import GRAVITY_M_S2, SolidObstacle, UprightSolid
 from snakesim_hal.wire.quantities import Name, Vector, above, from_zero
 
 MAX_SLOPE_RAD = 0.7854  # 45 degrees
@@ -43,7 +43,7 @@ class Ground(Surface, frozen=True, kw_only=True):
     friction: Friction
     """Coulomb friction between the ground and the snake."""
 
-    viscous: Viscous | None = None
+    viscous: ViscousFriction | None = None
     """Viscous friction in addition to dry friction, such as in mud; none: there is none."""
 
     heightfield: Heightfield | None = None
@@ -78,7 +78,7 @@ class WaypointRoute(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_
     """Points of the route in the world frame, as [x, y], from its start to its end."""
 
 
-class Cylinder(Upright, frozen=True, kw_only=True):
+class Cylinder(UprightSolid, frozen=True, kw_only=True):
     """A peg."""
 
     position_m: Point
@@ -94,7 +94,7 @@ class Cylinder(Upright, frozen=True, kw_only=True):
     """Name, which no other obstacle has. None: `cylinder_` with its number in the file."""
 
 
-class Box(Upright, frozen=True, kw_only=True):
+class Box(UprightSolid, frozen=True, kw_only=True):
     """A block."""
 
     position_m: Point
@@ -110,7 +110,7 @@ class Box(Upright, frozen=True, kw_only=True):
     """Name, which no other obstacle has. None: `box_` with its number in the file."""
 
 
-class Sphere(Solid, frozen=True, kw_only=True):
+class Sphere(SolidObstacle, frozen=True, kw_only=True):
     """A ball. One that slides does not roll."""
 
     position_m: Point
@@ -126,7 +126,7 @@ class Sphere(Solid, frozen=True, kw_only=True):
     """Name, which no other obstacle has. None: `sphere_` with its number in the file."""
 
 
-class Wall(Upright, frozen=True, kw_only=True):
+class Wall(UprightSolid, frozen=True, kw_only=True):
     """A straight wall between two points."""
 
     from_m: Point
@@ -167,7 +167,7 @@ class Step(Surface, frozen=True, kw_only=True):
     """Name, which no other obstacle has. None: `step_` with its number in the file."""
 
 
-class PegsAlongRoute(Upright, frozen=True, kw_only=True):
+class PegsAlongRoute(UprightSolid, frozen=True, kw_only=True):
     """Pegs beside the route where a snake can push off: at its inflections, on alternating sides.
 
     `corridor_m` is the distance from the route to a peg's surface, so a body of radius r has `corridor_m - r` of

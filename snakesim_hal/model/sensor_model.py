@@ -31,9 +31,10 @@ class SensorModel(ABC):
         """Prepare for reading.
 
         Args:
-            sensor: The entry of the robot file, a `snakesim_hal.model.sensors.Mounted` with the fields of its section.
-            scope: A `snakesim_sim_backend.sensors.scope.Scope`: the run, the model, a copy of its state, and the noise
-                generator of this sensor.
+            sensor: The entry of the robot file, a `snakesim_hal.model.sensors.MountedSensor` with the fields of its
+                section.
+            scope: A `snakesim_sim_backend.sensors.scope.SensorScope`: the run, the model, a copy of its state, and the
+                noise generator of this sensor.
             settings: An instance of `Settings`.
 
         Raises:

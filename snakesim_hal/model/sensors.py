@@ -48,7 +48,7 @@ class JointSensor(FileStruct, frozen=True, kw_only=True):
     """Standard deviation of the noise of every torque."""
 
 
-class _Sampled(FileStruct, frozen=True, kw_only=True):
+class _SampledSensor(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
     """Number of samples per second. At most the rate of the control cycle."""
 
@@ -56,7 +56,7 @@ class _Sampled(FileStruct, frozen=True, kw_only=True):
     """Time from the measurement to its arrival at the host."""
 
 
-class ContactSensor(_Sampled, frozen=True, kw_only=True):
+class ContactSensor(_SampledSensor, frozen=True, kw_only=True):
     """Contacts of the links with obstacles."""
 
     position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
@@ -69,7 +69,7 @@ class ContactSensor(_Sampled, frozen=True, kw_only=True):
     """Force below which a contact is not detected."""
 
 
-class ImuSensor(_Sampled, frozen=True, kw_only=True):
+class ImuSensor(_SampledSensor, frozen=True, kw_only=True):
     """Angular velocity and acceleration (gravity included) of every link."""
 
     angular_velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
@@ -79,7 +79,7 @@ class ImuSensor(_Sampled, frozen=True, kw_only=True):
     """Standard deviation of the noise of each component of the acceleration."""
 
 
-class PoseSensor(_Sampled, frozen=True, kw_only=True):
+class PoseSensor(_SampledSensor, frozen=True, kw_only=True):
     """Pose of the base, from motion capture."""
 
     position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
@@ -99,7 +99,7 @@ class PowerSensor(FileStruct, frozen=True, kw_only=True):
     """Time from the measurement to its arrival at the host."""
 
 
-class Mounted(FileStruct, frozen=True, kw_only=True):
+class MountedSensor(FileStruct, frozen=True, kw_only=True):
     """A sensor at a position on a link; its name distinguishes it from others of the same kind.
 
     What it measures arrives after `delay_s`, but not earlier than one control period later.
@@ -131,7 +131,7 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     """Settings of the sensor's model, which checks them."""
 
 
-class DistanceSensor(Mounted, frozen=True, kw_only=True):
+class DistanceSensor(MountedSensor, frozen=True, kw_only=True):
     """A sensor that measures distances from its position."""
 
     noise_m: Annotated[float, from_zero(1, "m")] = 0.0
@@ -204,7 +204,7 @@ class RangeSensor(DistanceSensor, frozen=True, kw_only=True):
             )
 
 
-class CustomSensor(Mounted, frozen=True, kw_only=True):
+class CustomSensor(MountedSensor, frozen=True, kw_only=True):
     """A custom sensor: the class in `model` defines its message, see docs/how-to/sensors.md."""
 
     model: Model
@@ -222,7 +222,7 @@ BodySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor
 AnySensor = BodySensor | AnyMounted
 
 
-class Sensors(FileStruct, frozen=True, kw_only=True):
+class SensorSections(FileStruct, frozen=True, kw_only=True):
     """The sensors of the robot. Without its section a sensor is absent."""
 
     joints: JointSensor = JointSensor()

@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from snakesim_hal.model.friction import Surface
 from snakesim_hal.model.outlines import Friction, Heading, Point
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 
 GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless the scene says otherwise
 PEG_FRICTION = 0.2  # plastic shell against plastic or metal: 0.13 to 0.32 in tables, see docs/how-to/scenes.md
@@ -14,7 +14,7 @@ BASE_FRICTION = 0.4  # an obstacle on the ground on which it slides
 MAX_LEAN_RAD = 0.6
 
 
-class Solid(Surface, frozen=True, kw_only=True):
+class SolidObstacle(Surface, frozen=True, kw_only=True):
     """An obstacle that the snake can push against. By default it is rigid, and fixed to the ground."""
 
     friction: Friction = PEG_FRICTION
@@ -47,7 +47,7 @@ class Solid(Surface, frozen=True, kw_only=True):
         return self.base_friction * normal_gravity_m_s2 * self.mass_kg
 
 
-class Upright(Solid, frozen=True, kw_only=True):
+class UprightSolid(SolidObstacle, frozen=True, kw_only=True):
     """A solid with an axis, which may lean about the middle of its foot."""
 
     lean_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
@@ -57,13 +57,13 @@ class Upright(Solid, frozen=True, kw_only=True):
     """Direction in which its top leans, seen from above. 0: along x."""
 
 
-def get_material_fields(solid: Solid) -> dict[str, Any]:
-    """Return the fields of `Solid`, and those of `Upright` if the obstacle is upright, without those of its shape."""
-    struct = Upright if isinstance(solid, Upright) else Solid
+def get_material_fields(solid: SolidObstacle) -> dict[str, Any]:
+    """Return the fields of `SolidObstacle`, and those of `UprightSolid` if it is upright, without those of a shape."""
+    struct = UprightSolid if isinstance(solid, UprightSolid) else SolidObstacle
     return {name: getattr(solid, name) for name in struct.__struct_fields__}
 
 
-def make_peg(name: str, position_m: Point, radius_m: float, height_m: float) -> Obstacle:
+def make_peg(name: str, position_m: Point, radius_m: float, height_m: float) -> KnownObstacle:
     """Return an upright cylinder that stands on the ground.
 
     Args:
@@ -73,7 +73,7 @@ def make_peg(name: str, position_m: Point, radius_m: float, height_m: float) -> 
         height_m: Height of the cylinder.
     """
     x, y = position_m
-    return Obstacle(
+    return KnownObstacle(
         name=name,
         shape="cylinder",
         position_w=(float(x), float(y), height_m / 2),
@@ -82,7 +82,7 @@ def make_peg(name: str, position_m: Point, radius_m: float, height_m: float) -> 
     )
 
 
-def make_block(name: str, position_m: Point, size_m: tuple[float, float, float], yaw_rad: float) -> Obstacle:
+def make_block(name: str, position_m: Point, size_m: tuple[float, float, float], yaw_rad: float) -> KnownObstacle:
     """Return a box that stands on the ground.
 
     Args:
@@ -92,7 +92,7 @@ def make_block(name: str, position_m: Point, size_m: tuple[float, float, float],
         yaw_rad: Rotation about the vertical. 0 if the length is along x.
     """
     length_m, width_m, height_m = size_m
-    return Obstacle(
+    return KnownObstacle(
         name=name,
         shape="box",
         position_w=(*position_m, height_m / 2),

@@ -1,13 +1,13 @@
 """Whether real motors move, in the same words for every program with which a person watches a robot."""
 
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 EMULATED = "EMULATED"
 REAL = "REAL"
 UNKNOWN = "UNKNOWN"
 
 
-def describe_what_moves(robot: Description | None) -> str:
+def describe_what_moves(robot: RobotDescription | None) -> str:
     """Describe whether real motors move: one of the words EMULATED, REAL and UNKNOWN, with an explanation.
 
     Args:
@@ -24,7 +24,7 @@ def describe_what_moves(robot: Description | None) -> str:
     return f"{REAL}: motors move ({hardware}){watchdog_clause}"
 
 
-def describe_missing_watchdogs(robot: Description) -> str:
+def describe_missing_watchdogs(robot: RobotDescription) -> str:
     """Return a clause about the joints whose drives have no watchdog; empty if every drive has one."""
     names = [joint.name for joint in robot.joints if not joint.watchdog]
     if not names:

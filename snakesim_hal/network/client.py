@@ -1,7 +1,7 @@
 """The HAL client of guidance, navigation and control: ticks, samples, outputs, and the right to command.
 
-A service loops over `Client.iterate_ticks()`. At each tick it reads the samples that the clock names, so a lockstep run
-gives every service the same inputs, no matter how the operating system scheduled the processes.
+A service loops over `HostClient.iterate_ticks()`. At each tick it reads the samples that the clock names, so a lockstep
+run gives every service the same inputs, no matter how the operating system scheduled the processes.
 
 Threads: the service calls every public method from one thread, its own. Zenoh's threads call `_store_clock` and
 `_on_host_token` alone; these hand over a clock by a queue, and everything else by setting one attribute.
@@ -13,26 +13,26 @@ from queue import Empty
 from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError, StalledError, WireError, shorten
-from snakesim_hal.network.feed import Feed, RobotFilter
+from snakesim_hal.network.feed import RobotFilter, SampleFeed
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival, Publisher
+from snakesim_hal.network.streams import Publisher, ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, MessageT
+from snakesim_hal.wire.codec import MessageDecoder, MessageT
 from snakesim_hal.wire.custom_sample import find_custom_message
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
     ClockMode,
-    Description,
-    Done,
     JointCommand,
+    JointMode,
     JointState,
     LeaseRequest,
     Message,
-    Mode,
+    RobotDescription,
+    TickDone,
 )
 from snakesim_hal.wire.outgoing import encode_checked
 from snakesim_hal.wire.setpoints import RequestedSetpoints
@@ -44,7 +44,7 @@ LEASE_RETRY_S = 0.25  # between two requests of the lease
 NO_COMMANDED_TICK = -1
 
 
-class Client:
+class HostClient:
     """A service's connection to one robot's HAL host.
 
     Example:
@@ -79,12 +79,12 @@ class Client:
         self._last_clock_s = time.monotonic()
         self.newest_clock: Clock | None = None  # due or not
         self._has_host_left = False
-        self._clock_decoder = Decoder(Clock)
+        self._clock_decoder = MessageDecoder(Clock)
         self._clock: Clock | None = None  # of the current tick
         self._next_clock: Clock | None = None  # popped from the queue, but of a later tick than the one returned
         self._has_restarted = False  # whether robot time has restarted since the last `fetch_changed_description`
         # Inputs and outputs.
-        self._feeds: dict[str, Feed[Any]] = {}
+        self._feeds: dict[str, SampleFeed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._filter = RobotFilter(session.rejected)
         self.commanded_tick = NO_COMMANDED_TICK
@@ -94,7 +94,7 @@ class Client:
 
     # --- the robot -------------------------------------------------------------------------------------------
 
-    def wait_for_description(self, timeout_s: float = 10.0) -> Description:
+    def wait_for_description(self, timeout_s: float = 10.0) -> RobotDescription:
         """Return the robot's description. The first call waits for it.
 
         Args:
@@ -111,7 +111,7 @@ class Client:
         self._filter.robot = robot
         return robot
 
-    def fetch_changed_description(self) -> Description | None:
+    def fetch_changed_description(self) -> RobotDescription | None:
         """Fetch and return the robot's description if its HAL host may have been replaced since the last call.
 
         The host may have been replaced if robot time has restarted, or if the liveliness token of the host has vanished
@@ -128,17 +128,17 @@ class Client:
         self._filter.robot = self._fetch_description(MISSING_SAMPLE_TIMEOUT_S) or self._filter.robot
         return self._filter.robot
 
-    def _fetch_description(self, timeout_s: float) -> Description | None:
+    def _fetch_description(self, timeout_s: float) -> RobotDescription | None:
         """Return the description that the host of this run publishes, or None after the timeout.
 
         A description without the proof of this run is ignored.
         """
         run_key = read_own_run_key()
 
-        def is_of_this_run(robot: Description) -> bool:
+        def is_of_this_run(robot: RobotDescription) -> bool:
             return has_valid_proof(robot, run_key)
 
-        return self.session.wait_for_latched(keys.DESCRIPTION, Description, timeout_s, is_of_this_run)
+        return self.session.wait_for_latched(keys.DESCRIPTION, RobotDescription, timeout_s, is_of_this_run)
 
     def _on_host_token(self, key: str, present: bool) -> None:
         """Set a flag, in Zenoh's thread, if the liveliness token of the robot's host has vanished."""
@@ -222,7 +222,7 @@ class Client:
             time.sleep(CLOCK_POLL_S)
         return self.newest_clock
 
-    def _store_clock(self, arrival: Arrival) -> None:
+    def _store_clock(self, arrival: ReceivedSample) -> None:
         """Store a clock, in Zenoh's thread, and queue it if its tick is due for this service."""
         self._last_clock_s = arrival.monotonic_ns * 1e-9
         try:
@@ -239,7 +239,7 @@ class Client:
 
     # --- inputs ----------------------------------------------------------------------------------------------
 
-    def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
+    def subscribe(self, key: str, message: type[MessageT]) -> SampleFeed[MessageT]:
         """Subscribe to a key. Do this for all keys before `announce`.
 
         Args:
@@ -249,11 +249,11 @@ class Client:
         Returns:
             What `read` takes.
         """
-        feed = Feed(self.session.declare_reader(key, message), key, self._filter.accepts)
+        feed = SampleFeed(self.session.declare_reader(key, message), key, self._filter.accepts)
         self._feeds[key] = feed
         return feed
 
-    def read(self, feed: Feed[MessageT]) -> MessageT | None:
+    def read(self, feed: SampleFeed[MessageT]) -> MessageT | None:
         """Return the sample of a feed that is valid at this tick, or None if there is none (yet).
 
         In real time this is the newest sample. In lockstep it is exactly the sample that the clock names, and an armed
@@ -267,7 +267,7 @@ class Client:
             self.missing_keys.add(feed.key)
         return sample
 
-    def _find_current_sample(self, feed: Feed[MessageT]) -> MessageT | None:
+    def _find_current_sample(self, feed: SampleFeed[MessageT]) -> MessageT | None:
         """Return the sample of a feed that belongs to the current tick, or None if there is none yet.
 
         In real time this is the newest sample. In lockstep, `Clock.newest` names the tick of the sample, by its key or
@@ -295,7 +295,7 @@ class Client:
             sample = self._wait_for_sample(feed, sample_tick, clock)
         return sample
 
-    def _wait_for_sample(self, feed: Feed[MessageT], tick: int, clock: Clock) -> MessageT:
+    def _wait_for_sample(self, feed: SampleFeed[MessageT], tick: int, clock: Clock) -> MessageT:
         deadline_s = time.monotonic() + MISSING_SAMPLE_TIMEOUT_S
         while time.monotonic() < deadline_s:
             time.sleep(SAMPLE_POLL_S)
@@ -338,7 +338,7 @@ class Client:
     def report_done(self, tick: int) -> None:
         """Report that all output for a tick is published. A command that answers the tick implies it."""
         if self.commanded_tick != tick:
-            self._get_publisher(keys.done_key(self.service), Done).put(Done(tick=tick))
+            self._get_publisher(keys.done_key(self.service), TickDone).put(TickDone(tick=tick))
 
     def _get_publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         """Return the publisher of a key, which is declared at its first message."""
@@ -364,7 +364,7 @@ class Commander:
     The service calls it from its own thread, the one that calls its client.
     """
 
-    def __init__(self, client: Client, description: Description) -> None:
+    def __init__(self, client: HostClient, description: RobotDescription) -> None:
         """Start without the lease.
 
         Args:
@@ -440,6 +440,6 @@ class Commander:
     def make_hold_setpoints(self, joints: JointState) -> RequestedSetpoints:
         """Return setpoints that hold every joint at its measured angle, to be sent while the robot is not armed."""
         robot_joints = self._description.joints
-        modes = [Mode.POSITION] * len(robot_joints)
+        modes = [JointMode.POSITION] * len(robot_joints)
         torque_limits_nm = [joint.torque_limit_nm for joint in robot_joints]
         return RequestedSetpoints(modes, list(joints.angle_rad), torque_limits_nm)

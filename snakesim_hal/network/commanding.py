@@ -13,10 +13,10 @@ from collections.abc import Callable
 from snakesim_hal.base.errors import RefusedError, StalledError
 from snakesim_hal.base.process import tune_garbage_collector
 from snakesim_hal.model.fault_kinds import CONTROL
-from snakesim_hal.network.client import Client, Commander, Feed
+from snakesim_hal.network.client import Commander, HostClient, SampleFeed
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, ClockMode, Contacts, Description, JointState, Message, Pose
+from snakesim_hal.wire.messages import Clock, ClockMode, Contacts, JointState, Message, Pose, RobotDescription
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 SILENCE_S = 2.0  # without a clock: the host has stalled
@@ -28,7 +28,7 @@ READABLE_KEYS = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contac
 class CommandingClient:
     """Takes the place of the run's control service, from construction to the end of the session."""
 
-    def __init__(self, session: Session, robot: Description, clock_mode: ClockMode) -> None:
+    def __init__(self, session: Session, robot: RobotDescription, clock_mode: ClockMode) -> None:
         """Subscribe to the robot's samples, and wait until this client holds the command lease.
 
         Args:
@@ -47,8 +47,8 @@ class CommandingClient:
                 "--set services.control.external=true",
                 code="robot/has-controller",
             )
-        self._client = Client(session, CONTROL, clock_mode=clock_mode)
-        self._feeds: dict[str, Feed] = {}
+        self._client = HostClient(session, CONTROL, clock_mode=clock_mode)
+        self._feeds: dict[str, SampleFeed] = {}
         for key, message in READABLE_KEYS.items():
             self._feeds[key] = self._client.subscribe(key, message)
         self._client.wait_for_description()

@@ -61,7 +61,7 @@ _requested_thread_counts: list[int] = []  # receiving threads of each session th
 
 
 @dataclass(frozen=True)
-class Link:
+class ConnectionSettings:
     """How a process connects to the robot's network."""
 
     endpoint: str = DEFAULT_ENDPOINT
@@ -72,17 +72,17 @@ class Link:
     session: SessionFile | None = None  # how to connect; `endpoint` is then the first one in it
 
     @staticmethod
-    def from_session_file(session: SessionFile, namespace: str | None = None) -> "Link":
+    def from_session_file(session: SessionFile, namespace: str | None = None) -> "ConnectionSettings":
         """Return the link that a session file describes.
 
         Raises:
             ConfigError: The file is for another namespace.
         """
-        return Link(session.endpoints[0], session.resolve_namespace(namespace), session=session)
+        return ConnectionSettings(session.endpoints[0], session.resolve_namespace(namespace), session=session)
 
 
 def open_zenoh(
-    link: Link, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
+    link: ConnectionSettings, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
 ) -> zenoh.Session:
     """Open a session of Zenoh with the settings that SnakeSIM needs.
 
@@ -107,7 +107,7 @@ def open_zenoh(
         raise _make_connection_error(link, error) from error
 
 
-def _build_config(link: Link, connect_timeout_s: float) -> zenoh.Config:
+def _build_config(link: ConnectionSettings, connect_timeout_s: float) -> zenoh.Config:
     """Return the settings of a session file, if there is one, with the settings of every session on top."""
     config = _build_base_config(link)
     settings = {**REQUIRED_SETTINGS, "connect/timeout_ms": round(connect_timeout_s * 1000)}
@@ -120,7 +120,7 @@ def _build_config(link: Link, connect_timeout_s: float) -> zenoh.Config:
     return config
 
 
-def _build_base_config(link: Link) -> zenoh.Config:
+def _build_base_config(link: ConnectionSettings) -> zenoh.Config:
     """Return the settings of the session file; without one, Zenoh's defaults with the link's endpoint alone."""
     if link.session is not None:
         return zenoh.Config.from_json5(link.session.text)
@@ -137,7 +137,7 @@ def _build_base_config(link: Link) -> zenoh.Config:
     return config
 
 
-def _make_connection_error(link: Link, error: zenoh.ZError) -> NotConnectedError:
+def _make_connection_error(link: ConnectionSettings, error: zenoh.ZError) -> NotConnectedError:
     """Return the error that explains to a user why Zenoh could not open the session."""
     if link.listen:
         return NotConnectedError(

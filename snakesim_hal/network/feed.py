@@ -8,19 +8,19 @@ from collections.abc import Callable
 from typing import Generic
 
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire.codec import MessageT
-from snakesim_hal.wire.messages import Description, Message
+from snakesim_hal.wire.messages import Message, RobotDescription
 
 MAX_SAMPLES_PER_KEY = 32  # samples
 NO_TICK = -1  # of messages without a tick, such as an intent: only the newest counts
 
 
-class Feed(Generic[MessageT]):
+class SampleFeed(Generic[MessageT]):
     """The newest samples of one key, by tick."""
 
     def __init__(
-        self, reader: Reader[MessageT], key: str, is_acceptable: Callable[[Message], bool] = lambda _message: True
+        self, reader: SampleReader[MessageT], key: str, is_acceptable: Callable[[Message], bool] = lambda _message: True
     ) -> None:
         """Start without samples.
 
@@ -82,7 +82,7 @@ class RobotFilter:
     def __init__(self, rejected: Counter[str]) -> None:
         """Count rejected messages into `rejected`, by reason."""
         self._rejected = rejected
-        self.robot: Description | None = None  # None: not known yet; every message is accepted
+        self.robot: RobotDescription | None = None  # None: not known yet; every message is accepted
 
     def accepts(self, message: Message) -> bool:
         """Return whether a message fits the robot, as far as that is known."""

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_hal.network.connection import Link, open_zenoh
+from snakesim_hal.network.connection import ConnectionSettings, open_zenoh
 
 MAX_WAITING_QUERIES = 10  # at one key, as rmw's profile of services has it
 CONNECT_TIMEOUT_S = 5.0
@@ -169,6 +169,6 @@ def open_foreign_network(endpoint: str, *, max_bytes: int) -> Iterator[ForeignNe
     Raises:
         NotConnectedError: The router does not answer.
     """
-    session = open_zenoh(Link(endpoint, max_bytes=max_bytes), CONNECT_TIMEOUT_S)
+    session = open_zenoh(ConnectionSettings(endpoint, max_bytes=max_bytes), CONNECT_TIMEOUT_S)
     with closing(ForeignNetwork(session)) as network:
         yield network

@@ -18,15 +18,22 @@ import msgspec
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Session, key_expressions_intersect
-from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, get_reader_depth
+from snakesim_hal.network.streams import (
+    READER_DEPTH,
+    IncomingQuery,
+    Publisher,
+    ReceivedSample,
+    SampleReader,
+    get_reader_depth,
+)
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
 
-SampleHandler = Callable[[Arrival], None]
+SampleHandler = Callable[[ReceivedSample], None]
 
 
-class LocalArrival(Arrival, frozen=True):
+class LocalArrival(ReceivedSample, frozen=True):
     """A sample that stays within this process. Its first reader decodes it, and the other readers get that message.
 
     So no reader may change a message. The host decodes commands anew: what moves motors is shared with no service.
@@ -34,7 +41,7 @@ class LocalArrival(Arrival, frozen=True):
 
     decoded: dict[type[Message], Any] = msgspec.field(default_factory=dict[type[Message], Any])
 
-    def decode(self, decoder: Decoder[MessageT]) -> MessageT:
+    def decode(self, decoder: MessageDecoder[MessageT]) -> MessageT:
         message: MessageT | None = self.decoded.get(decoder.message)
         if message is None:
             message = super().decode(decoder)
@@ -50,11 +57,11 @@ class LocalNetwork:
         self.run_responders: Callable[[], None] = lambda: None  # runs the parts that answer queries
         # Callbacks, each with the key or pattern that it is for.
         self.subscribers: list[tuple[str, SampleHandler]] = []
-        self.queryables: list[tuple[str, Callable[[Query], None]]] = []
+        self.queryables: list[tuple[str, Callable[[IncomingQuery], None]]] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         # What sessions have published.
         self.tokens: list[str] = []
-        self.latched: dict[str, Arrival] = {}  # by key
+        self.latched: dict[str, ReceivedSample] = {}  # by key
         self._handlers: dict[str, list[SampleHandler]] = {}  # cache of `find_handlers`, by key
 
     def create_session(self) -> "LocalSession":
@@ -97,27 +104,29 @@ class LocalNetwork:
 
 
 @dataclass
-class Declaration:
+class ZenohDeclaration:
     """A subscription, token or queryable of a session. Zenoh's own objects have the same method."""
 
     undeclare: Callable[[], None]
 
 
-class LocalReader(Reader[MessageT]):
+class LocalReader(SampleReader[MessageT]):
     """Reads the newest samples of one key from a queue that its subscription fills."""
 
-    def __init__(self, declared: Declaration, arrivals: deque[Arrival], message: type[MessageT], rejected: Any) -> None:
+    def __init__(
+        self, declared: ZenohDeclaration, arrivals: deque[ReceivedSample], message: type[MessageT], rejected: Any
+    ) -> None:
         super().__init__(declared, message, rejected)
         self._arrivals = arrivals
 
-    def _pop_samples(self) -> list[Arrival]:
+    def _pop_samples(self) -> list[ReceivedSample]:
         if not self._arrivals:
             return []
         arrived = list(self._arrivals)
         self._arrivals.clear()
         return arrived
 
-    def _decode_sample(self, sample: Arrival, decoder: Decoder[MessageT]) -> MessageT:
+    def _decode_sample(self, sample: ReceivedSample, decoder: MessageDecoder[MessageT]) -> MessageT:
         return sample.decode(decoder)
 
 
@@ -140,7 +149,7 @@ class LocalQuery:
         if self.answers.empty():
             return None
         _, payload, encoding = self.answers.get_nowait()
-        return Decoder(Answer).decode(payload, encoding)
+        return MessageDecoder(Answer).decode(payload, encoding)
 
 
 class LocalSession(Session):
@@ -173,13 +182,13 @@ class LocalSession(Session):
 
         return self._register_publisher(key, Publisher(message, send, has_subscribers))
 
-    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
-        arrivals: deque[Arrival] = deque(maxlen=depth or get_reader_depth(message))
+    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> SampleReader[MessageT]:
+        arrivals: deque[ReceivedSample] = deque(maxlen=depth or get_reader_depth(message))
         declared = self._subscribe(key, arrivals.append)
         return LocalReader(declared, arrivals, message, self.rejected)
 
-    def declare_latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
-        arrivals: deque[Arrival] = deque(maxlen=READER_DEPTH)
+    def declare_latched_reader(self, key: str, message: type[MessageT]) -> SampleReader[MessageT]:
+        arrivals: deque[ReceivedSample] = deque(maxlen=READER_DEPTH)
         if key in self._network.latched:
             arrivals.append(self._network.latched[key])
         declared = self._subscribe(key, arrivals.append)
@@ -198,7 +207,7 @@ class LocalSession(Session):
                 handler(arrival)
         self._subscribe(key, handler)
 
-    def on_query(self, key: str, handler: Callable[[Query], None]) -> None:
+    def on_query(self, key: str, handler: Callable[[IncomingQuery], None]) -> None:
         """Call `handler` for every query, in the thread of the session that sends it."""
         queryable = (key, handler)
         self._network.queryables.append(queryable)
@@ -223,11 +232,11 @@ class LocalSession(Session):
             declared.undeclare()
         self._declared.clear()
 
-    def _subscribe(self, key: str, handler: SampleHandler) -> Declaration:
+    def _subscribe(self, key: str, handler: SampleHandler) -> ZenohDeclaration:
         return self._declare(self._network.subscribe(key, handler))
 
-    def _declare(self, undeclare: Callable[[], None]) -> Declaration:
-        declared = Declaration(undeclare)
+    def _declare(self, undeclare: Callable[[], None]) -> ZenohDeclaration:
+        declared = ZenohDeclaration(undeclare)
         self._declared.append(declared)
         return declared
 
@@ -238,11 +247,11 @@ class LocalSession(Session):
         ]
         query = LocalQuery(len(matching))
         for key, handler in matching:
-            handler(Query(key, encode(request), format_encoding(type(request)), query))
+            handler(IncomingQuery(key, encode(request), format_encoding(type(request)), query))
         return query
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
-        decoder = Decoder(Answer)
+        decoder = MessageDecoder(Answer)
         query = self.send_query(pattern, request)
         self._network.run_responders()
         deadline = time.monotonic() + timeout_s

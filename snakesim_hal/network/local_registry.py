@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
-    from snakesim_hal.network.session import Link
+    from snakesim_hal.network.session import ConnectionSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class LocalRobot:
 
     @staticmethod
     def from_connection(
-        link: "Link", robot: str, backend: str, stop_port: socket.socket, config: str | None = None
+        link: "ConnectionSettings", robot: str, backend: str, stop_port: socket.socket, config: str | None = None
     ) -> "LocalRobot":
         """Return the entry of a robot for which this process is responsible."""
         stop_host, port = stop_port.getsockname()[:2]

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import msgspec
 
 from snakesim_hal.base.workers import start_restarting_thread
-from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Status
+from snakesim_hal.wire.messages import Answer, LifecycleRequest, RobotDescription, RobotStatus
 
 MAX_BYTES = 1 << 18
 
@@ -22,8 +22,8 @@ MAX_BYTES = 1 << 18
 class HostMessage(msgspec.Struct, frozen=True, kw_only=True):
     """A message of the host, with one of these fields set."""
 
-    description: Description | None = None
-    status: Status | None = None
+    description: RobotDescription | None = None
+    status: RobotStatus | None = None
     answer: Answer | None = None
 
 
@@ -84,8 +84,8 @@ class StarterEnd:
         self._socket = opened
         self._socket.setblocking(False)
         self._decoder = msgspec.msgpack.Decoder(HostMessage)
-        self.description: Description | None = None
-        self.status: Status | None = None
+        self.description: RobotDescription | None = None
+        self.status: RobotStatus | None = None
         self.answers: list[Answer] = []
         self.resets = 0  # how often another host has started in the same process
 

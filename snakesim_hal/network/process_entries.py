@@ -16,10 +16,10 @@ from snakesim_hal.base.process import get_user_name
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.shared_settings import collect_shared_settings
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival, Publisher
+from snakesim_hal.network.streams import Publisher, ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import VERSIONS, Process
+from snakesim_hal.wire.codec import MessageDecoder
+from snakesim_hal.wire.messages import VERSIONS, ProcessInfo
 
 HOST = "host"
 MAX_ENTRIES = 256
@@ -27,14 +27,14 @@ MAX_LISTED_DIFFERENCES = 3  # differences in the text of a refusal
 NOT_SET = "not set"
 
 
-def make_own_entry(name: str, config: RunConfig | None = None) -> Process:
+def make_own_entry(name: str, config: RunConfig | None = None) -> ProcessInfo:
     """Return the entry that describes this process to other processes.
 
     Args:
         name: Role of the process, such as the name of its service.
         config: Configuration of the run. None if the process uses none.
     """
-    return Process(
+    return ProcessInfo(
         name=name,
         machine=socket.gethostname()[:64] or "unnamed",
         user=get_user_name(),
@@ -46,7 +46,7 @@ def make_own_entry(name: str, config: RunConfig | None = None) -> Process:
     )
 
 
-def publish_process_entry(session: Session, entry: Process) -> Publisher[Process]:
+def publish_process_entry(session: Session, entry: ProcessInfo) -> Publisher[ProcessInfo]:
     """Publish an entry for as long as the session lives.
 
     The liveliness token is declared first, so that a host waits for the entry.
@@ -56,12 +56,12 @@ def publish_process_entry(session: Session, entry: Process) -> Publisher[Process
     """
     key = keys.process_key(entry.name, secrets.token_hex(4))
     session.declare_token(key)
-    shown = session.declare_latched_publisher(key, Process)
+    shown = session.declare_latched_publisher(key, ProcessInfo)
     shown.put(entry)
     return shown
 
 
-def describe_differences(one: Process, other: Process) -> list[str]:
+def describe_differences(one: ProcessInfo, other: ProcessInfo) -> list[str]:
     """Return the differences between two processes of one robot as texts, with values in the order of the arguments."""
     found = [
         f"`{key}` is {value} on {describe_process(one)}, {other_value} on {describe_process(other)}"
@@ -75,7 +75,7 @@ def describe_differences(one: Process, other: Process) -> list[str]:
     return found
 
 
-def _find_differing_settings(one: Process, other: Process) -> list[tuple[str, str, str]]:
+def _find_differing_settings(one: ProcessInfo, other: ProcessInfo) -> list[tuple[str, str, str]]:
     """Return the keys whose values differ, each with both values. A process may use only some sections."""
     sections = {_get_section(key) for key in one.settings} & {_get_section(key) for key in other.settings}
     differing: list[tuple[str, str, str]] = []
@@ -91,12 +91,12 @@ def _get_section(key: str) -> str:
     return key.partition(".")[0]
 
 
-def _find_differing_messages(one: Process, other: Process) -> list[str]:
+def _find_differing_messages(one: ProcessInfo, other: ProcessInfo) -> list[str]:
     """Return the messages that both processes know in different versions."""
     return [name for name in one.messages if name in other.messages and one.messages[name] != other.messages[name]]
 
 
-def _describe_conflict(entry: Process, own: Process) -> str:
+def _describe_conflict(entry: ProcessInfo, own: ProcessInfo) -> str:
     """Return a text about the settings and messages in which a process differs from this one, with the remedy.
 
     The text is empty if nothing differs.
@@ -115,7 +115,7 @@ def _describe_conflict(entry: Process, own: Process) -> str:
     return f"{describe_process(entry)} differs from this host in {listing}; {_describe_remedy(entry, own)}"
 
 
-def _describe_remedy(entry: Process, own: Process) -> str:
+def _describe_remedy(entry: ProcessInfo, own: ProcessInfo) -> str:
     """Return what to do about different settings, or different versions, of two processes."""
     if _find_differing_messages(entry, own):
         return "install one version of SnakeSIM on both machines"
@@ -125,16 +125,16 @@ def _describe_remedy(entry: Process, own: Process) -> str:
     return f"start host and {entry.name} with equal files, --set and --clock-mode"
 
 
-def describe_process(entry: Process) -> str:
+def describe_process(entry: ProcessInfo) -> str:
     """Return the machine, name and id of a process as text."""
     return f"{entry.machine} ({entry.name}, process {entry.pid})"
 
 
-class _Comparison(NamedTuple):
+class _EntryComparison(NamedTuple):
     """Two entries that have been compared."""
 
-    entry: Process
-    own: Process
+    entry: ProcessInfo
+    own: ProcessInfo
     conflict: str  # empty: they fit
 
 
@@ -144,14 +144,14 @@ class ProcessEntries:
     def __init__(self, session: Session) -> None:
         """Subscribe to entries, also to those that were published before."""
         self._session = session
-        self._decoder = Decoder(Process)
-        self._entries: dict[str, Process] = {}
+        self._decoder = MessageDecoder(ProcessInfo)
+        self._entries: dict[str, ProcessInfo] = {}
         self._alive: set[str] = set()
-        self._comparisons: dict[str, _Comparison] = {}  # cache by key; only of known services, so there are few
+        self._comparisons: dict[str, _EntryComparison] = {}  # cache by key; only of known services, so there are few
         session.on_token_change(self._on_token, keys.PROCESS_ALL)
         session.on_latched_arrival(keys.PROCESS_ALL, self._store_entry)
 
-    def find_problems(self, own: Process, names: Collection[str]) -> list[str]:
+    def find_problems(self, own: ProcessInfo, names: Collection[str]) -> list[str]:
         """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
         problems = [f"{process} has not published its settings yet" for process in self.unpublished(names)]
         for key, entry in self._find_entries(names).items():
@@ -160,11 +160,11 @@ class ProcessEntries:
                 problems.append(conflict)
         return problems
 
-    def _find_conflict(self, key: str, entry: Process, own: Process) -> str:
+    def _find_conflict(self, key: str, entry: ProcessInfo, own: ProcessInfo) -> str:
         """Return the text of `_describe_conflict`. Each entry is compared only once, although every status needs it."""
         comparison = self._comparisons.get(key)
         if comparison is None or comparison.entry is not entry or comparison.own is not own:
-            comparison = _Comparison(entry, own, _describe_conflict(entry, own))
+            comparison = _EntryComparison(entry, own, _describe_conflict(entry, own))
             self._comparisons[key] = comparison
         return comparison.conflict
 
@@ -172,9 +172,9 @@ class ProcessEntries:
         """Return the present processes of these names that have not published their entry yet."""
         return [keys.parse_service(key) for key, entry in self._find_entries(names).items() if entry is None]
 
-    def _find_entries(self, names: Collection[str]) -> dict[str, Process | None]:
+    def _find_entries(self, names: Collection[str]) -> dict[str, ProcessInfo | None]:
         """Return the entry of each connected process of these names by its key; None for an unpublished entry."""
-        entry_by_key: dict[str, Process | None] = {}
+        entry_by_key: dict[str, ProcessInfo | None] = {}
         for key in sorted(self._alive.copy()):
             name = keys.parse_service(key).rpartition("-")[0]
             if name in names:
@@ -195,7 +195,7 @@ class ProcessEntries:
         elif not present:
             self._alive.discard(key)  # the entry stays: if only the link was cut, it is not sent again
 
-    def _store_entry(self, arrival: Arrival) -> None:
+    def _store_entry(self, arrival: ReceivedSample) -> None:
         """Store an entry, in Zenoh's thread. A full table first drops the entries of processes that have vanished."""
         if len(self._entries) >= MAX_ENTRIES and arrival.key not in self._entries:
             for key in self._entries.keys() - self._alive:

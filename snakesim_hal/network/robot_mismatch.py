@@ -17,15 +17,15 @@ from snakesim_hal.wire.messages import (
     ColorImage,
     Contacts,
     DepthImage,
-    Description,
     Imu,
     JointState,
     Message,
     MountedSample,
     Pose,
     Power,
+    RobotDescription,
     Trajectory,
-    World,
+    WorldModel,
 )
 
 MAX_PATH_M = 1e5  # a longer path exceeds the bounds of `control/state`
@@ -34,10 +34,10 @@ POWER_LIST_FIELDS = ("voltage_v", "current_a", "motor_c", "board_c", "leak", "va
 IMU_LIST_FIELDS = ("angular_velocity_rad_s", "acceleration_m_s2")
 MAX_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
 
-Check = Callable[[Any, Description], WireError | None]
+Check = Callable[[Any, RobotDescription], WireError | None]
 
 
-def find_mismatch(message: Message, robot: Description) -> WireError | None:
+def find_mismatch(message: Message, robot: RobotDescription) -> WireError | None:
     """Check whether the list lengths, link numbers, rotations and path of a message fit a robot.
 
     Args:
@@ -59,42 +59,42 @@ def _find_check(message_type: type[Message]) -> Check | None:
     return next((check for kind, check in CHECKS.items() if issubclass(message_type, kind)), None)
 
 
-def _check_joint_state(state: JointState, robot: Description) -> WireError | None:
+def _check_joint_state(state: JointState, robot: RobotDescription) -> WireError | None:
     joint_count = len(robot.joints)
     if state.has_joint_count(joint_count):
         return None
     return _find_wrong_length(state, JOINT_STATE_LIST_FIELDS, joint_count, "one a joint")
 
 
-def _check_power(power: Power, robot: Description) -> WireError | None:
+def _check_power(power: Power, robot: RobotDescription) -> WireError | None:
     return _find_wrong_length(power, POWER_LIST_FIELDS, len(robot.joints), "one a joint")
 
 
-def _check_imu(imu: Imu, robot: Description) -> WireError | None:
+def _check_imu(imu: Imu, robot: RobotDescription) -> WireError | None:
     error = _find_wrong_length(imu, IMU_LIST_FIELDS, len(imu.link), "one for each of Imu.link")
     return error or _find_wrong_link("Imu.link", max(imu.link, default=0), robot)
 
 
-def _check_depth_image(image: DepthImage, robot: Description) -> WireError | None:
+def _check_depth_image(image: DepthImage, robot: RobotDescription) -> WireError | None:
     error = _find_wrong_length(image, ("depth",), 2 * image.width * image.height, "two bytes a pixel")
     return error or _check_mount(image, robot)
 
 
-def _check_color_image(image: ColorImage, robot: Description) -> WireError | None:
+def _check_color_image(image: ColorImage, robot: RobotDescription) -> WireError | None:
     error = _find_wrong_length(image, ("rgb",), 3 * image.width * image.height, "three bytes a pixel")
     return error or _check_mount(image, robot)
 
 
-def _check_world(world: World, robot: Description) -> WireError | None:
+def _check_world(world: WorldModel, robot: RobotDescription) -> WireError | None:
     error = _check_contacts(world, robot)
     return error or _find_wrong_rotation("World.base_orientation_wxyz", world.base_orientation_wxyz)
 
 
-def _check_pose(pose: Pose, _robot: Description) -> WireError | None:
+def _check_pose(pose: Pose, _robot: RobotDescription) -> WireError | None:
     return _find_wrong_rotation("Pose.orientation_wxyz", pose.orientation_wxyz)
 
 
-def _check_trajectory(trajectory: Trajectory, _robot: Description) -> WireError | None:
+def _check_trajectory(trajectory: Trajectory, _robot: RobotDescription) -> WireError | None:
     """Return the error of a trajectory whose points are not a usable path."""
     if _is_path(np.array(trajectory.path_w)):
         return None
@@ -114,18 +114,18 @@ def _find_wrong_length(
     return None
 
 
-def _check_contacts(message: Contacts | World, robot: Description) -> WireError | None:
+def _check_contacts(message: Contacts | WorldModel, robot: RobotDescription) -> WireError | None:
     max_link = max((contact.link for contact in message.contacts), default=0)
     return _find_wrong_link(f"{type(message).__name__}.contacts: link", max_link, robot)
 
 
-def _check_mount(message: MountedSample, robot: Description) -> WireError | None:
+def _check_mount(message: MountedSample, robot: RobotDescription) -> WireError | None:
     name = type(message).__name__
     error = _find_wrong_link(f"{name}.link", message.link, robot)
     return error or _find_wrong_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)
 
 
-def _find_wrong_link(label: str, link: int, robot: Description) -> WireError | None:
+def _find_wrong_link(label: str, link: int, robot: RobotDescription) -> WireError | None:
     """Return the error of a link number that the robot does not have; None for an existing link."""
     last_link = len(robot.links) - 1
     if link <= last_link:
@@ -159,7 +159,7 @@ CHECKS: dict[type[Message], Check] = {
     DepthImage: _check_depth_image,
     ColorImage: _check_color_image,
     MountedSample: _check_mount,
-    World: _check_world,
+    WorldModel: _check_world,
     Pose: _check_pose,
     Trajectory: _check_trajectory,
 }

@@ -11,7 +11,7 @@ import secrets
 import msgspec
 
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 RUN_KEY = "SNAKESIM_RUN_KEY"  # environment variable: the processes of other users cannot read it
 
@@ -26,20 +26,20 @@ def read_own_run_key() -> str | None:
     return os.environ.get(RUN_KEY) or None
 
 
-def add_proof(description: Description, key: str | None) -> Description:
+def add_proof(description: RobotDescription, key: str | None) -> RobotDescription:
     """Return a description with the proof that it is of the run with this key."""
     if key is None:
         return description
     return msgspec.structs.replace(description, proof=_compute_proof(description, key))
 
 
-def has_valid_proof(description: Description, key: str | None) -> bool:
+def has_valid_proof(description: RobotDescription, key: str | None) -> bool:
     """Return whether a description is of the run's own host. Without a key, any description is accepted."""
     if key is None:
         return True
     return hmac.compare_digest(description.proof, _compute_proof(description, key))
 
 
-def _compute_proof(description: Description, key: str) -> str:
+def _compute_proof(description: RobotDescription, key: str) -> str:
     unproven = encode(msgspec.structs.replace(description, proof=""))
     return hmac.new(key.encode(), unproven, "sha256").hexdigest()

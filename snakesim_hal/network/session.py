@@ -25,16 +25,23 @@ from snakesim_hal.base.process import raise_open_file_limit
 from snakesim_hal.network.connection import (
     CLIENT_RECEIVING_THREADS,
     ROUTER_RECEIVING_THREADS,
-    Link,
+    ConnectionSettings,
     limit_receiving_threads,
     open_zenoh,
 )
 from snakesim_hal.network.endpoint import require_safe_listening_endpoint
 from snakesim_hal.network.image_connection import configure_for_images
-from snakesim_hal.network.streams import READER_DEPTH, Arrival, Publisher, Query, Reader, get_reader_depth
+from snakesim_hal.network.streams import (
+    READER_DEPTH,
+    IncomingQuery,
+    Publisher,
+    ReceivedSample,
+    SampleReader,
+    get_reader_depth,
+)
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, Decoder, MessageT, encode, format_encoding
-from snakesim_hal.wire.messages import Answer, Message, Preview
+from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, MessageDecoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.messages import Answer, ImagePreview, Message
 
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
 DONE_KEY_PREFIX = keys.done_key("")  # of the keys on which services report that their tick is done
@@ -147,7 +154,7 @@ class Session:
 
     # --- reading ---------------------------------------------------------------------------------------------
 
-    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
+    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> SampleReader[MessageT]:
         """Subscribe to a stream. A slow reader loses old samples, and never blocks the publisher.
 
         Args:
@@ -157,9 +164,9 @@ class Session:
         """
         subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or get_reader_depth(message)))
         self._declared.append(subscriber)
-        return Reader(subscriber, message, self.rejected)
+        return SampleReader(subscriber, message, self.rejected)
 
-    def declare_latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
+    def declare_latched_reader(self, key: str, message: type[MessageT]) -> SampleReader[MessageT]:
         """Subscribe as `reader` does, and also get the value that was latched before."""
         subscriber = ext.declare_advanced_subscriber(
             self._zenoh,
@@ -168,9 +175,9 @@ class Session:
             history=_make_last_value_history(),
         )
         self._declared.append(subscriber)
-        return Reader(subscriber, message, self.rejected)
+        return SampleReader(subscriber, message, self.rejected)
 
-    def close_reader(self, reader: Reader[Any]) -> None:
+    def close_reader(self, reader: SampleReader[Any]) -> None:
         """Close a reader that is no longer used."""
         self._declared.remove(reader.subscriber)
         reader.subscriber.undeclare()
@@ -204,11 +211,11 @@ class Session:
 
     # --- callbacks -------------------------------------------------------------------------------------------
 
-    def on_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
+    def on_arrival(self, key: str, handler: Callable[[ReceivedSample], None]) -> None:
         """Call `handler` for every sample, in a thread of this subscriber. It must only store the sample."""
         self._declared.append(self._zenoh.declare_subscriber(key, _make_arrival_handler(handler)))
 
-    def on_urgent_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
+    def on_urgent_arrival(self, key: str, handler: Callable[[ReceivedSample], None]) -> None:
         """Call `handler` for every sample, in the thread that receives for the whole session.
 
         The control loop waits for one thread less than with `on_arrival`. While `handler` runs, the session receives
@@ -217,21 +224,21 @@ class Session:
         callback = handlers.Callback(_make_handler_with_thread_state(_make_arrival_handler(handler)), indirect=False)
         self._declared.append(self._zenoh.declare_subscriber(key, callback))
 
-    def on_latched_arrival(self, key: str, handler: Callable[[Arrival], None]) -> None:
+    def on_latched_arrival(self, key: str, handler: Callable[[ReceivedSample], None]) -> None:
         """Call `handler` as `on_arrival` does, and also for the values that were latched before."""
         subscriber = ext.declare_advanced_subscriber(
             self._zenoh, key, _make_arrival_handler(handler), history=_make_last_value_history()
         )
         self._declared.append(subscriber)
 
-    def on_query(self, key: str, handler: Callable[[Query], None]) -> None:
+    def on_query(self, key: str, handler: Callable[[IncomingQuery], None]) -> None:
         """Call `handler` for every query, in Zenoh's thread. Reply from a thread of your own."""
 
         def handle(query: zenoh.Query) -> None:
             payload = b"" if query.payload is None else query.payload.to_bytes()
             encoding = str(query.encoding or "")
             # The query's own key may be a pattern, such as `hal/*`; the question is always for our key.
-            handler(Query(key, payload, encoding, query))
+            handler(IncomingQuery(key, payload, encoding, query))
 
         self._declared.append(self._zenoh.declare_queryable(key, handle))
 
@@ -290,7 +297,7 @@ class Session:
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,  # no answer replaces another
         )
-        decoder = Decoder(Answer)
+        decoder = MessageDecoder(Answer)
         for reply in replies:
             sample = reply.ok
             if sample is None:
@@ -348,7 +355,7 @@ class Session:
 
 
 @contextmanager
-def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
+def open_session(link: ConnectionSettings, connect_timeout_s: float = 5.0) -> Iterator[Session]:
     """Connect to the network of a robot, or listen for its clients, and close the session when the context ends.
 
     Args:
@@ -398,7 +405,7 @@ def _choose_priority(key: str, message: type[Message]) -> zenoh.Priority:
     """Return the priority of a stream: commands first, then data, images, and previews of images."""
     if message in IMAGE_MESSAGE_TYPES:
         return zenoh.Priority.DATA_LOW
-    if message is Preview:
+    if message is ImagePreview:
         return zenoh.Priority.BACKGROUND
     if key == keys.JOINT_COMMAND:
         return zenoh.Priority.REAL_TIME
@@ -410,14 +417,14 @@ def _make_last_value_history() -> ext.HistoryConfig:
     return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
 
 
-def _make_arrival_handler(handler: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
-    """Return a handler for Zenoh's thread that passes each sample to `handler` as an `Arrival`."""
+def _make_arrival_handler(handler: Callable[[ReceivedSample], None]) -> Callable[[zenoh.Sample], None]:
+    """Return a handler for Zenoh's thread that passes each sample to `handler` as an `ReceivedSample`."""
 
     def handle(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         payload = sample.payload.to_bytes()
         encoding = str(sample.encoding)
-        handler(Arrival(key, payload, encoding, time.monotonic_ns()))
+        handler(ReceivedSample(key, payload, encoding, time.monotonic_ns()))
 
     return handle
 

@@ -8,14 +8,14 @@ from typing import Any, Generic
 import msgspec
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, Decoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, MessageDecoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
 
 READER_DEPTH = 256  # samples; a burst of noise on a key must not displace the valid sample
 IMAGES_DEPTH = 32  # samples; images take much memory, and in lockstep a reader may lag by that many
 
 
-class Arrival(msgspec.Struct, frozen=True):
+class ReceivedSample(msgspec.Struct, frozen=True):
     """A received sample, not decoded yet."""
 
     key: str
@@ -23,7 +23,7 @@ class Arrival(msgspec.Struct, frozen=True):
     encoding: str
     monotonic_ns: int
 
-    def decode(self, decoder: Decoder[MessageT]) -> MessageT:
+    def decode(self, decoder: MessageDecoder[MessageT]) -> MessageT:
         """Return the message. Raises WireError if it is another one than the decoder's, or malformed."""
         return decoder.decode(self.payload, self.encoding)
 
@@ -62,13 +62,13 @@ class Publisher(Generic[MessageT]):
         self._put = self.send if put is None else put
 
 
-class Reader(Generic[MessageT]):
+class SampleReader(Generic[MessageT]):
     """Keeps the newest samples of one key. It decodes them when it is called, in the caller's thread."""
 
     def __init__(self, subscriber: Any, message: type[MessageT], rejected: Counter[str]) -> None:
         """Read from a subscriber; count samples that cannot be decoded into `rejected`, by reason."""
         self.subscriber = subscriber
-        self._decoder = Decoder(message)
+        self._decoder = MessageDecoder(message)
         self._rejected = rejected
 
     def drain(self) -> list[MessageT]:
@@ -104,13 +104,13 @@ class Reader(Generic[MessageT]):
             self._rejected[error.reason] += 1
             return None
 
-    def _decode_sample(self, sample: Any, decoder: Decoder[MessageT]) -> MessageT:
+    def _decode_sample(self, sample: Any, decoder: MessageDecoder[MessageT]) -> MessageT:
         """Return the message of a sample. Raises WireError."""
         return decoder.decode(sample.payload.to_bytes(), str(sample.encoding))
 
 
 @dataclass(frozen=True)
-class Query:
+class IncomingQuery:
     """A query that waits for its answer."""
 
     key: str

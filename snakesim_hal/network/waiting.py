@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 
 CONNECT_ATTEMPT_S = 2.0  # for one attempt to connect: `keeps_waiting` is called so often
 
 
 @contextmanager
-def open_session_when_ready(link: Link, keeps_waiting: Callable[[], bool]) -> Iterator[Session]:
+def open_session_when_ready(link: ConnectionSettings, keeps_waiting: Callable[[], bool]) -> Iterator[Session]:
     """Connect as soon as the robot's network accepts connections, and close the session when the context ends.
 
     After each failed attempt the caller decides whether to try again, so that a waiting process can be ended in order.

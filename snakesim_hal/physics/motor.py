@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import Module, RobotFile
+from snakesim_hal.model.robot import ModuleBody, RobotFile
 
 # With this slope, full torque is available up to 9/10 of the speed limit, and none at the limit.
 STEEPEST_ROLL_OFF = 10.0
@@ -17,7 +17,7 @@ MIN_LAG_STEPS = 0.5
 MAX_LAG_STEPS = 1e3
 
 
-def compute_torque_roll_off(joint: Joint, module: Module, step_s: float) -> float:
+def compute_torque_roll_off(joint: Joint, module: ModuleBody, step_s: float) -> float:
     """Compute how steeply the motor torque falls to 0 near the speed limit, in units of full torque per speed limit.
 
     The roll-off acts on the rotor as a damper behind the lag of the motor. Explicit steps can integrate such a damper

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.physics.motor import compute_torque_roll_off
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 
-class Motors:
+class PowerStages:
     """The power stages of all joint modules. All are passive at first."""
 
     def __init__(self, robot: RobotFile, step_s: float) -> None:
@@ -77,7 +77,7 @@ class Motors:
     def set_demand(
         self,
         joint_index: int,
-        mode: Mode,
+        mode: JointMode,
         target: float,
         torque_limit_nm: float,
         stiffness: float,
@@ -101,18 +101,18 @@ class Motors:
         self._velocity[joint_index] = 0.0
         self._feedforward[joint_index] = 0.0
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 self._kp[joint_index] = stiffness
                 self._kd[joint_index] = damping
                 self._position[joint_index] = target
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 self._kd[joint_index] = damping
                 self._velocity[joint_index] = target
-            case Mode.TORQUE:
+            case JointMode.TORQUE:
                 self._feedforward[joint_index] = target
-            case Mode.PASSIVE:
+            case JointMode.PASSIVE:
                 pass
-        if mode == Mode.PASSIVE:  # without a limit: the demand of a passive motor is 0
+        if mode == JointMode.PASSIVE:  # without a limit: the demand of a passive motor is 0
             self._slope[joint_index] = 0.0
             self._stall_torque[joint_index] = math.inf
         else:

@@ -40,7 +40,7 @@ class HeatLimits:
         return 1.0 - (1.0 - MIN_TORQUE_FRACTION) * min(max(derating_progress, 0.0), 1.0)
 
 
-class Thermal:
+class ThermalModel:
     """Winding temperatures of all motors, and the power that they draw."""
 
     def __init__(self, joints: Sequence[Joint]) -> None:
@@ -126,7 +126,7 @@ class Thermal:
     def compute_power_w(self, torque_nm: Floats, speed_rad_s: Floats) -> Floats:
         """Return the power that each motor draws, (n_joints,): mechanical power and copper losses.
 
-        The current that a module draws at rest, `Supply.idle_a`, is not included.
+        The current that a module draws at rest, `JointSupply.idle_a`, is not included.
         """
         mechanical_w = torque_nm * speed_rad_s
         copper_loss_w = self._loss_at_rated_w * (torque_nm / self._rated_torque_nm) ** 2

@@ -14,7 +14,7 @@ from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_endpoint, chec
 
 if TYPE_CHECKING:
     from snakesim_hal.model.scenario import LoadedScenario, RunConfig
-    from snakesim_hal.network.session import Link
+    from snakesim_hal.network.session import ConnectionSettings
     from snakesim_hal.network.session_file import SessionFile
 
 SESSION_VARIABLE = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
@@ -153,7 +153,7 @@ def load_scenario_from_arguments(arguments: argparse.Namespace) -> "LoadedScenar
     Raises:
         ConfigError: A file or an override is not valid.
     """
-    from snakesim_hal.model.scenario import Override, load_scenario, parse_set_option
+    from snakesim_hal.model.scenario import KeyOverride, load_scenario, parse_set_option
 
     # Options that set one key of the scenario.
     value_by_key = {
@@ -164,16 +164,16 @@ def load_scenario_from_arguments(arguments: argparse.Namespace) -> "LoadedScenar
         "seed": arguments.seed,
     }
     overrides = [parse_set_option(text) for text in arguments.set]
-    overrides += [Override(key, None, f"--unset {shorten(key)}") for key in arguments.unset]
+    overrides += [KeyOverride(key, None, f"--unset {shorten(key)}") for key in arguments.unset]
     if getattr(arguments, "until_goal", False):
-        overrides.append(Override("mission.until_goal", True, "--until-goal"))
+        overrides.append(KeyOverride("mission.until_goal", True, "--until-goal"))
     for key, value in value_by_key.items():
         if value is not None:
             flag = f"--{key.removesuffix('_s').replace('_', '-')} {shorten(str(value))}"
-            overrides.append(Override(key, value, flag))
+            overrides.append(KeyOverride(key, value, flag))
     faults = getattr(arguments, "fault", None)
     if faults:
-        overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
+        overrides.append(KeyOverride("faults", faults, " ".join(f"--fault {text}" for text in faults)))
     return load_scenario(arguments.scenario, overrides)
 
 
@@ -296,7 +296,7 @@ def read_session_option(arguments: argparse.Namespace, *, or_environment: bool =
     return read_session(path.expanduser())
 
 
-def create_link(arguments: argparse.Namespace, config: "RunConfig", *, is_host: bool = False) -> "Link":
+def create_link(arguments: argparse.Namespace, config: "RunConfig", *, is_host: bool = False) -> "ConnectionSettings":
     """Create the description of how a process of a robot connects to its network.
 
     Args:
@@ -308,7 +308,7 @@ def create_link(arguments: argparse.Namespace, config: "RunConfig", *, is_host: 
     Raises:
         ConfigError: The options contradict one another, or the session file is not valid.
     """
-    from snakesim_hal.network.session import Link
+    from snakesim_hal.network.session import ConnectionSettings
     from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 
     check_network(arguments)
@@ -316,8 +316,8 @@ def create_link(arguments: argparse.Namespace, config: "RunConfig", *, is_host: 
     max_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.max_image_bytes)
     if session_file is not None:
         namespace = session_file.resolve_namespace(arguments.namespace) or config.robot.name
-        return Link(session_file.endpoints[0], namespace, max_bytes=max_bytes, session=session_file)
-    return Link(
+        return ConnectionSettings(session_file.endpoints[0], namespace, max_bytes=max_bytes, session=session_file)
+    return ConnectionSettings(
         endpoint=arguments.router or arguments.endpoint or DEFAULT_ENDPOINT,
         namespace=arguments.namespace or config.robot.name,
         listen=is_host and arguments.router is None,

@@ -27,7 +27,7 @@ def add_nothing(_parser: argparse.ArgumentParser) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Noun:
+class CommandGroup:
     """A word that groups commands, such as `robot` in `snakesim robot arm`. Several packages may register the same."""
 
     name: str  # with the nouns before it, such as "drive scan"
@@ -48,4 +48,4 @@ class Command:
     heading: str = ""  # in `snakesim --help`; empty below a noun
 
 
-Commands = tuple[Noun | Command, ...]
+Commands = tuple[CommandGroup | Command, ...]

@@ -33,7 +33,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.local_registry import LocalRobot, get_robot_state_folder, register_robot
 from snakesim_hal.network.private_channel import HostEnd
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.stop_port import find_stop_address, open_stop_port, start_stop_server
 from snakesim_hal.programs.arguments import add_host_arguments
 from snakesim_hal.programs.preflight import decode_backend_settings, load_backend_class, validate_backend_config
@@ -169,7 +169,7 @@ def _create_host(
     return Host(config, backend_with_faults, session, options)
 
 
-def refuse_second_host(session: Session, link: Link) -> None:
+def refuse_second_host(session: Session, link: ConnectionSettings) -> None:
     """Raise RefusedError if another HAL host has the robot's name. A dead host stays visible for a while."""
     deadline = time.monotonic() + TOKEN_EXPIRY_TIMEOUT_S
     while other_hosts := session.list_tokens(keys.HOST_ALL):

@@ -23,7 +23,7 @@ from snakesim_hal.model.plugins import (
 from snakesim_hal.model.robot import describe_joints
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.service import Service
-from snakesim_hal.wire.messages import JointDescription, Mode
+from snakesim_hal.wire.messages import JointDescription, JointMode
 
 GUIDANCE = "guidance"
 POSE_SERVICES = {GUIDANCE, "navigation"}  # of no use without a pose of the robot
@@ -183,7 +183,7 @@ def find_missing_capability(
     for joint in joints:
         for mode in controller.required_modes:
             if not joint.supports_mode(mode):
-                available = [mode.name.lower() for mode in joint.modes if mode is not Mode.PASSIVE]
+                available = [mode.name.lower() for mode in joint.modes if mode is not JointMode.PASSIVE]
                 return (
                     f"controller {name!r} needs {mode.name.lower()} mode of every joint, and {joint.name} has "
                     f"{', '.join(available)}. Choose another controller; or correct `modes` in [drive] or "

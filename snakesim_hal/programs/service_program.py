@@ -24,7 +24,7 @@ from snakesim_hal.base.process import (
 )
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.scenario import LoadedScenario, RunConfig
-from snakesim_hal.network.session import Link, Session
+from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.programs.arguments import add_service_arguments, create_link, load_scenario_from_arguments
 from snakesim_hal.programs.preflight import load_service_class
@@ -38,7 +38,7 @@ class ProcessOptions:
     """What one process of a robot was started with."""
 
     loaded: LoadedScenario
-    link: Link
+    link: ConnectionSettings
     arguments: argparse.Namespace
 
     @property
@@ -123,7 +123,7 @@ class StartupWait:
         return now_s - self._start_time_s < SERVICE_START_LIMIT_S
 
 
-def connect_process(link: Link, name: str) -> AbstractContextManager[Session]:
+def connect_process(link: ConnectionSettings, name: str) -> AbstractContextManager[Session]:
     """Connect a process as soon as there is a network, and report the wait on the terminal.
 
     Args:

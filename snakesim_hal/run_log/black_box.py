@@ -25,7 +25,7 @@ from snakesim_hal.backend import Samples
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contacts, Description, Pose
+from snakesim_hal.wire.messages import Contacts, Pose, RobotDescription
 
 MEMORY_BYTES = 16 * 2**20  # about four minutes of 13 joints at 100 Hz
 MAX_COPIED_BYTES = 2**18  # in one copy: meanwhile the host waits for the interpreter, about 20 µs
@@ -34,7 +34,7 @@ HEADER_ALIGNMENT_BYTES = 64
 ROW_ALIGNMENT_BYTES = 8
 
 
-class Column(msgspec.Struct, frozen=True):
+class LogColumn(msgspec.Struct, frozen=True):
     """One column: a number in every row, or a vector of them."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
@@ -54,17 +54,17 @@ class Column(msgspec.Struct, frozen=True):
         return np.dtype(self.format).itemsize
 
 
-class Layout(msgspec.Struct, frozen=True, kw_only=True):
+class RowLayout(msgspec.Struct, frozen=True, kw_only=True):
     """The first line of the file: the columns of a row."""
 
     format: Literal["snakesim.blackbox/1"] = "snakesim.blackbox/1"
     robot: str
     joints: list[str]  # the order within a column
     row_bytes: Annotated[int, Meta(ge=1, le=2**20)]
-    columns: list[Column]  # in order; the rest of the row is padding
+    columns: list[LogColumn]  # in order; the rest of the row is padding
 
     @classmethod
-    def for_robot(cls, description: Description) -> Self:
+    def for_robot(cls, description: RobotDescription) -> Self:
         """Return the layout of a row of the black box for a robot.
 
         Names of columns contain the units; that of `target` depends on the mode of the joint: rad, rad/s or N·m.
@@ -80,14 +80,14 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
         joint_count = len(description.joints)
         joint_columns = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
         columns = [
-            Column("tick", "<i8"),
-            Column("time_s", "<f8"),
-            *(Column(name, "<f8", joint_count) for name in joint_columns),
-            Column("position_w_m", "<f8", 3),
-            Column("orientation_wxyz", "<f8", 4),
-            Column("contact_peak_n", "<f8"),
-            Column("contact_count", "<f8"),
-            Column("mode", "|i1", joint_count),
+            LogColumn("tick", "<i8"),
+            LogColumn("time_s", "<f8"),
+            *(LogColumn(name, "<f8", joint_count) for name in joint_columns),
+            LogColumn("position_w_m", "<f8", 3),
+            LogColumn("orientation_wxyz", "<f8", 4),
+            LogColumn("contact_peak_n", "<f8"),
+            LogColumn("contact_count", "<f8"),
+            LogColumn("mode", "|i1", joint_count),
         ]
         used_bytes = sum(column.bytes for column in columns)
         padding_bytes = -used_bytes % ROW_ALIGNMENT_BYTES
@@ -118,11 +118,11 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
 class BlackBox:
     """Records a row in each tick, and keeps the newest rows until they are read."""
 
-    def __init__(self, description: Description, memory_bytes: int = MEMORY_BYTES) -> None:
+    def __init__(self, description: RobotDescription, memory_bytes: int = MEMORY_BYTES) -> None:
         """Allocate the memory for a robot's rows."""
-        self.layout = Layout.for_robot(description)
+        self.layout = RowLayout.for_robot(description)
         joint_count = len(description.joints)
-        # One row, in the order of the columns of `Layout.for_robot`: tick, time, five values of each joint, 7 of the
+        # One row, in the order of the columns of `RowLayout.for_robot`: tick, time, five values of each joint, 7 of the
         # pose, 2 of the contacts, and the mode of each joint.
         self._pack_row_into = struct.Struct(f"<qd{5 * joint_count + 9}d{joint_count}b").pack_into
         self._capacity = max(memory_bytes // self.layout.row_bytes, 2)
@@ -156,7 +156,7 @@ class BlackBox:
         joints = samples.joints
         setpoints = decision.setpoints
         buffer_offset = self._rows_written % self._capacity * self.layout.row_bytes
-        # The order of the arguments is that of the columns in `Layout.for_robot`.
+        # The order of the arguments is that of the columns in `RowLayout.for_robot`.
         self._pack_row_into(
             self._buffer,
             buffer_offset,
@@ -227,7 +227,7 @@ def summarize_contacts(contacts: Contacts) -> tuple[float, int]:
     return max(squared_forces, default=0.0) ** 0.5, touched_count
 
 
-def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
+def read_black_box(path: Path) -> tuple[RowLayout, dict[str, NDArray[Any]]]:
     """Read every complete row of a black box file.
 
     Args:
@@ -242,7 +242,7 @@ def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
     try:
         with path.open("rb") as file:
             header = file.readline(MAX_HEADER_BYTES)
-            layout = msgspec.json.decode(header, type=Layout)
+            layout = msgspec.json.decode(header, type=RowLayout)
             return layout, layout.decode_rows(file.read())
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise ConfigError(

@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-from snakesim_hal.wire.messages import Fault, Timing
+from snakesim_hal.wire.messages import Fault, TimingStatistics
 
 BLACK_BOX = "blackbox.rows"
 DESCRIPTION = "description.json"
@@ -24,7 +24,7 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     armed_ticks: int
     command_digest: str
     state_to_command_us: dict[str, float | None]
-    tick_times: dict[str, Timing] = {}  # as in `hal/status`
+    tick_times: dict[str, TimingStatistics] = {}  # as in `hal/status`
     rejected_commands: dict[str, int]
     limited_commands: dict[str, int]
     faults: list[Fault]

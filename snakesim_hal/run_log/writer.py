@@ -22,7 +22,7 @@ from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 WRITE_PERIOD_S = 0.5
 CLOSE_TIMEOUT_S = 2.0  # for a disk that hangs
@@ -47,7 +47,7 @@ class HostRecordWriter:
     def __init__(
         self,
         black_box: BlackBox,
-        description: Description,
+        description: RobotDescription,
         make_statistics: StatisticsFactory,
         folder: Path | None,
         memory_fd: int | None = None,

@@ -16,25 +16,25 @@ from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.safety.cables import CableTracker
 from snakesim_hal.safety.derating import HealthMonitor
 from snakesim_hal.safety.fault_log import FaultLog
-from snakesim_hal.safety.isolation import Isolation
+from snakesim_hal.safety.isolation import JointIsolation
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, JointMask
-from snakesim_hal.safety.lease import Lease, decide_lease_request, free_lease, renew_lease
+from snakesim_hal.safety.lease import CommandLease, decide_lease_request, free_lease, renew_lease
 from snakesim_hal.safety.lifecycle import UnmetCondition
 from snakesim_hal.safety.limit_names import find_active_limits
 from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityChecker, replace_non_finite_values
 from snakesim_hal.safety.stop_ramp import StopReaction, make_uniform_setpoints
 from snakesim_hal.wire.messages import (
     Answer,
-    Description,
     EstopRequest,
     Fault,
     JointCommand,
+    JointMode,
     JointState,
     LeaseRequest,
     LifecycleRequest,
     LifecycleState,
-    Mode,
     Power,
+    RobotDescription,
 )
 
 RECENT_COMMAND_COUNT = 1024  # accepted commands that are stored: in lockstep a tick may need an older one
@@ -50,12 +50,12 @@ class TickOutput:
     limit_by_joint: dict[int, str]  # joint index -> name of the limit that changed its target
 
 
-class Authority:
+class CommandAuthority:
     """Lifecycle, lease and limiter of one robot."""
 
     def __init__(
         self,
-        description: Description,
+        description: RobotDescription,
         *,
         first_epoch: int = 0,
         awaits_reports: bool = False,
@@ -84,7 +84,7 @@ class Authority:
         self.state: LifecycleState = "disarmed"
         self.reason = "not armed yet"
         self.arm_session = 0
-        self.lease = Lease(epoch=first_epoch)
+        self.lease = CommandLease(epoch=first_epoch)
         self._newest_state_tick = 0
         self._last_arming_tick = -1  # tick of the joint state that was the newest at the last arming
         self._is_stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
@@ -102,7 +102,7 @@ class Authority:
         self._measured_state = self._plausibility_checker.measured
         self._implausible_state: ImplausibleState | None = self._make_unknown_state("no joint state yet")
         self._backend_obstacles: list[str] = []  # reasons of the backend against arming now
-        self._isolation = Isolation(description)
+        self._isolation = JointIsolation(description)
         self._health_monitor = HealthMonitor(description, awaits_reports=awaits_reports)
 
         # Commands.
@@ -358,7 +358,7 @@ class Authority:
         elif command is None:
             # Just armed: hold the pose until the first command.
             pose_rad = self.limits.clip_angles(self._angles_at_arming_rad)
-            applied = make_uniform_setpoints(Mode.POSITION, pose_rad, self._compute_derated_torque_nm())
+            applied = make_uniform_setpoints(JointMode.POSITION, pose_rad, self._compute_derated_torque_nm())
         else:
             applied = limiter.limit_command(
                 command,

@@ -16,7 +16,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Fault, JointDescription, Power
+from snakesim_hal.wire.messages import Fault, JointDescription, Power, RobotDescription
 
 UNDERVOLTAGE_DELAY_NS = 50_000_000  # shorter dips, as when motors start, stop nothing
 REPORT_TIMEOUT_NS = 3_000_000_000  # values of an older report are unknown; modules report about twice a second
@@ -27,7 +27,7 @@ MIN_VOLTAGE_FIELD = "`min_voltage_v` under [limits] in the robot file"
 class HealthMonitor:
     """What is left of each joint's torque limit, and the faults of heat, supply and leaks, from power samples."""
 
-    def __init__(self, description: Description, *, awaits_reports: bool) -> None:
+    def __init__(self, description: RobotDescription, *, awaits_reports: bool) -> None:
         """Start without derating and without a report.
 
         Args:
@@ -38,7 +38,7 @@ class HealthMonitor:
         self._robot = description.robot
         self._awaits_reports = awaits_reports
         self._has_power_sensor = any(sensor.key == keys.POWER for sensor in description.sensors)
-        self._module_healths = [_ModuleHealth(joint) for joint in description.joints]
+        self._module_healths = [_LastReport(joint) for joint in description.joints]
         self._first_evaluation_ns: int | None = None
         self._next_evaluation_ns = -math.inf  # before this time nothing changes without a sample
         self._last_faults: set[tuple[str, str | None]] = set()  # of the last evaluation: name and joint of each
@@ -95,7 +95,7 @@ class HealthMonitor:
     def find_supply_problems(self, now_ns: int) -> list[str]:
         """Return a text for each problem of the supply that prevents arming, with the remedy."""
         problems: list[str] = []
-        low: list[_ModuleHealth] = []
+        low: list[_LastReport] = []
         for health in self._module_healths:
             if health.is_known(now_ns) and health.undervoltage_since_ns is not None:
                 low.append(health)
@@ -145,7 +145,7 @@ def _format_others(count: int) -> str:
 
 
 @dataclass
-class _ModuleHealth:
+class _LastReport:
     """The last report of one joint module."""
 
     joint: JointDescription

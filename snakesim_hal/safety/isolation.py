@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointMask
-from snakesim_hal.wire.messages import Description, JointCommand, Mode
+from snakesim_hal.wire.messages import JointCommand, JointMode, RobotDescription
 
 
-class Isolation:
+class JointIsolation:
     """The isolated joints of a robot."""
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         self._names = [joint.name for joint in description.joints]
         self._max_isolated = description.max_isolated_joints
         self.joints: JointMask = np.zeros(len(self._names), dtype=np.bool_)
@@ -60,14 +60,14 @@ class Isolation:
             return applied
         return replace(
             applied,
-            mode=np.where(self.joints, int(Mode.PASSIVE), applied.mode),
+            mode=np.where(self.joints, int(JointMode.PASSIVE), applied.mode),
             target=np.where(self.joints, 0.0, applied.target),
             torque_limit_nm=np.where(self.joints, 0.0, applied.torque_limit_nm),
         )
 
     def find_overruled_joints(self, command: JointCommand) -> dict[int, str]:
         """Return the limit name "isolated" by the index of each isolated joint that a command would move."""
-        return {i: "isolated" for i in sorted(self.indices) if command.mode[i] is not Mode.PASSIVE}
+        return {i: "isolated" for i in sorted(self.indices) if command.mode[i] is not JointMode.PASSIVE}
 
     def _set_joints(self, joints: JointMask) -> None:
         self.joints = joints

@@ -1,6 +1,6 @@
 """The values that the limiter works with: a robot's limits, its measured state, and the last setpoints.
 
-All arrays have the shape (n_joints,), tail to head, in the order of `Description.joints`.
+All arrays have the shape (n_joints,), tail to head, in the order of `RobotDescription.joints`.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.freshness import max_state_age_ns
-from snakesim_hal.wire.messages import Description, JointDescription, Mode
+from snakesim_hal.wire.messages import JointDescription, JointMode, RobotDescription
 
 Ints = NDArray[np.int64]
 JointMask = NDArray[np.bool_]  # (n_joints,): which joints
@@ -39,7 +39,7 @@ class JointLimits:
     has_all_modes: bool  # whether every joint supports every mode
 
     @staticmethod
-    def from_description(description: Description) -> "JointLimits":
+    def from_description(description: RobotDescription) -> "JointLimits":
         """Collect the limits of all joints from the description of a robot, as vectors and joint by joint."""
         joints = description.joints
 
@@ -58,8 +58,8 @@ class JointLimits:
             max_state_age_ns=max_state_age_ns(description),
             layout=description.layout,
             joints=tuple(joints),
-            has_velocity_mode=np.array([joint.supports_mode(Mode.VELOCITY) for joint in joints]),
-            has_all_modes=all(joint.supports_mode(mode) for joint in joints for mode in Mode),
+            has_velocity_mode=np.array([joint.supports_mode(JointMode.VELOCITY) for joint in joints]),
+            has_all_modes=all(joint.supports_mode(mode) for joint in joints for mode in JointMode),
         )
 
     def clip_angles(self, angle_rad: Floats) -> Floats:
@@ -80,6 +80,6 @@ class MeasuredState:
 class AppliedSetpoints:
     """Limited setpoints of the joints, (n_joints,) each."""
 
-    mode: Ints  # values of `Mode`
+    mode: Ints  # values of `JointMode`
     target: Floats  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: Floats

@@ -6,7 +6,7 @@ from snakesim_hal.wire.messages import LeaseRequest
 
 
 @dataclass(frozen=True)
-class Lease:
+class CommandLease:
     """The right to command, and until when. `epoch` grows with every new holder, so old commands are void."""
 
     holder: str | None = None
@@ -23,13 +23,15 @@ class Lease:
 class LeaseDecision:
     """The decision about a lease request."""
 
-    lease: Lease  # after the request
+    lease: CommandLease  # after the request
     refusal: str | None = None  # text why the request is refused; None if it is granted
     has_holder_changed: bool = False
     refusal_code: str | None = None  # the reason of the refusal as one word
 
 
-def decide_lease_request(lease: Lease, request: LeaseRequest, now_ns: int, lease_duration_ns: int) -> LeaseDecision:
+def decide_lease_request(
+    lease: CommandLease, request: LeaseRequest, now_ns: int, lease_duration_ns: int
+) -> LeaseDecision:
     """Grant or refuse a request to acquire, renew or release a lease.
 
     While the lease is held, only its holder may renew or release it, and only a client with a higher priority may
@@ -52,7 +54,7 @@ def decide_lease_request(lease: Lease, request: LeaseRequest, now_ns: int, lease
                     f"{remaining_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
                     refusal_code="lease_held",
                 )
-            acquired = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + lease_duration_ns)
+            acquired = CommandLease(request.holder, lease.epoch + 1, request.priority, now_ns + lease_duration_ns)
             return LeaseDecision(acquired, has_holder_changed=True)
         case "renew":
             if not is_holder:
@@ -64,18 +66,18 @@ def decide_lease_request(lease: Lease, request: LeaseRequest, now_ns: int, lease
             return LeaseDecision(free_lease(lease), has_holder_changed=True)
 
 
-def _make_not_holder_refusal(lease: Lease, request: LeaseRequest, advice: str) -> LeaseDecision:
+def _make_not_holder_refusal(lease: CommandLease, request: LeaseRequest, advice: str) -> LeaseDecision:
     """Return the refusal of a request of a client that does not hold the lease."""
     return LeaseDecision(
         lease, f"{request.holder} does not hold epoch {request.epoch}; {advice}", refusal_code="not_holder"
     )
 
 
-def renew_lease(lease: Lease, now_ns: int, lease_duration_ns: int) -> Lease:
+def renew_lease(lease: CommandLease, now_ns: int, lease_duration_ns: int) -> CommandLease:
     """Return the lease with an expiry time one lease duration from now."""
     return replace(lease, expires_ns=now_ns + lease_duration_ns)
 
 
-def free_lease(lease: Lease) -> Lease:
+def free_lease(lease: CommandLease) -> CommandLease:
     """Return a lease without a holder. Its epoch stays, so that later commands of the last holder are rejected."""
-    return Lease(epoch=lease.epoch)
+    return CommandLease(epoch=lease.epoch)

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import JointMask
-from snakesim_hal.wire.messages import Description, JointCommand, LifecycleRequest, LifecycleState, Mode
+from snakesim_hal.wire.messages import JointCommand, JointMode, LifecycleRequest, LifecycleState, RobotDescription
 
 LifecycleEvent = Literal["arm", "disarm", "fault", "estop", "reset"]
 
@@ -60,7 +60,7 @@ class UnmetCondition(NamedTuple):
     reason: str  # for people
 
 
-def find_address_mismatches(request: LifecycleRequest, description: Description) -> list[UnmetCondition]:
+def find_address_mismatches(request: LifecycleRequest, description: RobotDescription) -> list[UnmetCondition]:
     """Return an unmet condition for each name in a request to arm that does not match this robot.
 
     The request must name the robot, its backend, and the hash of its configuration.
@@ -85,7 +85,7 @@ def find_address_mismatches(request: LifecycleRequest, description: Description)
 
 
 def find_far_targets(
-    command: JointCommand, angle_rad: Floats, description: Description, isolated: JointMask
+    command: JointCommand, angle_rad: Floats, description: RobotDescription, isolated: JointMask
 ) -> list[str]:
     """Return a text for each joint that a command would move at once. At arming, a command must hold the pose.
 
@@ -106,9 +106,9 @@ def find_far_targets(
         if is_isolated:
             continue
         match mode:
-            case Mode.PASSIVE:
+            case JointMode.PASSIVE:
                 continue
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 if abs(target - measured_rad) > max_step_rad:
                     reasons.append(
                         f"{joint.name} has a target {target - measured_rad:+.2f} rad from its angle; at most "

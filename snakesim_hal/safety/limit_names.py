@@ -5,7 +5,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, JointMask, MeasuredState
 from snakesim_hal.safety.limiter import compute_torque_bounds, compute_velocity_bounds
-from snakesim_hal.wire.messages import JointCommand, JointDescription, Mode
+from snakesim_hal.wire.messages import JointCommand, JointDescription, JointMode
 
 
 def find_active_limits(
@@ -34,7 +34,7 @@ def find_active_limits(
     names: dict[int, str] = {}
     derated = find_derated_joints(command, limits, torque_fraction)
     for i, (mode, requested) in enumerate(zip(command.mode, command.target, strict=True)):
-        if mode is Mode.PASSIVE:
+        if mode is JointMode.PASSIVE:
             continue
         if applied.target[i] != requested:
             angle = float(measured.angle_rad[i])
@@ -58,7 +58,7 @@ def find_derated_joints(command: JointCommand, limits: JointLimits, torque_fract
 
 def _find_tightest_limit(
     joint: JointDescription,
-    mode: Mode,
+    mode: JointMode,
     requested: float,
     angle_rad: float,
     velocity_rad_s: float,
@@ -77,12 +77,12 @@ def _find_tightest_limit(
         period_s: Duration of a control period.
     """
     match mode:
-        case Mode.VELOCITY:
+        case JointMode.VELOCITY:
             bounds = compute_velocity_bounds(joint, angle_rad, period_s)
             magnitude_limit = joint.speed_limit_rad_s
             magnitude_name = "speed"
             rate_name = "acceleration"
-        case Mode.TORQUE:
+        case JointMode.TORQUE:
             bounds = compute_torque_bounds(joint, angle_rad, velocity_rad_s, period_s)
             magnitude_limit = torque_limit_nm
             magnitude_name = "torque"

@@ -25,8 +25,8 @@ import numpy as np
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, MeasuredState
-from snakesim_hal.safety.lease import Lease
-from snakesim_hal.wire.messages import JointCommand, JointDescription, Mode
+from snakesim_hal.safety.lease import CommandLease
+from snakesim_hal.wire.messages import JointCommand, JointDescription, JointMode
 
 REACTION_PERIODS = 4  # the minimum that keeps joints from overshooting their end, with two periods of latency on a bus
 MIN_SPEED_LIMIT_RAD_S = 1e-9  # divisor for a joint that may not move
@@ -43,7 +43,7 @@ RejectionReason = Literal[
     "wrong_mode",
     "not_finite",
 ]
-_MODES = {int(mode): mode for mode in Mode}
+_MODES = {int(mode): mode for mode in JointMode}
 
 
 # --- checks of a whole command ---------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ _MODES = {int(mode): mode for mode in Mode}
 def find_rejection_reason(
     command: JointCommand,
     *,
-    lease: Lease,
+    lease: CommandLease,
     now_ns: int,
     tick: int,
     last_sequence: int,
@@ -132,16 +132,16 @@ def limit_command(
         measured.torque_nm.tolist(),
         strict=True,
     ):
-        if mode is Mode.PASSIVE:
+        if mode is JointMode.PASSIVE:
             targets.append(0.0)
             continue
         start = last_target
         if mode != last_mode:
             start = compute_bumpless_target(joint, mode, angle, velocity, torque)
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 target = _limit_angle_target(joint, requested, start, angle, limits)
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 target = _limit_velocity_target(joint, requested, start, angle, limits.period_s)
             case _:  # torque: passive joints have been handled above
                 target = _limit_torque_target(joint, requested, start, torque_limit, angle, velocity, limits.period_s)
@@ -286,7 +286,7 @@ def compute_stoppable_speed(distance_rad: float, acceleration_rad_s2: float, per
 
 
 def compute_bumpless_target(
-    joint: JointDescription, mode: Mode, angle_rad: float, velocity_rad_s: float, torque_nm: float
+    joint: JointDescription, mode: JointMode, angle_rad: float, velocity_rad_s: float, torque_nm: float
 ) -> float:
     """Return the target with which a motor that changes to another mode keeps its current torque.
 
@@ -304,14 +304,14 @@ def compute_bumpless_target(
         The target in rad, rad/s or N·m, depending on the mode.
     """
     match mode:
-        case Mode.POSITION:
+        case JointMode.POSITION:
             spring_torque_nm = torque_nm + joint.damping_nm_s_per_rad * velocity_rad_s
             return angle_rad + spring_torque_nm / max(joint.stiffness_nm_per_rad, MIN_STIFFNESS_NM_PER_RAD)
-        case Mode.VELOCITY:
+        case JointMode.VELOCITY:
             return velocity_rad_s + torque_nm / joint.velocity_gain_nm_s_per_rad
-        case Mode.TORQUE:
+        case JointMode.TORQUE:
             return torque_nm
-        case Mode.PASSIVE:
+        case JointMode.PASSIVE:
             return 0.0
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, JointMask, MeasuredState
-from snakesim_hal.wire.messages import Fault, JointState, Mode
+from snakesim_hal.wire.messages import Fault, JointMode, JointState
 
 Columns = tuple[list[float], list[float], list[float]]  # angle, velocity, torque
 
@@ -325,7 +325,7 @@ class _FrozenDetector:
         if applied is None:
             self._had_position_target = np.zeros_like(self._had_position_target)
             return
-        self._had_position_target = applied.mode == Mode.POSITION
+        self._had_position_target = applied.mode == JointMode.POSITION
         self._lowest_target_rad = applied.target
         self._highest_target_rad = applied.target
         self._wide_range_since_s = self._never_times_s
@@ -347,7 +347,7 @@ class _FrozenDetector:
         if applied is None:
             self.restart(columns, None)
             return np.zeros_like(self._had_position_target)
-        is_in_position_mode = applied.mode == Mode.POSITION
+        is_in_position_mode = applied.mode == JointMode.POSITION
         is_repeated = (columns == self._last_columns).all(axis=0) & is_in_position_mode & self._had_position_target
         if not np.count_nonzero(is_repeated):
             self.restart(columns, applied)

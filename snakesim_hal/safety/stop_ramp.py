@@ -19,7 +19,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, MeasuredState
 from snakesim_hal.safety.limiter import compute_bumpless_target
-from snakesim_hal.wire.messages import LifecycleState, Mode, StopMode
+from snakesim_hal.wire.messages import JointMode, LifecycleState, StopMode
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class StopRamp:
             strict=True,
         )
         bumpless_rad = [
-            compute_bumpless_target(joint, Mode.POSITION, angle, velocity, torque)
+            compute_bumpless_target(joint, JointMode.POSITION, angle, velocity, torque)
             for joint, angle, velocity, torque in joint_states
         ]
         # A joint in position mode continues from its last target, any other one where its motor keeps its torque.
-        start_target_rad = np.where(last.mode == Mode.POSITION, last.target, bumpless_rad)
+        start_target_rad = np.where(last.mode == JointMode.POSITION, last.target, bumpless_rad)
         lower_rad = angle_rad - limits.max_step_rad
         upper_rad = angle_rad + limits.max_step_rad
         limited_target_rad = np.clip(start_target_rad, lower_rad, upper_rad)
@@ -110,24 +110,26 @@ class StopReaction:
                 return self._make_damping_setpoints(self._ramp, torque_nm)
             case "hold":
                 self._ramp = self._ramp.advance(self._limits)
-                return make_uniform_setpoints(Mode.POSITION, self._ramp.target_rad, torque_nm)
+                return make_uniform_setpoints(JointMode.POSITION, self._ramp.target_rad, torque_nm)
 
     def _make_passive_setpoints(self, torque_nm: Floats) -> AppliedSetpoints:
-        return make_uniform_setpoints(Mode.PASSIVE, np.zeros_like(torque_nm), torque_nm)
+        return make_uniform_setpoints(JointMode.PASSIVE, np.zeros_like(torque_nm), torque_nm)
 
     def _make_damping_setpoints(self, ramp: StopRamp, torque_nm: Floats) -> AppliedSetpoints:
         """Return velocity targets of 0. Joints without a velocity mode follow the ramp until they are at rest."""
         has_velocity_mode = self._limits.has_velocity_mode
         if has_velocity_mode.all():
-            return make_uniform_setpoints(Mode.VELOCITY, np.zeros_like(torque_nm), torque_nm)
+            return make_uniform_setpoints(JointMode.VELOCITY, np.zeros_like(torque_nm), torque_nm)
         ramp = ramp.advance(self._limits)
         self._ramp = ramp
         at_rest = ramp.velocity_rad_s == 0.0
-        modes = np.select([has_velocity_mode, at_rest], [int(Mode.VELOCITY), int(Mode.PASSIVE)], int(Mode.POSITION))
-        target = np.where(modes == int(Mode.POSITION), ramp.target_rad, 0.0)
+        modes = np.select(
+            [has_velocity_mode, at_rest], [int(JointMode.VELOCITY), int(JointMode.PASSIVE)], int(JointMode.POSITION)
+        )
+        target = np.where(modes == int(JointMode.POSITION), ramp.target_rad, 0.0)
         return AppliedSetpoints(modes.astype(np.int64), target, torque_nm)
 
 
-def make_uniform_setpoints(mode: Mode, target: Floats, torque_nm: Floats) -> AppliedSetpoints:
+def make_uniform_setpoints(mode: JointMode, target: Floats, torque_nm: Floats) -> AppliedSetpoints:
     """Return setpoints of one mode for all joints. `target` and `torque_nm` have the shape (n_joints,)."""
     return AppliedSetpoints(np.full(len(target), int(mode), dtype=np.int64), target, torque_nm)

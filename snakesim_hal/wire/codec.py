@@ -1,6 +1,6 @@
 """Bytes on the wire: MessagePack of a message, its name and version in the Zenoh encoding.
 
-`encode` and `Decoder` are pure; the session puts the encoding string on the sample.
+`encode` and `MessageDecoder` are pure; the session puts the encoding string on the sample.
 """
 
 from typing import Generic, TypeVar
@@ -33,7 +33,7 @@ def format_encoding(message: type[Message]) -> str:
     return f"{ENCODING_PREFIX}{known.__name__}/{VERSIONS[known]}"
 
 
-class Decoder(Generic[MessageT]):
+class MessageDecoder(Generic[MessageT]):
     """Decodes one message type and rejects everything else with a `WireError`, never another exception."""
 
     def __init__(self, message: type[MessageT]) -> None:

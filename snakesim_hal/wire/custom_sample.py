@@ -1,8 +1,8 @@
 """The message of a custom sensor: a Struct that its author writes, and the same one made from its JSON Schema.
 
 A process that has the author's class uses that. All others (host, recorder, console, bridges, tables) have the schema
-in `Description.custom`, so that no process runs code because a robot or a recording names it. Fields are flat: numbers,
-flags, words, texts, and lists of the first two; each with bounds, and numbers that are no counts with a unit.
+in `RobotDescription.custom`, so that no process runs code because a robot or a recording names it. Fields are flat:
+numbers, flags, words, texts, and lists of the first two; each with bounds, and numbers that are no counts with a unit.
 """
 
 import math
@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, WireError, shorten
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import CustomSample, Description, Message
+from snakesim_hal.wire.messages import CustomSample, Message, RobotDescription
 from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_CUSTOM_SCHEMA
 
 MAX_FIELDS = 32
@@ -198,7 +198,7 @@ def _make_number_type(field: dict[str, Any], name: str, units: dict[str, str]) -
 # --- of a robot ------------------------------------------------------------------------------------------------
 
 
-def find_custom_message(key: str, robot: Description) -> CustomMessage | None:
+def find_custom_message(key: str, robot: RobotDescription) -> CustomMessage | None:
     """Return the message of a robot's custom sensor; None if this key has none, or its schema is of no use."""
     if key not in robot.custom:
         return None
@@ -207,7 +207,7 @@ def find_custom_message(key: str, robot: Description) -> CustomMessage | None:
     return None
 
 
-def find_custom_messages(robot: Description) -> dict[str, CustomMessage]:
+def find_custom_messages(robot: RobotDescription) -> dict[str, CustomMessage]:
     """Return the messages of all custom sensors of a robot, by key."""
     messages: dict[str, CustomMessage] = {}
     for key in robot.custom:
@@ -217,7 +217,7 @@ def find_custom_messages(robot: Description) -> dict[str, CustomMessage]:
     return messages
 
 
-def find_message_type(key: str, robot: Description | None) -> type[Message] | None:
+def find_message_type(key: str, robot: RobotDescription | None) -> type[Message] | None:
     """Return the message at a key: as the robot describes it if it is known, else that of the key space."""
     custom_message = None if robot is None else find_custom_message(key, robot)
     if custom_message is None:

@@ -51,7 +51,7 @@ class KeyRow:
 
 
 _TICK = "every tick"
-_SENSOR = "at its `rate_hz` in `Description.sensors`"
+_SENSOR = "at its `rate_hz` in `RobotDescription.sensors`"
 _ASKED = "on request"
 _TURN = "every `decimation` of its service"
 _LIVES = "while connected"
@@ -65,16 +65,23 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(POWER, m.Power, "HAL", "stream", _SENSOR, "supply, temperatures and leaks of the joint modules"),
     KeyRow(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
     KeyRow(COLOR_ALL, m.ColorImage, "HAL", "stream", _SENSOR, "what a camera sees, in color"),
-    KeyRow(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
+    KeyRow(RANGE_ALL, m.RangeScan, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
     KeyRow(CUSTOM_ALL, m.CustomSample, "HAL", "stream", _SENSOR, "samples of a sensor with a custom message"),
     KeyRow(
-        PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
+        PREVIEW_DEPTH_ALL,
+        m.ImagePreview,
+        "preview",
+        "stream",
+        _LOOKED_AT,
+        "small PNG of a depth image, for remote viewers",
     ),
-    KeyRow(PREVIEW_COLOR_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small JPEG of a color image"),
+    KeyRow(PREVIEW_COLOR_ALL, m.ImagePreview, "preview", "stream", _LOOKED_AT, "small JPEG of a color image"),
     KeyRow(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and setpoint of every joint"),
-    KeyRow(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
-    KeyRow(CONFIG, m.Configuration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
-    KeyRow(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
+    KeyRow(DESCRIPTION, m.RobotDescription, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
+    KeyRow(CONFIG, m.RunConfiguration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
+    KeyRow(
+        STATUS, m.RobotStatus, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"
+    ),
     KeyRow(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
     KeyRow(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "setpoints that the motors got, and limits applied"),
     KeyRow(
@@ -86,8 +93,8 @@ SPACE: tuple[KeyRow, ...] = (
         SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator. Replies Answer"
     ),
     KeyRow(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "inject a fault, where allowed. Replies Answer"),
-    KeyRow(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all output for a tick is published"),
-    KeyRow(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
+    KeyRow(DONE_ALL, m.TickDone, "each service", "stream", _TURN, "lockstep: all output for a tick is published"),
+    KeyRow(WORLD, m.WorldModel, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
     KeyRow(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
     KeyRow(
         CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"
@@ -103,9 +110,13 @@ SPACE: tuple[KeyRow, ...] = (
     KeyRow(
         PARAMETERS_IN_FORCE, m.ControlParameters, "control", "latched", "on a change", "the controller's parameters now"
     ),
-    KeyRow(INTENT, m.Intent, "operator", "stream", "before the last expires", "the requested speed and direction"),
+    KeyRow(
+        INTENT, m.LocomotionIntent, "operator", "stream", "before the last expires", "the requested speed and direction"
+    ),
     KeyRow(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
-    KeyRow(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings, and its token"),
+    KeyRow(
+        PROCESS_ALL, m.ProcessInfo, "each process", "latched", "once", "its machine, version, settings, and its token"
+    ),
     KeyRow(
         HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process, and a robot must have only one"
     ),

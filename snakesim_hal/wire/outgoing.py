@@ -12,7 +12,7 @@ import msgspec
 
 from snakesim_hal.base.errors import WireError, shorten, suggest_word
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode
+from snakesim_hal.wire.codec import MessageDecoder, encode
 from snakesim_hal.wire.custom_sample import CustomMessage
 from snakesim_hal.wire.messages import VERSIONS, CustomSample, Message
 
@@ -22,7 +22,7 @@ MAX_VALUE_LENGTH = 100  # characters of a value that an error quotes
 PATH_STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
 ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
 
-_make_decoder = cache(Decoder[Any])
+_make_decoder = cache(MessageDecoder[Any])
 
 
 def encode_checked(key: str, message: Message, custom: CustomMessage | None = None) -> bytes:

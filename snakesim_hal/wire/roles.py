@@ -70,7 +70,7 @@ FAULT_INJECTION_KEYS = (keys.FAULT_ALL,)  # granted only for a robot whose lab f
 OWN_NAME_ONLY = ("publish", "declare", "answer")
 
 
-class Permission(NamedTuple):
+class KeyPermission(NamedTuple):
     """One kind of Zenoh message that a router lets pass at a key, relative to the robot's namespace."""
 
     flow: str  # seen from the router: `ingress` comes from the process, `egress` goes to it
@@ -165,7 +165,7 @@ LATCHED_ZENOH_MESSAGES_BY_ACTION: dict[str, tuple[tuple[str, str, str], ...]] = 
 
 def iterate_permissions(
     role: Role, services: Iterable[str] = (), *, allow_fault_injection: bool = False
-) -> Iterator[Permission]:
+) -> Iterator[KeyPermission]:
     """Yield the rules of Zenoh's access control for a role of a robot: each message that a router lets pass.
 
     Args:
@@ -177,7 +177,7 @@ def iterate_permissions(
     allowed_names = _find_allowed_names(role, services)
     # Every role may declare a subscription to a pattern that is wider than its rights, such as `**`. That is safe,
     # because the router forwards a sample only with an `egress` permission for its own key.
-    yield Permission("ingress", "declare_subscriber", "**")
+    yield KeyPermission("ingress", "declare_subscriber", "**")
     for rule in ACCESS_RULES:
         if rule.key in FAULT_INJECTION_KEYS and not allow_fault_injection:
             continue
@@ -187,10 +187,10 @@ def iterate_permissions(
                 key_exprs = _make_key_exprs_of_names(rule.key, allowed_names)
             for flow, message, key_suffix in _list_zenoh_messages(rule, action):
                 for key_expr in key_exprs:
-                    yield Permission(flow, message, key_expr + key_suffix)
+                    yield KeyPermission(flow, message, key_expr + key_suffix)
             if action == "publish":
                 # The router sends a publisher the subscriptions to its keys.
-                yield Permission("egress", "declare_subscriber", "**")
+                yield KeyPermission("egress", "declare_subscriber", "**")
 
 
 def _find_allowed_names(role: Role, services: Iterable[str]) -> list[str] | None:

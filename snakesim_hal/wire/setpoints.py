@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 
 @dataclass(frozen=True)
@@ -12,6 +12,6 @@ class RequestedSetpoints:
     A backend never receives them. The HAL host's limiter turns them into `snakesim_hal.backend.SafeSetpoints`.
     """
 
-    mode: list[Mode]  # of each joint
+    mode: list[JointMode]  # of each joint
     target: list[float]  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: list[float]  # maximum torque of each joint's motor, at least 0

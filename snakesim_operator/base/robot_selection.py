@@ -11,7 +11,7 @@ from snakesim_hal.network.local_registry import LocalRobot, list_local_robots
 from snakesim_hal.programs.arguments import check_network, read_session_option
 
 if TYPE_CHECKING:
-    from snakesim_hal.network.session import Link
+    from snakesim_hal.network.session import ConnectionSettings
     from snakesim_hal.network.session_file import SessionFile
 
 
@@ -35,15 +35,15 @@ class RobotSelection:
         """List the endpoints of all networks to search."""
         return [link.endpoint for link in self.list_networks()]
 
-    def list_networks(self) -> "list[Link]":
+    def list_networks(self) -> "list[ConnectionSettings]":
         """List the links to all networks to search, for the addressed namespace."""
-        from snakesim_hal.network.session import Link
+        from snakesim_hal.network.session import ConnectionSettings
 
         if self.endpoint is not None:
-            return [Link(self.endpoint, self.namespace, session=self.session)]
+            return [ConnectionSettings(self.endpoint, self.namespace, session=self.session)]
         links = {robot.endpoint: _make_link(robot, self.namespace) for robot in self.list_local_robots()}
         if DEFAULT_ENDPOINT not in links:
-            links[DEFAULT_ENDPOINT] = Link(namespace=self.namespace)
+            links[DEFAULT_ENDPOINT] = ConnectionSettings(namespace=self.namespace)
         return list(links.values())
 
 
@@ -56,14 +56,14 @@ def select_robots(arguments: argparse.Namespace) -> RobotSelection:
     return RobotSelection(arguments.router or arguments.endpoint, arguments.namespace)
 
 
-def _make_link(robot: LocalRobot, namespace: str | None) -> "Link":
+def _make_link(robot: LocalRobot, namespace: str | None) -> "ConnectionSettings":
     """Make the link to a robot on this computer, by its session file if this user may read that."""
-    from snakesim_hal.network.session import Link
+    from snakesim_hal.network.session import ConnectionSettings
     from snakesim_hal.network.session_file import read_session
 
     if robot.session:
         try:
-            return Link.from_session_file(read_session(Path(robot.session)), namespace)
+            return ConnectionSettings.from_session_file(read_session(Path(robot.session)), namespace)
         except ConfigError:
             pass
-    return Link(robot.endpoint, namespace)
+    return ConnectionSettings(robot.endpoint, namespace)

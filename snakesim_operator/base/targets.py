@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.robot_selection import RobotSelection
@@ -16,7 +16,7 @@ SEARCH_TIMEOUT_S = 3.0  # to connect, and to answer: a busy computer takes more 
 ALL_HALS_KEY = f"**/{keys.alive_key('hal')}"
 
 
-def make_robot_flags(link: Link, robot: str | None) -> str:
+def make_robot_flags(link: ConnectionSettings, robot: str | None) -> str:
     """Make the command-line flags that address a robot; empty for the defaults.
 
     Args:
@@ -42,9 +42,9 @@ def get_namespace(key: str) -> str:
     return namespace_and_key[0]
 
 
-def find_robots(selection: RobotSelection) -> list[Link]:
+def find_robots(selection: RobotSelection) -> list[ConnectionSettings]:
     """Find the links to all addressed robots that can be reached."""
-    links: list[Link] = []
+    links: list[ConnectionSettings] = []
     for link in selection.list_networks():
         try:
             with open_session(link, SEARCH_TIMEOUT_S) as session:
@@ -57,7 +57,9 @@ def find_robots(selection: RobotSelection) -> list[Link]:
     return links
 
 
-def open_sessions(selection: RobotSelection, exit_stack: contextlib.ExitStack) -> list[tuple[Link, Session]]:
+def open_sessions(
+    selection: RobotSelection, exit_stack: contextlib.ExitStack
+) -> list[tuple[ConnectionSettings, Session]]:
     """Open a session on every network that can be reached, for messages of any size.
 
     Args:
@@ -70,7 +72,7 @@ def open_sessions(selection: RobotSelection, exit_stack: contextlib.ExitStack) -
     Raises:
         NotConnectedError: No network can be reached.
     """
-    sessions: list[tuple[Link, Session]] = []
+    sessions: list[tuple[ConnectionSettings, Session]] = []
     for link in selection.list_networks():
         with contextlib.suppress(NotConnectedError):
             unlimited_link = replace(link, max_bytes=MAX_IMAGE_BYTES)
@@ -83,7 +85,7 @@ def open_sessions(selection: RobotSelection, exit_stack: contextlib.ExitStack) -
     return sessions
 
 
-def find_single_robot(selection: RobotSelection, command: str) -> Link:
+def find_single_robot(selection: RobotSelection, command: str) -> ConnectionSettings:
     """Find the single addressed robot.
 
     Args:

@@ -85,7 +85,7 @@ class WorkerPool:
             count: Maximum number of processes; None for one per core that this process may use.
         """
         self.size = count or len(os.sched_getaffinity(0))
-        self._workers: list[_Worker] = []
+        self._workers: list[_WorkerProcess] = []
         self._folder: Path | None = None
         self._started_worker_count = 0
 
@@ -118,7 +118,7 @@ class WorkerPool:
             The index of a call in `calls` and its outcome, as soon as the call is done.
         """
         waiting = deque(_PendingCall(number, arguments) for number, arguments in enumerate(calls))
-        running: dict[_Worker, _PendingCall] = {}
+        running: dict[_WorkerProcess, _PendingCall] = {}
         try:
             while waiting or running:
                 while waiting and len(running) < self.size:
@@ -149,7 +149,7 @@ class WorkerPool:
             values[number] = outcome.value
         return [values[number] for number in range(len(calls))]
 
-    def _find_idle_worker(self, running: "dict[_Worker, _PendingCall]") -> "_Worker":
+    def _find_idle_worker(self, running: "dict[_WorkerProcess, _PendingCall]") -> "_WorkerProcess":
         """Return a worker without a call; a new one is started if there is none."""
         for worker in self._workers:
             if worker not in running:
@@ -158,11 +158,11 @@ class WorkerPool:
         folder = self._folder / str(self._started_worker_count)
         folder.mkdir()
         self._started_worker_count += 1
-        worker = _Worker(folder)
+        worker = _WorkerProcess(folder)
         self._workers.append(worker)
         return worker
 
-    def _wait_for_workers(self, running: "dict[_Worker, _PendingCall]") -> "list[_Worker]":
+    def _wait_for_workers(self, running: "dict[_WorkerProcess, _PendingCall]") -> "list[_WorkerProcess]":
         """Wait until calls are done, have failed, or take too long, and return their workers."""
         remaining_s = min(call.deadline_s for call in running.values()) - time.monotonic()
         timeout_s = None if remaining_s == float("inf") else max(remaining_s, 0.0)
@@ -170,7 +170,7 @@ class WorkerPool:
         now_s = time.monotonic()
         return [worker for worker, call in running.items() if worker.connection in readable or now_s >= call.deadline_s]
 
-    def _receive_outcome(self, worker: "_Worker", call: _PendingCall) -> Outcome | None:
+    def _receive_outcome(self, worker: "_WorkerProcess", call: _PendingCall) -> Outcome | None:
         """Receive the outcome of a call; None if the call has to be retried.
 
         A call is retried if its worker died or the function raised, unless this has happened too often.
@@ -197,7 +197,7 @@ class WorkerPool:
                 return None
         return outcome
 
-    def _kill_and_remove(self, worker: "_Worker") -> None:
+    def _kill_and_remove(self, worker: "_WorkerProcess") -> None:
         """Kill a worker and remove its temporary files."""
         worker.kill()
         self._workers.remove(worker)
@@ -220,7 +220,7 @@ def _remove_abandoned_folders() -> None:
 
 
 @dataclass(eq=False)
-class _Worker:
+class _WorkerProcess:
     """A worker process, as the process that started it controls it."""
 
     folder: Path  # for the worker's temporary files

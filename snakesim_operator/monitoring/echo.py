@@ -16,7 +16,7 @@ from snakesim_hal.base.errors import ConfigError, WireError, shorten, suggest_wo
 from snakesim_hal.base.terminal import print_json, print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Session, key_expressions_intersect, normalize_key_expression
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import CustomSample
 from snakesim_operator.base.targets import RobotSelection, open_sessions
@@ -169,12 +169,12 @@ class OutputQueue:
     """Queues received messages for the terminal. If the terminal is too slow, the newest are dropped and counted."""
 
     def __init__(self) -> None:
-        self._arrivals: Mailbox[Arrival] = Mailbox()
+        self._arrivals: Mailbox[ReceivedSample] = Mailbox()
         self._lock = threading.Lock()
         self._queued_bytes = 0
         self._dropped_count = 0
 
-    def add(self, arrival: Arrival) -> None:
+    def add(self, arrival: ReceivedSample) -> None:
         """Add a message, or drop it if the queue is full. This runs in Zenoh's threads."""
         with self._lock:
             if self._queued_bytes + len(arrival.payload) > MAX_QUEUED_BYTES:
@@ -183,16 +183,16 @@ class OutputQueue:
             self._queued_bytes += len(arrival.payload)
         self._arrivals.put(arrival)
 
-    def make_filtered_add(self, is_selected: Callable[[str], bool]) -> Callable[[Arrival], None]:
+    def make_filtered_add(self, is_selected: Callable[[str], bool]) -> Callable[[ReceivedSample], None]:
         """Return a function that adds a message if `is_selected` returns true for its key."""
 
-        def add_if_selected(arrival: Arrival) -> None:
+        def add_if_selected(arrival: ReceivedSample) -> None:
             if is_selected(arrival.key):
                 self.add(arrival)
 
         return add_if_selected
 
-    def get(self, timeout: float | None = None) -> Arrival:
+    def get(self, timeout: float | None = None) -> ReceivedSample:
         """Return the oldest sample. Raises queue.Empty after `timeout` in s; None waits without a limit."""
         if self._dropped_count and self._arrivals.empty():
             print_stderr(f"{self._dropped_count} messages were dropped: they came faster than they could be printed")
@@ -215,7 +215,7 @@ def _count_up_to(count: int | None) -> Iterable[int]:
     return itertools.count() if count is None else range(count)
 
 
-def _decode_content(arrival: Arrival) -> dict[str, Any]:
+def _decode_content(arrival: ReceivedSample) -> dict[str, Any]:
     """Return the decoded message under the name "message", or the reason why it cannot be decoded under "error"."""
     message = keys.find_message(arrival.key)
     if message is None:

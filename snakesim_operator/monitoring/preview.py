@@ -17,10 +17,10 @@ from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Session, open_session
-from snakesim_hal.network.streams import Publisher, Reader
+from snakesim_hal.network.streams import Publisher, SampleReader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, Preview
+from snakesim_hal.wire.messages import ColorImage, DepthImage, ImagePreview, RobotDescription
 from snakesim_hal.wire.quantities import MAX_PREVIEW_BYTES
 from snakesim_operator.base import extras
 from snakesim_operator.base.targets import RobotSelection, find_single_robot
@@ -57,7 +57,7 @@ def publish_previews(selection: RobotSelection, rate_hz: float, max_width_px: in
         )
     link = find_single_robot(selection, "start preview")
     with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.wait_for_latched(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
+        robot = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, DESCRIPTION_TIMEOUT_S)
         if robot is None:
             raise NotConnectedError(
                 f"{link.namespace} does not describe itself within {DESCRIPTION_TIMEOUT_S:g} s", code="network/no-robot"
@@ -77,7 +77,7 @@ def publish_previews(selection: RobotSelection, rate_hz: float, max_width_px: in
             time.sleep(1.0 / rate_hz)
 
 
-def find_cameras(session: Session, robot: Description, max_width_px: int) -> list["CameraPreviewPublisher"]:
+def find_cameras(session: Session, robot: RobotDescription, max_width_px: int) -> list["CameraPreviewPublisher"]:
     """Return a publisher of previews for each stream of images in the description of the robot.
 
     Args:
@@ -97,7 +97,7 @@ class CameraPreviewPublisher:
     """Reads the images of one key, and publishes their previews."""
 
     def __init__(
-        self, session: Session, robot: Description, key: str, image_type: type[Any], max_width_px: int
+        self, session: Session, robot: RobotDescription, key: str, image_type: type[Any], max_width_px: int
     ) -> None:
         """Declare the publisher of the previews. Images are not read before the previews have a subscriber.
 
@@ -113,8 +113,8 @@ class CameraPreviewPublisher:
         self._robot = robot
         self._image_type = image_type
         self._max_width_px = max_width_px
-        self._publisher: Publisher[Preview] = session.declare_publisher(keys.preview_key(key), Preview)
-        self._reader: Reader[Any] | None = None
+        self._publisher: Publisher[ImagePreview] = session.declare_publisher(keys.preview_key(key), ImagePreview)
+        self._reader: SampleReader[Any] | None = None
 
     def publish_preview(self) -> str | None:
         """Publish a preview of the newest image if the previews have a subscriber; else stop reading images.
@@ -140,7 +140,7 @@ class CameraPreviewPublisher:
         return None
 
 
-def encode_preview(image: DepthImage | ColorImage, max_width_px: int) -> Preview:
+def encode_preview(image: DepthImage | ColorImage, max_width_px: int) -> ImagePreview:
     """Return a small, compressed copy of an image: color as JPEG, depth as PNG.
 
     A color image is averaged. A depth image keeps every n-th pixel unchanged, because the mean of a near and a far
@@ -162,7 +162,7 @@ def encode_preview(image: DepthImage | ColorImage, max_width_px: int) -> Preview
         full_image = PIL.Image.frombytes("RGB", (image.width, image.height), image.rgb)
         reduced_image = full_image.reduce(stride)
         reduced_image.save(buffer, "JPEG", quality=JPEG_QUALITY)
-    return Preview(
+    return ImagePreview(
         tick=image.tick,
         timestamp_ns=image.timestamp_ns,
         width=reduced_image.width,

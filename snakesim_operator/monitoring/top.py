@@ -11,11 +11,11 @@ import msgspec
 from snakesim_hal.base.terminal import PrintLine, overwrite_lines, print_json, print_line
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import TICK_TIMES, Description, Timing
+from snakesim_hal.wire.messages import TICK_TIMES, RobotDescription, TimingStatistics
 from snakesim_operator.base.targets import RobotSelection, open_sessions
-from snakesim_operator.monitoring.traffic import KeyTraffic, Latency, Traffic
+from snakesim_operator.monitoring.traffic import CommandLatency, KeyTraffic, NetworkTraffic
 
 PERIOD_S = 1.0
 SINGLE_MEASUREMENT_S = 2.0  # long enough for two samples of the slowest key that repeats itself
@@ -60,16 +60,16 @@ def show_traffic(selection: RobotSelection, print_text: PrintLine = print_line, 
                 return 0 if snapshot.lines else 1
 
 
-def _subscribe_to_traffic(namespace: str | None, session: Session) -> Traffic:
+def _subscribe_to_traffic(namespace: str | None, session: Session) -> NetworkTraffic:
     """Subscribe to everything on a network, and return the object that collects what arrives from now on.
 
     Args:
         namespace: Namespace of the only robot that is measured. None if keys begin with the namespace of a robot.
         session: Session on this network.
     """
-    traffic = Traffic(namespace)
+    traffic = NetworkTraffic(namespace)
 
-    def add_unknown_key(arrival: Arrival) -> None:
+    def add_unknown_key(arrival: ReceivedSample) -> None:
         if not traffic.is_known_key(arrival.key):
             traffic.add(arrival)
 
@@ -89,9 +89,9 @@ class TrafficSnapshot:
     """The measured traffic on all networks at one time, as one table of `snakesim topic rate` prints it."""
 
     lines: Sequence[KeyTraffic]
-    latencies: Sequence[Latency]
-    tick_times: Mapping[str, Mapping[str, Timing]]  # by robot; without those that have no times yet
-    descriptions: Mapping[str, Description]  # by robot
+    latencies: Sequence[CommandLatency]
+    tick_times: Mapping[str, Mapping[str, TimingStatistics]]  # by robot; without those that have no times yet
+    descriptions: Mapping[str, RobotDescription]  # by robot
     left_out: int  # messages on more keys than are counted
 
     def format_table(self) -> list[str]:
@@ -123,13 +123,13 @@ class TrafficSnapshot:
         return table
 
 
-def _evaluate_traffic(traffics: Sequence[Traffic]) -> TrafficSnapshot:
+def _evaluate_traffic(traffics: Sequence[NetworkTraffic]) -> TrafficSnapshot:
     """Measure rates, latencies and tick times of all networks now, and return them as one snapshot."""
     now_ns = time.monotonic_ns()
     lines: list[KeyTraffic] = []
-    latencies: list[Latency] = []
-    tick_times: dict[str, Mapping[str, Timing]] = {}
-    descriptions: dict[str, Description] = {}
+    latencies: list[CommandLatency] = []
+    tick_times: dict[str, Mapping[str, TimingStatistics]] = {}
+    descriptions: dict[str, RobotDescription] = {}
     left_out = 0
     for traffic in traffics:
         lines += traffic.measure_keys(now_ns)
@@ -154,7 +154,7 @@ def _print_json_snapshot(snapshot: TrafficSnapshot, print_text: PrintLine) -> No
     print_json(msgspec.to_builtins(content), print_text)
 
 
-def _format_timing(name: str, timing: Timing) -> str:
+def _format_timing(name: str, timing: TimingStatistics) -> str:
     """Return the line of a duration, with its histogram from the shortest to the longest."""
     max_count = max(timing.bins)
     bars = ""
@@ -165,7 +165,7 @@ def _format_timing(name: str, timing: Timing) -> str:
     return f"{name:<10} {description:<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"
 
 
-def _format_latency(latency: Latency) -> str:
+def _format_latency(latency: CommandLatency) -> str:
     """Return the line of a robot's latency."""
     text = (
         f"state to command, as measured here: {latency.arrival_median_ms:.2f} ms in the median, "

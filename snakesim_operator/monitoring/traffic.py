@@ -13,18 +13,18 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, MessageT
+from snakesim_hal.wire.codec import MessageDecoder, MessageT
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
-    Description,
     JointCommand,
     JointState,
     Message,
-    Status,
-    Timing,
+    RobotDescription,
+    RobotStatus,
+    TimingStatistics,
 )
 
 MAX_KEYS = 512  # an unknown client may invent more; arrivals on those are only counted
@@ -38,7 +38,7 @@ LATENCY_MESSAGE_TYPES: dict[str, type[Message]] = {
 MAX_LATENCY_MESSAGES = 1024  # newest states and commands, from which the latency is computed
 MAX_LATENCY_MESSAGE_BYTES = 16384  # larger ones are dropped; a command of 256 joints has 4 kB
 
-get_decoder = cache(Decoder)
+get_decoder = cache(MessageDecoder)
 
 
 class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,7 +56,7 @@ class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):
     age_ms: float | None  # of the newest data, by its timestamp and the robot's clock
 
 
-class Latency(msgspec.Struct, frozen=True, kw_only=True):
+class CommandLatency(msgspec.Struct, frozen=True, kw_only=True):
     """Time from a joint state to the command that answers it, and to the motors.
 
     A busy computer delays the arrivals that are measured here.
@@ -70,7 +70,7 @@ class Latency(msgspec.Struct, frozen=True, kw_only=True):
     count: int
 
 
-class Traffic:
+class NetworkTraffic:
     """Collects what arrives on one network, from any thread, and measures rates and latencies of it."""
 
     def __init__(self, namespace: str | None = None) -> None:
@@ -82,11 +82,13 @@ class Traffic:
         self.keys_left_out = 0  # arrivals on keys beyond MAX_KEYS
         self._namespace = namespace
         self._lock = threading.Lock()
-        self._newest_by_key: dict[str, Arrival] = {}  # by key
+        self._newest_by_key: dict[str, ReceivedSample] = {}  # by key
         self._arrival_times_ns_by_key: dict[str, deque[int]] = {}  # by key
-        self._latency_arrivals: dict[tuple[str, type[Message]], deque[Arrival]] = {}  # by prefix of the key and message
+        self._latency_arrivals: dict[
+            tuple[str, type[Message]], deque[ReceivedSample]
+        ] = {}  # by prefix of the key and message
 
-    def add(self, arrival: Arrival) -> None:
+    def add(self, arrival: ReceivedSample) -> None:
         """Add an arrival. This runs in Zenoh's threads, so no message is decoded here."""
         with self._lock:
             if arrival.key not in self._newest_by_key and len(self._newest_by_key) >= MAX_KEYS:
@@ -99,7 +101,7 @@ class Traffic:
             if len(arrival.payload) <= MAX_LATENCY_MESSAGE_BYTES:
                 self._keep_latency_arrival(arrival)
 
-    def _keep_latency_arrival(self, arrival: Arrival) -> None:
+    def _keep_latency_arrival(self, arrival: ReceivedSample) -> None:
         """Keep an arrival if it is a joint state or a command, from which the latency is computed."""
         for suffix, message in LATENCY_MESSAGE_TYPES.items():
             if f"/{arrival.key}".endswith(f"/{suffix}"):
@@ -161,14 +163,14 @@ class Traffic:
         return {
             self._split_namespace(key)[0]: status.lease_holder
             for key, status in contents.items()
-            if isinstance(status, Status)
+            if isinstance(status, RobotStatus)
         }
 
-    def measure_latencies(self) -> list[Latency]:
+    def measure_latencies(self) -> list[CommandLatency]:
         """Return the latency of every robot whose commands answer known joint states."""
         with self._lock:
             arrivals_by_source = {source: list(arrivals) for source, arrivals in self._latency_arrivals.items()}
-        latencies: list[Latency] = []
+        latencies: list[CommandLatency] = []
         prefixes = sorted(prefix for prefix, message_type in arrivals_by_source if message_type is JointCommand)
         for prefix in prefixes:
             latency = self._measure_latency(
@@ -187,7 +189,7 @@ class Traffic:
         states: list[tuple[JointState, int]],
         commands: list[tuple[JointCommand, int]],
         applied_commands: list[tuple[AppliedCommand, int]],
-    ) -> Latency | None:
+    ) -> CommandLatency | None:
         """Measure the time from each joint state to the command that answers it, and to the motors.
 
         The response latency is the difference of arrival times by this computer's clock. The actuation latency is the
@@ -224,7 +226,7 @@ class Traffic:
         if response_median_ms is None or response_p99_ms is None:
             return None
         actuation_median_ms, actuation_p99_ms = _compute_median_and_p99(actuation_latencies_ms)
-        return Latency(
+        return CommandLatency(
             robot=self._namespace or prefix.rstrip("/"),
             arrival_median_ms=response_median_ms,
             arrival_p99_ms=response_p99_ms,
@@ -233,15 +235,15 @@ class Traffic:
             count=len(response_latencies_ms),
         )
 
-    def read_tick_times(self) -> dict[str, dict[str, Timing]]:
+    def read_tick_times(self) -> dict[str, dict[str, TimingStatistics]]:
         """Return the tick times of every robot from its newest status; empty for one that was not armed yet."""
         statuses = self._decode_newest(keys.STATUS)
-        return {robot: status.tick_times for robot, status in statuses.items() if isinstance(status, Status)}
+        return {robot: status.tick_times for robot, status in statuses.items() if isinstance(status, RobotStatus)}
 
-    def read_descriptions(self) -> dict[str, Description]:
+    def read_descriptions(self) -> dict[str, RobotDescription]:
         """Return the newest description by robot, of every robot that publishes one."""
         contents = self._decode_newest(keys.DESCRIPTION)
-        return {robot: content for robot, content in contents.items() if isinstance(content, Description)}
+        return {robot: content for robot, content in contents.items() if isinstance(content, RobotDescription)}
 
     def _decode_newest(self, relative_key: str) -> dict[str, Any]:
         """Return the newest message at a key by robot; a text in its place is the reason why it is unreadable."""
@@ -318,7 +320,7 @@ def _measure_arrival_rate(times_ns: list[int]) -> dict[str, float | None]:
     }
 
 
-def _decode_or_explain(relative_key: str, arrival: Arrival) -> Any:
+def _decode_or_explain(relative_key: str, arrival: ReceivedSample) -> Any:
     """Return the decoded message, or a text with the reason why it cannot be decoded."""
     message = keys.find_message(relative_key)
     if message is None:
@@ -329,7 +331,7 @@ def _decode_or_explain(relative_key: str, arrival: Arrival) -> Any:
         return error.reason
 
 
-def _decode_readable(arrivals: list[Arrival], message_type: type[MessageT]) -> list[tuple[MessageT, int]]:
+def _decode_readable(arrivals: list[ReceivedSample], message_type: type[MessageT]) -> list[tuple[MessageT, int]]:
     """Return the messages that can be decoded, each with the monotonic time of its arrival in ns."""
     decoded: list[tuple[MessageT, int]] = []
     for arrival in arrivals:

@@ -13,7 +13,7 @@ from snakesim_hal.programs.arguments import (
     add_task_argument,
     make_number_parser,
 )
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.recording.message import RAW_ONLY_HELP
 from snakesim_operator.recording.stamps import LOG_TIME_CLOCK_HELP, LOG_TIME_CLOCKS
@@ -204,7 +204,7 @@ COMMANDS: Commands = (
         details="Exit code: 0 every robot is armed or disarmed without a fault, 1 otherwise or without a robot.",
         examples=("status", "status --json --endpoint tcp/127.0.0.1:7447"),
     ),
-    Noun(name="topic", heading="robot", help="List keys, print their messages, and measure their rates."),
+    CommandGroup(name="topic", heading="robot", help="List keys, print their messages, and measure their rates."),
     Command(
         name="topic list",
         help="List the keys on which a robot publishes.",

@@ -17,7 +17,7 @@ from snakesim_hal.programs.arguments import (
     add_task_argument,
     make_number_parser,
 )
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.recording.stamps import LOG_TIME_CLOCK_HELP, LOG_TIME_CLOCKS
 
 
@@ -210,7 +210,7 @@ def _replay_recording(arguments: argparse.Namespace) -> int:
     Raises:
         ConfigError: The recording cannot be read, or the options contradict each other.
     """
-    from snakesim_hal.model.scenario import Override, parse_set_option
+    from snakesim_hal.model.scenario import KeyOverride, parse_set_option
     from snakesim_operator.playback.control import replay_and_compare_commands
     from snakesim_operator.playback.play import play_recording
     from snakesim_operator.results.run_reader import find_recording_path
@@ -219,7 +219,7 @@ def _replay_recording(arguments: argparse.Namespace) -> int:
     if arguments.control:
         overrides = [parse_set_option(text) for text in arguments.set]
         if arguments.controller is not None:
-            overrides.append(Override("controller", arguments.controller, "--controller"))
+            overrides.append(KeyOverride("controller", arguments.controller, "--controller"))
         return replay_and_compare_commands(
             path, overrides, arguments.out, print_line, run_recorded_code=arguments.run_recorded_code
         )
@@ -263,7 +263,7 @@ COMMANDS: Commands = (
             "replay runs/demo --control --set control.speed_kp_s=0.3 --out runs/again",
         ),
     ),
-    Noun(name="recording", heading="runs and studies", help="Inspect, convert and draw recorded runs."),
+    CommandGroup(name="recording", heading="runs and studies", help="Inspect, convert and draw recorded runs."),
     Command(
         name="recording info",
         help="Print what a recording holds: keys, rates, sizes, gaps.",
@@ -298,7 +298,7 @@ COMMANDS: Commands = (
             "recording video runs/demo --out demo.gif --speed 4 --from 2 --to 10",
         ),
     ),
-    Noun(name="study", heading="runs and studies", help="Evaluate, sweep, optimize and compare runs."),
+    CommandGroup(name="study", heading="runs and studies", help="Evaluate, sweep, optimize and compare runs."),
     Command(
         name="study compare",
         help="Compare two runs, as a table and as a page with plots.",

@@ -19,22 +19,29 @@ from threadpoolctl import threadpool_limits
 from snakesim_hal.base.errors import ConfigError, SnakesimError, shorten
 from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.model.plugins import is_file_plugin
-from snakesim_hal.model.scenario import CHOSEN_PREFIXES, Override, RunConfig, encode_config, load_scenario, write_config
+from snakesim_hal.model.scenario import (
+    CHOSEN_PREFIXES,
+    KeyOverride,
+    RunConfig,
+    encode_config,
+    load_scenario,
+    write_config,
+)
 from snakesim_hal.network.local_network import LocalNetwork, LocalQuery
-from snakesim_hal.network.streams import Arrival, Publisher, Query
+from snakesim_hal.network.streams import IncomingQuery, Publisher, ReceivedSample
 from snakesim_hal.programs.preflight import load_service_class
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
     Clock,
-    Configuration,
     ControlParameters,
-    Description,
     JointCommand,
     ParametersRequest,
+    RobotDescription,
+    RunConfiguration,
 )
 from snakesim_operator.playback.play import iterate_in_robot_time_order
 from snakesim_operator.recording.message import RECORDING_FILENAME, RecordedMessage
@@ -102,7 +109,7 @@ def are_same_commands(a: JointCommand, b: JointCommand) -> bool:
 
 
 def load_recorded_config(
-    contents: RecordingContents, overrides: list[Override], *, run_recorded_code: bool = False
+    contents: RecordingContents, overrides: list[KeyOverride], *, run_recorded_code: bool = False
 ) -> RunConfig:
     """Load the configuration of a recorded run, and apply changes.
 
@@ -165,7 +172,7 @@ class ControlReplay:
     """Runs services on the recorded sensor data of a run, in place of the services of that run."""
 
     def __init__(
-        self, path: Path, overrides: list[Override], out: Path | None = None, *, run_recorded_code: bool = False
+        self, path: Path, overrides: list[KeyOverride], out: Path | None = None, *, run_recorded_code: bool = False
     ) -> None:
         """Read the configuration of a recording, and prepare its replay.
 
@@ -186,7 +193,7 @@ class ControlReplay:
         )
         if contents.description is None:
             raise ConfigError(f"{path}: holds no hal/description", code="recording/missing-data")
-        self.robot: Description = contents.description
+        self.robot: RobotDescription = contents.description
         self.clock_mode = self.config.clock_mode
         self.stop_reason = ""  # why the replay did not reach the end of an incomplete recording; empty if it did
         self.comparison = CommandComparison()
@@ -211,11 +218,11 @@ class ControlReplay:
         # Commands.
         self._now_ns = 0
         self._recorded_by_sequence: dict[int, JointCommand] = {}
-        self._command_decoder = Decoder(JointCommand)
-        self._applied_decoder = Decoder(AppliedCommand)
+        self._command_decoder = MessageDecoder(JointCommand)
+        self._applied_decoder = MessageDecoder(AppliedCommand)
 
         # Parameters of the controller.
-        self._parameters_decoder = Decoder(ControlParameters)
+        self._parameters_decoder = MessageDecoder(ControlParameters)
         self._overridden_parameters = {
             override.key.removeprefix(CHOSEN_PREFIXES[0]): override.value
             for override in overrides
@@ -260,9 +267,9 @@ class ControlReplay:
 
     def _publish_description(self) -> None:
         """Publish the configuration and the description, as a host does at its start."""
-        effective = Configuration(config_hash=self.robot.config_hash, content=encode_config(self.config).decode())
-        self._session.declare_latched_publisher(keys.CONFIG, Configuration).put(effective)
-        self._session.declare_latched_publisher(keys.DESCRIPTION, Description).put(self.robot)
+        effective = RunConfiguration(config_hash=self.robot.config_hash, content=encode_config(self.config).decode())
+        self._session.declare_latched_publisher(keys.CONFIG, RunConfiguration).put(effective)
+        self._session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(self.robot)
 
     def _replay_messages(self) -> None:
         """Replay all messages of the recording, in the order of robot time."""
@@ -384,12 +391,12 @@ class ControlReplay:
         )
         return encode(replayed_applied)
 
-    def _store_replayed_command(self, arrival: Arrival) -> None:
+    def _store_replayed_command(self, arrival: ReceivedSample) -> None:
         """Store a command of the replayed controller for the comparison."""
         command = self._command_decoder.decode(arrival.payload, arrival.encoding)
         self.comparison.replayed[command.tick] = command
 
-    def _grant_lease(self, query: Query) -> None:
+    def _grant_lease(self, query: IncomingQuery) -> None:
         """Grant the lease with the next epoch in the recording."""
         now_tick = self._now_ns // self.robot.period_ns
         epoch = next((epoch for tick, epoch in self._epochs if tick >= now_tick), 1)
@@ -397,7 +404,12 @@ class ControlReplay:
 
 
 def replay_and_compare_commands(
-    path: Path, overrides: list[Override], out: Path | None, print_text: PrintLine, *, run_recorded_code: bool = False
+    path: Path,
+    overrides: list[KeyOverride],
+    out: Path | None,
+    print_text: PrintLine,
+    *,
+    run_recorded_code: bool = False,
 ) -> int:
     """Replay a recording through the services, and print how their commands differ from the recorded ones.
 

@@ -18,7 +18,7 @@ import msgspec
 
 from snakesim_hal.base.process import call_on_stop_signals, get_user_name, list_stop_signals
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, find_single_robot
 from snakesim_operator.recording.recorder_process import record_to_file
@@ -117,7 +117,7 @@ def record_demonstrations(selection: RobotSelection, folder: Path, task: str, li
 class _DemonstrationRecorder:
     """Records episodes one after another into a folder, each with its label."""
 
-    def __init__(self, link: Link, folder: Path, task: str, keyboard: _LineReader) -> None:
+    def __init__(self, link: ConnectionSettings, folder: Path, task: str, keyboard: _LineReader) -> None:
         self._link = link
         self._folder = folder
         self._task = task

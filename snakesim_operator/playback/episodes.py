@@ -27,7 +27,7 @@ from snakesim_operator.results.run_reader import find_recording_path
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """A run, or a part of it between two gaps of its recording."""
 
     record: RunRecord
@@ -41,7 +41,7 @@ class Episode:
     pictures_after_tick: int = -1  # images up to this tick were taken before the gap in front of the episode
 
 
-def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> list[Episode]:
+def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> list[RecordedEpisode]:
     """Read the episodes of several runs and folders of demonstrations.
 
     Args:
@@ -56,7 +56,7 @@ def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> li
     Raises:
         ConfigError: A run or its labels cannot be read.
     """
-    episodes: list[Episode] = []
+    episodes: list[RecordedEpisode] = []
     for run in runs:
         labels_path = run / LABELS_FILENAME
         is_demonstrations = labels_path.is_file()
@@ -69,7 +69,7 @@ def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> li
     return episodes
 
 
-def describe_gaps(episodes: Sequence[Episode]) -> list[str]:
+def describe_gaps(episodes: Sequence[RecordedEpisode]) -> list[str]:
     """Return a sentence for each gap that ended an episode."""
     sentences: list[str] = []
     for before, after in pairwise(episodes):
@@ -95,7 +95,7 @@ def read_labels(path: Path) -> list[EpisodeLabel]:
         ) from None
 
 
-def _read_run_episodes(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[Episode]:
+def _read_run_episodes(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[RecordedEpisode]:
     """Read the episodes of one run. A gap in the record ends an episode and begins the next one.
 
     Args:
@@ -122,7 +122,7 @@ def _read_run_episodes(run: Path, task: str | None, success: bool | None, *, ima
     row_groups = record.contiguous_rows
     if not row_groups:  # the robot was never armed
         row_groups = [np.arange(0)]
-    episodes: list[Episode] = []
+    episodes: list[RecordedEpisode] = []
     for number, rows in enumerate(row_groups):
         is_first = number == 0
         is_last = number == len(row_groups) - 1
@@ -132,7 +132,7 @@ def _read_run_episodes(run: Path, task: str | None, success: bool | None, *, ima
         pictures_after_tick = -1
         if not is_first:  # pictures from before the gap do not show this episode
             pictures_after_tick = int(record.ticks[rows[0] - 1])
-        episode = Episode(
+        episode = RecordedEpisode(
             record=record,
             task=task or record.config.name,
             success=episode_success,

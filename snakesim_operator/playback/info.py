@@ -17,8 +17,8 @@ from snakesim_hal.base.arithmetic import find_differing_parts, format_digest
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import ControlParameters, Status
+from snakesim_hal.wire.codec import MessageDecoder
+from snakesim_hal.wire.messages import ControlParameters, RobotStatus
 from snakesim_operator.recording.losses import LossGap
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.missing_data import describe_undecodable_messages, report_missing_data
@@ -84,7 +84,7 @@ def inspect_recording(path: Path) -> RecordingInfo:
     contents = RecordingContents(path)
     by_key: dict[str, KeyInfo] = {}
     parameters_in_force: list[ControlParameters] = []
-    parameters_decoder = Decoder(ControlParameters)
+    parameters_decoder = MessageDecoder(ControlParameters)
     for recorded in reader.read_messages():
         key_info = by_key.setdefault(recorded.key, KeyInfo())
         key_info.time_ns.append(recorded.robot_time_ns)
@@ -160,7 +160,7 @@ def _find_parameter_changes(in_force: Sequence[ControlParameters]) -> list[Param
     return changes
 
 
-def _lifecycle_reason(status: Status) -> str:
+def _lifecycle_reason(status: RobotStatus) -> str:
     """Return the reason of the last lifecycle state.
 
     While disarmed, the status appends what prevents arming; that part is left out.

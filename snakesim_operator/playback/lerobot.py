@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.playback.episodes import Episode
+from snakesim_operator.playback.episodes import RecordedEpisode
 from snakesim_operator.playback.lerobot_statistics import (
     Statistics,
     compute_feature_statistics,
@@ -56,7 +56,7 @@ class DatasetSize:
 
 
 def write_lerobot(
-    episodes: Sequence[Episode], folder: Path, write_table: WriteTable, fps: float | None = None
+    episodes: Sequence[RecordedEpisode], folder: Path, write_table: WriteTable, fps: float | None = None
 ) -> DatasetSize:
     """Write episodes as a dataset in the format of LeRobot.
 
@@ -114,7 +114,7 @@ class _DatasetWriter:
         self.frame_count = 0
 
     def add_episode(
-        self, episode: Episode, rows: NDArray[np.int64], image_indices_by_camera: dict[str, NDArray[np.int64]]
+        self, episode: RecordedEpisode, rows: NDArray[np.int64], image_indices_by_camera: dict[str, NDArray[np.int64]]
     ) -> None:
         """Write the frames of an episode as a file, and add the episode to the metadata.
 
@@ -229,7 +229,7 @@ class _DatasetContent:
     size_by_camera: dict[str, tuple[int, int]]  # width and height
 
     @staticmethod
-    def from_episodes(episodes: Sequence[Episode]) -> "_DatasetContent":
+    def from_episodes(episodes: Sequence[RecordedEpisode]) -> "_DatasetContent":
         """Determine the features that are known in every episode."""
         cameras = _find_camera_sizes(episodes[0])
         for episode in episodes[1:]:
@@ -242,7 +242,7 @@ class _DatasetContent:
         )
 
 
-def _find_camera_sizes(episode: Episode) -> set[tuple[str, tuple[int, int]]]:
+def _find_camera_sizes(episode: RecordedEpisode) -> set[tuple[str, tuple[int, int]]]:
     """Find the name, width and height of each camera with images in an episode."""
     sizes: set[tuple[str, tuple[int, int]]] = set()
     for name, pictures in episode.pictures.items():
@@ -265,7 +265,7 @@ def _compute_ticks_per_frame(robot_hz: int, fps: float | None) -> int:
 
 
 def _select_frame_rows(
-    episode: Episode, content: _DatasetContent, ticks_per_frame: int
+    episode: RecordedEpisode, content: _DatasetContent, ticks_per_frame: int
 ) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
     """Select the rows of an episode that become frames, and the newest image of each camera at each frame.
 
@@ -316,7 +316,7 @@ def _find_common_rate_hz(records: Sequence[RunRecord]) -> int:
     return round(rate_hz)
 
 
-def _make_dataset_info(episode: Episode, content: _DatasetContent, fps: int) -> dict[str, Any]:
+def _make_dataset_info(episode: RecordedEpisode, content: _DatasetContent, fps: int) -> dict[str, Any]:
     """Make the content of `meta/info.json` in a LeRobot dataset, without the totals.
 
     Args:
@@ -368,7 +368,7 @@ def _list_feature_names(record: RunRecord, *, has_pose: bool) -> dict[str, list[
     }
 
 
-def _make_frames(episode: Episode, content: _DatasetContent, rows: NDArray[np.int64]) -> Frames:
+def _make_frames(episode: RecordedEpisode, content: _DatasetContent, rows: NDArray[np.int64]) -> Frames:
     """Make the values of the features of an episode, (n, width) or (n,), except indices and images."""
     record = episode.record
     state = [record.angle_rad, record.velocity_rad_s, record.torque_nm]

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_operator.base.png import encode_png
 from snakesim_operator.recording.reader import RecordingReader
 
-_DECODERS = {"depth": Decoder(DepthImage), "color": Decoder(ColorImage)}
+_DECODERS = {"depth": MessageDecoder(DepthImage), "color": MessageDecoder(ColorImage)}
 Rgb = NDArray[np.uint8]
 
 

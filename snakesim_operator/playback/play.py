@@ -12,7 +12,7 @@ from typing import Any
 
 from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, format_encoding
@@ -76,13 +76,13 @@ def play_recording(
     robot = read_recording(path, (keys.DESCRIPTION,)).description
     default_namespace = robot.robot if robot is not None else "recording"
     namespace = namespace or default_namespace
-    link = Link(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, max_bytes=MAX_IMAGE_BYTES)
+    link = ConnectionSettings(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, max_bytes=MAX_IMAGE_BYTES)
     reader = RecordingReader(path)
     messages = iterate_in_robot_time_order(reader)
     with open_session(link) as session:
         playback_mode = "Enter plays a tick" if step else f"{rate:g} x real time"
         print_text(f"playing {path} on {link.endpoint}, namespace {namespace}: {playback_mode}; Ctrl-C ends it")
-        player = _Player(session)
+        player = _MessagePlayer(session)
         playback_clock = _PlaybackClock(rate)
         for time_ns, simultaneous in groupby(messages, lambda recorded: recorded.robot_time_ns):
             if step:
@@ -115,7 +115,7 @@ class _PlaybackClock:
             self._origin = (time.monotonic(), time_ns)
 
 
-class _Player:
+class _MessagePlayer:
     """Publishes recorded messages, with one publisher for each key."""
 
     def __init__(self, session: Session) -> None:

@@ -10,7 +10,7 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointState_pb2 import JointState as NamedJoint
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 
-from snakesim_hal.wire.messages import Description, JointState
+from snakesim_hal.wire.messages import JointState, RobotDescription
 from snakesim_operator.recording import shapes
 
 BasePose = tuple[Sequence[float], Sequence[float]]  # position (3,) in m and orientation wxyz (4,)
@@ -67,7 +67,7 @@ class _JointStatesTemplate:
 class BodyMessageEncoder:
     """Encodes the link transforms and joint states of one robot for Foxglove."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         """Preallocate the FrameTransforms and JointStates messages of one robot.
 
         The methods fill them with the values of each sample of the joint angles.

@@ -27,20 +27,20 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import (
     ColorImage,
-    Configuration,
     Contacts,
     DepthImage,
-    Description,
     JointState,
     Pose,
+    RobotDescription,
+    RunConfiguration,
     Trajectory,
-    World,
     WorldContact,
+    WorldModel,
 )
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyMessageEncoder
 from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_name_part, make_topic
-from snakesim_operator.recording.state_messages import ContactForces, StateMessages
+from snakesim_operator.recording.state_messages import ContactForcesMessage, StateMessages
 
 # Periods at which messages for viewers are made, in robot time.
 MOTION_PERIOD_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
@@ -78,7 +78,7 @@ class FoxgloveConverter:
 
         # What the robot has published.
         self._newest_by_key: dict[str, tuple[bytes, int]] = {}  # by key: payload, and its robot time in ns
-        self._robot: Description | None = None
+        self._robot: RobotDescription | None = None
         self._body_encoder: BodyMessageEncoder | None = None
         self._custom_message_by_key: dict[str, CustomMessage] = {}  # messages of the robot's custom sensors, by key
         self._true_obstacles = shapes.draw_obstacles([], "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
@@ -132,7 +132,7 @@ class FoxgloveConverter:
 
     def _set_robot(self, payload: bytes) -> None:
         with suppress(SnakesimError, *UNDECODABLE):
-            robot: Description = _get_decoder(Description).decode(payload)
+            robot: RobotDescription = _get_decoder(RobotDescription).decode(payload)
             if len(robot.links) == len(robot.joints) + 1:
                 frames = BodyMessageEncoder(robot)
                 custom_types = find_custom_messages(robot)
@@ -143,7 +143,7 @@ class FoxgloveConverter:
     def _set_true_obstacles(self, payload: bytes) -> None:
         """Compute the obstacles of the run from its configuration, placed as the simulator places them."""
         with suppress(SnakesimError, *UNDECODABLE):
-            content = _get_decoder(Configuration).decode(payload).content
+            content = _get_decoder(RunConfiguration).decode(payload).content
             config = msgspec.json.decode(content, type=RunConfig)
             placed = place_scene_obstacles(config.scene, make_start_capsules(config))  # checked when the run began
             obstacles = [body.obstacle for body in placed]
@@ -201,7 +201,7 @@ class FoxgloveConverter:
         contacts: Contacts | None = _decode(Contacts, payload)
         if self._robot is None or contacts is None:
             return []
-        forces = ContactForces.sum_contacts(contacts, len(self._robot.links))
+        forces = ContactForcesMessage.sum_contacts(contacts, len(self._robot.links))
         return [self._encode_json("contact_forces", forces)]
 
     def _make_state_messages(self, time_ns: int, *, with_reference: bool = False) -> list[FoxgloveMessage]:
@@ -322,7 +322,7 @@ class FoxgloveConverter:
         messages += self._make_due_scene_messages(robot, time_ns)
         return messages
 
-    def _make_due_scene_messages(self, robot: Description, time_ns: int) -> list[FoxgloveMessage]:
+    def _make_due_scene_messages(self, robot: RobotDescription, time_ns: int) -> list[FoxgloveMessage]:
         """Make the drawings that seldom change: body, obstacles, map and path, each if it is due."""
         messages: list[FoxgloveMessage] = []
         if self._check_due_and_reschedule("body", time_ns, SCENE_PERIOD_NS):
@@ -330,7 +330,7 @@ class FoxgloveConverter:
             messages.append(self._encode_scene("body", links))
             self._true_obstacles.timestamp.CopyFrom(shapes.make_timestamp(time_ns))
             messages.append(self._encode_scene("obstacles", [self._true_obstacles]))
-        world: World | None = self._decode_if_scene_due(keys.WORLD, World, time_ns)
+        world: WorldModel | None = self._decode_if_scene_due(keys.WORLD, WorldModel, time_ns)
         if world is not None:
             obstacles = shapes.draw_obstacles(world.obstacles, "map", shapes.MAP_COLOR, time_ns)
             messages.append(self._encode_scene("map", [obstacles]))

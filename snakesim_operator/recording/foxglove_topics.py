@@ -21,17 +21,17 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message as Protobuf
 
 from snakesim_hal.wire.messages import CustomSample
-from snakesim_operator.recording.state_messages import ContactForces, State
+from snakesim_operator.recording.state_messages import ContactForcesMessage, RobotStateMessage
 
-JsonMessage = State | ContactForces | CustomSample
-MessageType = type[Protobuf] | type[State] | type[ContactForces] | type[CustomSample]
+JsonMessage = RobotStateMessage | ContactForcesMessage | CustomSample
+MessageType = type[Protobuf] | type[RobotStateMessage] | type[ContactForcesMessage] | type[CustomSample]
 
 COMMON_TOPICS: dict[str, MessageType] = {  # below the robot's name; every robot may have them, unlike cameras
     "tf": FrameTransforms,
     "joint_states": JointStates,
     "joint_references": JointStates,
-    "contact_forces": ContactForces,
-    "state": State,
+    "contact_forces": ContactForcesMessage,
+    "state": RobotStateMessage,
     "log": Log,
     "pose": PoseInFrame,
     "scene/body": SceneUpdate,
@@ -78,7 +78,7 @@ def make_topic(robot: str, name: str) -> str:
 @cache
 def make_schema(message_type: MessageType) -> FoxgloveSchema:
     """Return the schema of a message type as MCAP requires it."""
-    if issubclass(message_type, State | ContactForces | CustomSample):
+    if issubclass(message_type, RobotStateMessage | ContactForcesMessage | CustomSample):
         return _make_json_schema(message_type)
     return _make_protobuf_schema(message_type)
 

@@ -21,7 +21,7 @@ class LossGap:
 
 
 @dataclass
-class Losses:
+class RecordingLosses:
     """Everything that one file has lost."""
 
     gaps: list[LossGap] = field(default_factory=list[LossGap])

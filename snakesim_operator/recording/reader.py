@@ -18,7 +18,7 @@ from mcap.writer import MCAP0_MAGIC
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.keys import find_row_key
 from snakesim_operator.recording.chunks import CorruptFileError, parse_chunk, parse_record, unpack_chunk
-from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, Losses
+from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, RecordingLosses
 from snakesim_operator.recording.mcap_file import SNAKESIM_PROFILE
 from snakesim_operator.recording.mcap_records import (
     OPCODES_TO_READ,
@@ -61,7 +61,7 @@ class RecordingReader:
 
     path: Path
     is_complete: bool = False  # else its recorder was killed, the disk was full, or the file was cut
-    losses: Losses = field(default_factory=Losses)
+    losses: RecordingLosses = field(default_factory=RecordingLosses)
     metadata: dict[str, Any] = field(default_factory=dict[str, Any])
 
     # What has been read.

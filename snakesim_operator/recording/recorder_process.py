@@ -3,7 +3,8 @@
 `python -m snakesim_operator.recording.recorder_process` is the child of `snakesim run`. `snakesim record` calls
 `record_to_file`.
 
-Data flow: Zenoh's threads -> `Tap` (bounded queue) -> `Recorder`, in the main thread -> `RecordingWriter` (one file).
+Data flow: Zenoh's threads -> `Tap` (bounded queue) -> `RobotRecorder`, in the main thread ->
+`RecordingWriter` (one file).
 """
 
 import argparse
@@ -25,15 +26,15 @@ from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import make_own_entry, publish_process_entry
 from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
-from snakesim_hal.network.session import Link, Session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.session import ConnectionSettings, Session
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, add_scenario_arguments
 from snakesim_hal.programs.service_program import ProcessOptions, read_process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.recording.message import RAW_ONLY_HELP, RECORDING_FILENAME
 from snakesim_operator.recording.shown_messages import OnViewerMessage
@@ -49,7 +50,7 @@ MAX_HOSTS = 100  # files: one for each host that a robot had
 EXIT_DISK_FULL = 4
 
 
-class Recorder:
+class RobotRecorder:
     """Writes a robot's messages into a file, and starts a new file when the robot gets a new host."""
 
     def __init__(
@@ -78,13 +79,15 @@ class Recorder:
         self.writer = RecordingWriter(path, viewer_robot_name, on_viewer_message, log_time_clock)
 
         # A new host publishes its description, and robot time starts over, in either order.
-        self._latched_arrivals: dict[str, Arrival] = {}  # newest messages that each file begins with, by key
+        self._latched_arrivals: dict[str, ReceivedSample] = {}  # newest messages that each file begins with, by key
         self._host_id: str | None = None
         self._host_count = 1
         self._awaits_new_host_clock = False  # a new host has described itself, and its file is not started yet
-        self._restarted_clock: Arrival | None = None  # newest clock since robot time went back, until a file starts
+        self._restarted_clock: ReceivedSample | None = (
+            None  # newest clock since robot time went back, until a file starts
+        )
 
-    def write_arrival(self, arrival: Arrival) -> None:
+    def write_arrival(self, arrival: ReceivedSample) -> None:
         """Write one message. Once the description and the first clock of a new host have come, start a new file."""
         if arrival.key in (keys.DESCRIPTION, keys.CONFIG, keys.STATUS):
             self._latched_arrivals[arrival.key] = arrival
@@ -121,13 +124,13 @@ class Recorder:
         A description whose origin cannot be verified is ignored.
         """
         with contextlib.suppress(*UNDECODABLE):
-            robot = msgspec.msgpack.decode(payload, type=Description)
+            robot = msgspec.msgpack.decode(payload, type=RobotDescription)
             if has_valid_proof(robot, read_own_run_key()):
                 if self._host_id is not None and robot.host != self._host_id:
                     self._awaits_new_host_clock = True
                 self._host_id = robot.host
 
-    def _start_next_file(self, clock: Arrival) -> None:
+    def _start_next_file(self, clock: ReceivedSample) -> None:
         """Complete the current file under another name, and start a new file after a change of the host.
 
         The new file begins with the latched messages and the clock. Beyond MAX_HOSTS files, nothing changes.
@@ -156,7 +159,7 @@ class Recorder:
 
 
 def record_to_file(
-    link: Link,
+    link: ConnectionSettings,
     path: Path,
     should_continue: Callable[[], bool],
     on_viewer_message: OnViewerMessage | None = None,
@@ -164,7 +167,7 @@ def record_to_file(
     raw_only: bool = False,
     wait_for_host_exit: bool = False,
     log_time_clock: LogTimeClock = "robot",
-) -> Recorder:
+) -> RobotRecorder:
     """Record a robot until the caller ends it or the disk is full.
 
     Args:
@@ -197,7 +200,9 @@ def record_to_file(
 
 
 @contextlib.contextmanager
-def _connect_when_ready(link: Link, should_continue: Callable[[], bool] = lambda: True) -> Iterator[Session]:
+def _connect_when_ready(
+    link: ConnectionSettings, should_continue: Callable[[], bool] = lambda: True
+) -> Iterator[Session]:
     """Connect as soon as the robot's network can be reached, and yield the session.
 
     Args:
@@ -230,7 +235,7 @@ def _connect_when_ready(link: Link, should_continue: Callable[[], bool] = lambda
 
 def _record_until_stopped(
     session: Session,
-    link: Link,
+    link: ConnectionSettings,
     path: Path,
     should_continue: Callable[[], bool],
     on_viewer_message: OnViewerMessage | None = None,
@@ -238,7 +243,7 @@ def _record_until_stopped(
     raw_only: bool,
     wait_for_host_exit: bool,
     log_time_clock: LogTimeClock = "robot",
-) -> Recorder:
+) -> RobotRecorder:
     """Record the messages of a robot over a session that is open, until the caller ends it or the disk is full.
 
     Args:
@@ -261,7 +266,7 @@ def _record_until_stopped(
     if not raw_only:
         viewer_robot_name = link.namespace or "robot"
     try:
-        recorder = Recorder(path, viewer_robot_name, on_viewer_message, log_time_clock)
+        recorder = RobotRecorder(path, viewer_robot_name, on_viewer_message, log_time_clock)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file", code="file/not-writable") from error
     tap = MessageTap(session)
@@ -296,7 +301,7 @@ def _track_present_hosts(session: Session) -> set[str]:
     return hosts
 
 
-def _write_last_messages(tap: MessageTap, recorder: Recorder, present_hosts: set[str]) -> None:
+def _write_last_messages(tap: MessageTap, recorder: RobotRecorder, present_hosts: set[str]) -> None:
     """Write the last messages of a run, until the host has left and no message is on its way.
 
     In a run the recorder ends last, so messages of the other processes may still be queued in the network.
@@ -317,7 +322,7 @@ def _write_last_messages(tap: MessageTap, recorder: Recorder, present_hosts: set
         time.sleep(CYCLE_S)
 
 
-def _write_arrivals(tap: MessageTap, recorder: Recorder) -> int:
+def _write_arrivals(tap: MessageTap, recorder: RobotRecorder) -> int:
     """Write the messages that have arrived since the last call, and return their number.
 
     In lockstep, as the newest clock states it, the tap is made lossless until it has dropped a message.

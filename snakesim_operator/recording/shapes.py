@@ -24,7 +24,14 @@ from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, LinkDescription, Obstacle, WorldContact
+from snakesim_hal.wire.messages import (
+    ColorImage,
+    DepthImage,
+    KnownObstacle,
+    LinkDescription,
+    RobotDescription,
+    WorldContact,
+)
 
 WORLD_FRAME = "world"
 
@@ -94,7 +101,7 @@ def compute_optical_orientation(camera_wxyz: Sequence[float]) -> tuple[float, fl
     )
 
 
-def draw_body(robot: Description, time_ns: int) -> list[SceneEntity]:
+def draw_body(robot: RobotDescription, time_ns: int) -> list[SceneEntity]:
     """Return one scene entity for each link: a capsule in the frame of the link."""
     return [_draw_link(link, time_ns) for link in robot.links]
 
@@ -115,7 +122,7 @@ def _draw_link(link: LinkDescription, time_ns: int) -> SceneEntity:
     )
 
 
-def draw_obstacles(obstacles: Iterable[Obstacle], name: str, color: Color, time_ns: int) -> SceneEntity:
+def draw_obstacles(obstacles: Iterable[KnownObstacle], name: str, color: Color, time_ns: int) -> SceneEntity:
     """Return obstacles as one entity of a Foxglove scene, in the world frame.
 
     Args:

@@ -17,7 +17,7 @@ OptionalNumber = float | msgspec.UnsetType
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
 
-class State(msgspec.Struct, frozen=True, kw_only=True):
+class RobotStateMessage(msgspec.Struct, frozen=True, kw_only=True):
     """The message on `/ROBOT/state`. Unknown texts are empty, unknown numbers are left out."""
 
     lifecycle: str
@@ -35,7 +35,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     custom: dict[str, float] = {}
 
 
-class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
+class ContactForcesMessage(msgspec.Struct, frozen=True, kw_only=True):
     """The message on `/ROBOT/contact_forces`: the force on each link in the link's frame, summed over its contacts.
 
     The links are in the order from tail to head.
@@ -95,7 +95,7 @@ _control_decoder = msgspec.msgpack.Decoder(_ControlFields)
 class StateUpdate(NamedTuple):
     """What is shown of the newest state of host and controller."""
 
-    state: State
+    state: RobotStateMessage
     new_logs: list[Log]  # the state in words, as far as it differs from what was logged
     reference_rad: Sequence[float]  # (n_joints,) angles that the controller wants; empty if unknown
 
@@ -119,7 +119,7 @@ class StateMessages:
         """
         host_state = _decode_status(status_payload)
         control_state = _decode_control(control_payload)
-        state = State(
+        state = RobotStateMessage(
             # Reported by the host.
             lifecycle=host_state.lifecycle,
             lifecycle_reason=host_state.reason,
@@ -139,7 +139,7 @@ class StateMessages:
         logs = self._make_logs(state, time_ns)
         return StateUpdate(state, logs, control_state.reference_rad)
 
-    def _make_logs(self, state: State, time_ns: int) -> list[Log]:
+    def _make_logs(self, state: RobotStateMessage, time_ns: int) -> list[Log]:
         """Return log entries for viewers: one for the host and one for the controller, if its state has changed.
 
         Args:

@@ -13,7 +13,7 @@ import time
 from collections import Counter, deque
 
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 
 MAX_QUEUED_BYTES = 64 * 1024 * 1024
@@ -34,7 +34,7 @@ class MessageTap:
         """
         self.is_lossless = False  # whether the network waits for room; set in lockstep
         self.dropped_count_by_key: Counter[str] = Counter()  # by key
-        self._queue: deque[Arrival] = deque()
+        self._queue: deque[ReceivedSample] = deque()
         self._queued_bytes = 0
         self._next_rest_ns = 0
         self._lock = threading.Lock()
@@ -45,7 +45,7 @@ class MessageTap:
                 # Urgent: otherwise each key had a thread, which would wake with every message.
                 session.on_urgent_arrival(row.key, self._queue_or_drop)
 
-    def take_arrivals(self) -> list[Arrival]:
+    def take_arrivals(self) -> list[ReceivedSample]:
         """Return the messages that have arrived since the last call, in order, and remove them from the queue."""
         with self._lock:
             arrivals = list(self._queue)
@@ -53,7 +53,7 @@ class MessageTap:
             self._queued_bytes = 0
         return arrivals
 
-    def _queue_or_drop(self, arrival: Arrival) -> None:
+    def _queue_or_drop(self, arrival: ReceivedSample) -> None:
         """Queue a message, or drop and count it if the queue is full. This runs in Zenoh's threads."""
         if self.is_lossless and arrival.monotonic_ns > self._next_rest_ns:
             time.sleep(REST_DURATION_S)

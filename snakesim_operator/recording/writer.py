@@ -15,11 +15,11 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.model.files import SCHEMAS_DIR
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.mcap_file import McapFileWriter
 from snakesim_operator.recording.robot_time import MessageClock
@@ -72,7 +72,9 @@ class RecordingWriter:
         # The robot's messages.
         self.counts: Counter[str] = Counter()  # messages written, by key
         self._custom_message_by_key: dict[str, CustomMessage] = {}
-        self._early_custom_samples: list[Arrival] | None = []  # of custom sensors; None once the description is known
+        self._early_custom_samples: (
+            list[ReceivedSample] | None
+        ) = []  # of custom sensors; None once the description is known
 
         # Messages made for viewers.
         self._viewer_messages: ViewerMessageWriter | None = None
@@ -83,7 +85,7 @@ class RecordingWriter:
 
         self.flush()
 
-    def write_arrival(self, arrival: Arrival) -> None:
+    def write_arrival(self, arrival: ReceivedSample) -> None:
         """Write one message of the robot, unless its key is not in the key space.
 
         A custom sensor's sample that comes before the robot's description is kept until the description arrives,
@@ -140,12 +142,12 @@ class RecordingWriter:
         for arrival in early:
             self._write_message(arrival)
 
-    def _write_message(self, arrival: Arrival) -> None:
+    def _write_message(self, arrival: ReceivedSample) -> None:
         """Write one message, and the messages for viewers that are made from it."""
         if arrival.key == keys.DESCRIPTION:
             with suppress(*UNDECODABLE):
                 self._custom_message_by_key = find_custom_messages(
-                    msgspec.msgpack.decode(arrival.payload, type=Description)
+                    msgspec.msgpack.decode(arrival.payload, type=RobotDescription)
                 )
         channel_id = self._channel_id_by_key.get(arrival.key)
         if channel_id is None:
@@ -160,7 +162,7 @@ class RecordingWriter:
         if self._viewer_messages is not None:
             self._viewer_messages.write(arrival.key, arrival.payload, log_time_ns, publish_time_ns)
 
-    def _open_channel(self, arrival: Arrival) -> int | None:
+    def _open_channel(self, arrival: ReceivedSample) -> int | None:
         """Add a channel for the key of a message, with its schema, to the file.
 
         Returns:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.run_log.host_record import HostRecord
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 EXIT_INCOMPLETE = 3
 """Exit code of a command that succeeded, but whose record is incomplete."""
@@ -44,7 +44,7 @@ def report_missing_data(path: Path, missing: Sequence[str], code: int = 0) -> in
 
 
 def replace_invalid_numbers(
-    columns: dict[str, NDArray[Any]], robot: Description, *, has_pose: bool
+    columns: dict[str, NDArray[Any]], robot: RobotDescription, *, has_pose: bool
 ) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """Replace invalid numbers by NaN, and describe them. An invalid time is replaced by the time of its tick.
 
@@ -98,7 +98,7 @@ def _mask_invalid_numbers(values: NDArray[Any]) -> NDArray[np.bool_]:
     return ~(np.abs(values) < MAX_MAGNITUDE)
 
 
-def _describe_counts_by_joint(is_invalid: NDArray[np.bool_], robot: Description) -> str:
+def _describe_counts_by_joint(is_invalid: NDArray[np.bool_], robot: RobotDescription) -> str:
     """Return the name and the count of invalid numbers of each joint that has any, such as `joint_1 3, joint_2 1`."""
     counts = is_invalid.sum(axis=0).tolist()
     parts: list[str] = []

@@ -19,19 +19,19 @@ from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.run_log.black_box import compute_digest, summarize_contacts
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
-    Configuration,
     Contacts,
     ControlState,
-    Description,
     JointState,
-    Status,
+    RobotDescription,
+    RobotStatus,
+    RunConfiguration,
     Trajectory,
-    World,
+    WorldModel,
 )
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.results.contact_log import ContactCollector, ContactLog
@@ -54,7 +54,7 @@ _SETPOINT_COLUMNS = ("target", "torque_limit_nm")  # of the messages at keys.APP
 RUN_KEYS: tuple[str, ...] = (*OUTPUT_KEYS, *_TICK_KEYS, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
 
 
-_decoder: Callable[[type[Any]], Decoder[Any]] = cache(Decoder)
+_decoder: Callable[[type[Any]], MessageDecoder[Any]] = cache(MessageDecoder)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class RunOutputs:
     """What services and custom sensors published in a run, and what of it is missing."""
 
     control: list[ControlState] = field(default_factory=list[ControlState])  # in time order
-    worlds: list[World] = field(default_factory=list[World])  # in time order, at most MAX_WORLDS_PER_S
+    worlds: list[WorldModel] = field(default_factory=list[WorldModel])  # in time order, at most MAX_WORLDS_PER_S
     trajectories: list[Trajectory] = field(default_factory=list[Trajectory])  # in time order, one for each path
     searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # by tick of a cycle of navigation
     custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns that sensors and controllers define
@@ -79,9 +79,9 @@ class RecordingContents:
     path: Path
 
     # The last message of each kind.
-    description: Description | None = None
-    config: Configuration | None = None
-    status: Status | None = None
+    description: RobotDescription | None = None
+    config: RunConfiguration | None = None
+    status: RobotStatus | None = None
 
     # Messages of the run.
     streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_OUTPUT_KEYS})
@@ -132,18 +132,18 @@ class RecordingContents:
             wall_ns: Wall clock at which the message was recorded.
         """
         match message:
-            case Description():
+            case RobotDescription():
                 self.description = message
-            case Configuration():
+            case RunConfiguration():
                 self.config = message
-            case Status():
+            case RobotStatus():
                 self.status = message
             case Clock(paused=True):
                 pass  # a paused clock belongs to no tick
             case Trajectory():
                 self.searched_nodes[message.tick] = message.searched_nodes
                 self._add_to_stream(key, message)
-            case World() | ControlState():
+            case WorldModel() | ControlState():
                 self._add_to_stream(key, message)
             case Clock():
                 self.messages_by_tick[key][message.tick] = message
@@ -181,7 +181,7 @@ class RecordingContents:
             last = f"the last that came is of {self.last_applied_time_ns * 1e-9:.2f} s"
         return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
 
-    def collect_outputs(self, robot: Description, time_s: Floats, unreached: Sequence[str] = ()) -> RunOutputs:
+    def collect_outputs(self, robot: RobotDescription, time_s: Floats, unreached: Sequence[str] = ()) -> RunOutputs:
         """Collect what guidance, navigation, control and custom sensors published in the run.
 
         Args:
@@ -212,7 +212,7 @@ class RecordingContents:
             unreached=list(unreached),
         )
 
-    def make_tick_columns(self, robot: Description) -> dict[str, NDArray[Any]]:
+    def make_tick_columns(self, robot: RobotDescription) -> dict[str, NDArray[Any]]:
         """Make columns with a row for each tick since the first arming, with the names of the black box."""
         rows = self._build_tick_rows(len(robot.joints))
         row_count = len(rows)
@@ -270,7 +270,9 @@ class RecordingContents:
                 )
         return rows
 
-    def make_custom_columns(self, robot: Description, time_s: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def make_custom_columns(
+        self, robot: RobotDescription, time_s: NDArray[np.float64]
+    ) -> dict[str, NDArray[np.float64]]:
         """Make columns of the custom sensors, with the newest sample and its age in each row.
 
         Samples that cannot be decoded are counted.
@@ -307,7 +309,7 @@ class RecordingContents:
 
     def _decode_custom_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
         """Decode the samples of a custom sensor: timestamp in ns and values by name, for each tick."""
-        decoder = Decoder(kind.message)
+        decoder = MessageDecoder(kind.message)
         samples: dict[int, tuple[int, dict[str, float]]] = {}
         for recorded in self.custom.get(key, ()):
             try:
@@ -467,7 +469,7 @@ def _count_lost_ticks(reader: "RecordingReader") -> int | None:
 def _should_store(last_stored: Any, message: Any) -> bool:
     """Return whether a message is stored: world models up to MAX_WORLDS_PER_S, and each path once."""
     match message:
-        case World():
+        case WorldModel():
             return message.timestamp_ns >= last_stored.timestamp_ns + round(1e9 / MAX_WORLDS_PER_S)
         case Trajectory():
             return message.path_id != last_stored.path_id

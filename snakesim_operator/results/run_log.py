@@ -18,7 +18,7 @@ from snakesim_hal.model.scene import make_route
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
+from snakesim_hal.wire.messages import ControlState, RobotDescription, Trajectory, WorldModel
 from snakesim_operator.results.contact_log import ContactCollector, ContactLog
 from snakesim_operator.results.missing_data import describe_unwritten_data, replace_invalid_numbers
 from snakesim_operator.results.run_ending import COMPLETE
@@ -34,12 +34,12 @@ class RunRecord:
     # What was run.
     path: Path  # the run's folder, or the recording
     config: RunConfig
-    description: Description
+    description: RobotDescription
     host: HostRecord
 
     # What the services published.
     control_states: list[ControlState]  # in time order, a few a second and at every change
-    worlds: list[World]  # in time order, a few a second
+    worlds: list[WorldModel]  # in time order, a few a second
     trajectories: list[Trajectory]  # in time order, one for each path
 
     # The ticks. NaN is unknown.
@@ -47,7 +47,7 @@ class RunRecord:
     angle_rad: Floats  # (n, joints)
     velocity_rad_s: Floats  # (n, joints)
     torque_nm: Floats  # (n, joints)
-    mode: NDArray[np.int8]  # (n, joints), values of messages.Mode
+    mode: NDArray[np.int8]  # (n, joints), values of messages.JointMode
     target: Floats  # (n, joints), in the unit of the mode
     torque_limit_nm: Floats  # (n, joints)
     position_w_m: Floats  # (n, 3) of the base

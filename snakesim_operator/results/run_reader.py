@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig, read_config
-from snakesim_hal.run_log.black_box import Layout, compute_digest, read_black_box
+from snakesim_hal.run_log.black_box import RowLayout, compute_digest, read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import Configuration, Description
+from snakesim_hal.wire.messages import RobotDescription, RunConfiguration
 from snakesim_operator.recording.message import RECORDING_FILENAME, RecordedMessage
 from snakesim_operator.results.recording_contents import OUTPUT_KEYS, RecordingContents, RunOutputs, read_recording
 from snakesim_operator.results.run_ending import COMPLETE, describe_early_end, describe_recorded_end
@@ -54,7 +54,7 @@ class RunReader(Protocol):
         """Return the effective configuration of the run."""
         ...
 
-    def read_description(self) -> Description:
+    def read_description(self) -> RobotDescription:
         """Return the robot's description."""
         ...
 
@@ -137,7 +137,7 @@ class RunFolderReader(RunReader):
     def read_config(self) -> RunConfig:
         return self._config
 
-    def read_description(self) -> Description:
+    def read_description(self) -> RobotDescription:
         return self._description
 
     def read_host_record(self) -> HostRecord:
@@ -164,13 +164,13 @@ class RunFolderReader(RunReader):
         return read_config(self.path / CONFIG_FILENAME)
 
     @cached_property
-    def _description(self) -> Description:
-        return msgspec.json.decode((self.path / DESCRIPTION).read_bytes(), type=Description)
+    def _description(self) -> RobotDescription:
+        return msgspec.json.decode((self.path / DESCRIPTION).read_bytes(), type=RobotDescription)
 
     @cached_property
     def _ticks(self) -> Columns:
         layout, columns = read_black_box(self.path / BLACK_BOX)
-        if layout != Layout.for_robot(self._description):
+        if layout != RowLayout.for_robot(self._description):
             raise ConfigError(
                 f"{self.path / BLACK_BOX} is of another robot than {DESCRIPTION} beside it",
                 code="recording/not-comparable",
@@ -202,7 +202,7 @@ class RecordingOnlyReader(RunReader):
     def read_config(self) -> RunConfig:
         return self._config
 
-    def read_description(self) -> Description:
+    def read_description(self) -> RobotDescription:
         return self._description
 
     def read_host_record(self) -> HostRecord:
@@ -226,7 +226,7 @@ class RecordingOnlyReader(RunReader):
         return read_recording(self.path, on_message=self._on_message)
 
     @cached_property
-    def _description_and_config(self) -> tuple[Description, Configuration]:
+    def _description_and_config(self) -> tuple[RobotDescription, RunConfiguration]:
         description = self._contents.description
         config = self._contents.config
         if description is None or config is None:
@@ -237,7 +237,7 @@ class RecordingOnlyReader(RunReader):
         return description, config
 
     @cached_property
-    def _description(self) -> Description:
+    def _description(self) -> RobotDescription:
         description, _ = self._description_and_config
         return description
 

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from snakesim_hal.base.arithmetic import find_differing_parts
 from snakesim_hal.model.locomotion import STANDING_STILL
-from snakesim_hal.wire.messages import ClockMode, ControlState, Fault, Mode, Timing
+from snakesim_hal.wire.messages import ClockMode, ControlState, Fault, JointMode, TimingStatistics
 from snakesim_operator.results.metrics.advance import (
     ForwardProgress,
     compute_center_of_mass_w,
@@ -17,9 +17,9 @@ from snakesim_operator.results.metrics.advance import (
     compute_energy_j_per_m,
     compute_work_j,
 )
-from snakesim_operator.results.metrics.directions import Displacement, HeadingEffort
-from snakesim_operator.results.metrics.effort import Effort
-from snakesim_operator.results.metrics.estimates import Estimates
+from snakesim_operator.results.metrics.directions import DisplacementMetrics, HeadingEffort
+from snakesim_operator.results.metrics.effort import EffortMetrics
+from snakesim_operator.results.metrics.estimates import EstimateMetrics
 from snakesim_operator.results.metrics.force_tracking import measure_force_tracking
 from snakesim_operator.results.metrics.motion import StopIntervals, find_stops
 from snakesim_operator.results.metrics.propulsion import count_hand_overs, find_propulsion_periods
@@ -32,7 +32,7 @@ def _make_quantity_meta(unit: str, description: str) -> Meta:
     return Meta(description=description, extra_json_schema={"unit": unit})
 
 
-class Restart(msgspec.Struct, frozen=True, kw_only=True):
+class ProcessRestart(msgspec.Struct, frozen=True, kw_only=True):
     """A process that ended and was restarted."""
 
     name: str
@@ -228,7 +228,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         dict[str, float | None], _make_quantity_meta("µs", "state published to command received")
     ]
     tick_times: Annotated[
-        dict[str, Timing],
+        dict[str, TimingStatistics],
         Meta(description="while armed: cycle, late (begin after the deadline), read and write (calls of the backend)"),
     ] = {}
     too_slow: Annotated[
@@ -240,7 +240,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     faults_left_out: Annotated[int, Meta(description="of `faults`, between the first and the newest")] = 0
     isolated: Annotated[list[str], Meta(description="joints that were isolated at the end")] = []
     hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
-    restarts: Annotated[list[Restart], Meta(description="processes that ended and were restarted")] = []
+    restarts: Annotated[list[ProcessRestart], Meta(description="processes that ended and were restarted")] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
     missing: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
     own_arithmetic: Annotated[
@@ -257,14 +257,14 @@ def get_distance_m(summary: RunSummary) -> float | None:
     return summary.net_displacement_m
 
 
-def get_estimates(summary: RunSummary) -> Estimates:
+def get_estimates(summary: RunSummary) -> EstimateMetrics:
     """Return the estimates of guidance that the summary of a run contains."""
-    return Estimates(
+    return EstimateMetrics(
         summary.pose_from, summary.contacts_from, summary.dead_reckoned_distance_m, summary.dead_reckoning_error_m
     )
 
 
-def summarize_run(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), hosts: int = 1) -> RunSummary:
+def summarize_run(record: RunRecord, ended: str, restarts: Sequence[ProcessRestart] = (), hosts: int = 1) -> RunSummary:
     """Compute all metrics of a run from its record.
 
     Args:
@@ -307,21 +307,21 @@ def summarize_run(record: RunRecord, ended: str, restarts: Sequence[Restart] = (
         # Motion.
         path_distance_m=path_distance_m,
         net_displacement_m=net_displacement_m,
-        **vars(Estimates.from_run(record)),
+        **vars(EstimateMetrics.from_run(record)),
         mean_speed_m_s=distance_m / pose_known_duration_s if distance_m is not None else None,
         locomoting_fraction=stop_intervals.moving_fraction if stop_intervals else None,
         **_summarize_control_reports(record, stop_intervals, last_report),
         # Forces and effort.
         **_compute_force_and_energy_metrics(record, has_torque_and_velocity=has_torque_and_velocity),
         **_compute_advance_metrics(record, progress, has_torque_and_velocity=has_torque_and_velocity),
-        **vars(Effort.from_run(record, progress, has_torque_and_velocity=has_torque_and_velocity)),
+        **vars(EffortMetrics.from_run(record, progress, has_torque_and_velocity=has_torque_and_velocity)),
         **vars(
             HeadingEffort.from_run(
                 record, progress, pose_known_duration_s, has_torque_and_velocity=has_torque_and_velocity
             )
         ),
         **vars(
-            Displacement.from_run(
+            DisplacementMetrics.from_run(
                 record, progress, pose_known_duration_s, has_torque_and_velocity=has_torque_and_velocity
             )
         ),
@@ -412,8 +412,8 @@ def _compute_force_and_energy_metrics(record: RunRecord, *, has_torque_and_veloc
         metrics["empty_push_points"] = tracking.no_contact_fraction
     if has_torque_and_velocity:
         metrics["energy_j"] = compute_energy_j(record)
-        metrics["torque_joints_j"] = compute_work_j(record, Mode.TORQUE)
-        metrics["position_joints_j"] = compute_work_j(record, Mode.POSITION)
+        metrics["torque_joints_j"] = compute_work_j(record, JointMode.TORQUE)
+        metrics["position_joints_j"] = compute_work_j(record, JointMode.POSITION)
     return metrics
 
 

@@ -26,7 +26,7 @@ def get_run_end_s(record: RunRecord) -> float:
 
 
 @dataclass(frozen=True)
-class Interval:
+class LabeledInterval:
     """An interval of time with a label, such as a state."""
 
     start_s: float
@@ -46,19 +46,19 @@ def list_control_state_spans(record: RunRecord) -> list[tuple[float, float, Cont
     return list(zip(starts, ends, record.control_states, strict=True))
 
 
-def merge_equal_reports(record: RunRecord, values: Sequence[str | None]) -> list[Interval]:
+def merge_equal_reports(record: RunRecord, values: Sequence[str | None]) -> list[LabeledInterval]:
     """Merge adjacent reports of control with equal values into intervals.
 
     Args:
         record: The recorded run.
         values: A label for each state that control reported; None if the report belongs to no interval.
     """
-    intervals: list[Interval] = []
+    intervals: list[LabeledInterval] = []
     for (start_s, end_s, _), label in zip(list_control_state_spans(record), values, strict=True):
         if label is None or end_s <= start_s:
             continue
         if intervals and intervals[-1].label == label and intervals[-1].end_s >= start_s:
-            intervals[-1] = Interval(intervals[-1].start_s, end_s, label)
+            intervals[-1] = LabeledInterval(intervals[-1].start_s, end_s, label)
         else:
-            intervals.append(Interval(start_s, end_s, label))
+            intervals.append(LabeledInterval(start_s, end_s, label))
     return intervals

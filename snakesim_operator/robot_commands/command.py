@@ -13,10 +13,17 @@ from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.base.terminal import PrintLine, print_line
 from snakesim_hal.host.latch import find_latched_stops, remove_latched_stop
-from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, make_arm_request
+from snakesim_hal.wire.messages import (
+    Answer,
+    LifecycleRequest,
+    RobotDescription,
+    RobotStatus,
+    SimulatorRequest,
+    make_arm_request,
+)
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
@@ -27,11 +34,11 @@ STATUS_TIMEOUT_S = 1.5  # until the host's status must show what it answered
 DONE_TEXT_BY_ACTION = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
 
 
-class Verification(NamedTuple):
+class ResponseVerification(NamedTuple):
     """Whether the answers to a request come from the robot's host."""
 
     problem: str | None  # why the answers are not confirmed; None if they are
-    status: Status | None  # newest status of the robot's host; None if there is none
+    status: RobotStatus | None  # newest status of the robot's host; None if there is none
 
 
 class NotReadyError(RefusedError):
@@ -189,7 +196,11 @@ def control_simulator(order: SimulatorOrder, selection: RobotSelection, print_te
 
 
 def _request_from_robot(
-    link: Link, key: str, request: LifecycleRequest | SimulatorRequest, done_text: str, print_text: PrintLine
+    link: ConnectionSettings,
+    key: str,
+    request: LifecycleRequest | SimulatorRequest,
+    done_text: str,
+    print_text: PrintLine,
 ) -> int:
     with open_session(link, CONNECT_TIMEOUT_S) as session:
         return request_from_host(session, key, request, done_text, link, print_text)
@@ -200,7 +211,7 @@ def request_from_host(
     key: str,
     request: LifecycleRequest | SimulatorRequest,
     done_text: str,
-    link: Link,
+    link: ConnectionSettings,
     print_text: PrintLine,
 ) -> int:
     """Send a request to the robot's host, confirm the answer by the robot's status, and print it.
@@ -220,7 +231,7 @@ def request_from_host(
         NotConnectedError: No host answers.
         RefusedError: The host refuses, or the status does not confirm the answer.
     """
-    status_reader = session.declare_latched_reader(keys.STATUS, Status)
+    status_reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
     answers = [answer for _, answer in session.send_request_to_all(key, request, ANSWER_TIMEOUT_S)]
     verification = verify_answers(answers, status_reader)
     name = link.namespace
@@ -248,7 +259,7 @@ def request_while_commanding(
     session: Session,
     request: LifecycleRequest,
     success_message: str,
-    connection: Link,
+    connection: ConnectionSettings,
     send_commands: Callable[[], object],
 ) -> None:
     """Send a request to the robot's host, and keep commanding the robot until the host has answered.
@@ -282,7 +293,7 @@ def request_while_commanding(
         response.result()
 
 
-def verify_answers(answers: Sequence[Answer], status_reader: Reader[Status]) -> Verification:
+def verify_answers(answers: Sequence[Answer], status_reader: SampleReader[RobotStatus]) -> ResponseVerification:
     """Check whether the robot's status confirms the answer of its host.
 
     An unauthorized process may answer in the host's name, or the host may answer and then hang. This waits up to
@@ -298,7 +309,7 @@ def verify_answers(answers: Sequence[Answer], status_reader: Reader[Status]) -> 
     """
     if len(answers) > 1:
         status = _wait_for_status(status_reader, None)
-        return Verification(f"{len(answers)} answered in its name; at least one is an impostor", status)
+        return ResponseVerification(f"{len(answers)} answered in its name; at least one is an impostor", status)
     answered_lifecycle = answers[0].lifecycle if answers else None
     status = _wait_for_status(status_reader, answered_lifecycle)
     host_ids = {answer.host for answer in answers}
@@ -306,14 +317,14 @@ def verify_answers(answers: Sequence[Answer], status_reader: Reader[Status]) -> 
         host_ids.add(status.host)
     if len(host_ids) > 1:
         problem = "the answer is not from the host that publishes its status; one of them is an impostor"
-        return Verification(problem, status)
+        return ResponseVerification(problem, status)
     if status is None or status.lifecycle != answered_lifecycle:
         problem = "its status does not show it; the host may hang, and the answer be from an impostor"
-        return Verification(problem, status)
-    return Verification(None, status)
+        return ResponseVerification(problem, status)
+    return ResponseVerification(None, status)
 
 
-def _wait_for_status(status_reader: Reader[Status], expected_lifecycle: str | None) -> Status | None:
+def _wait_for_status(status_reader: SampleReader[RobotStatus], expected_lifecycle: str | None) -> RobotStatus | None:
     """Wait up to STATUS_TIMEOUT_S for a status with the expected lifecycle state.
 
     Args:
@@ -323,7 +334,7 @@ def _wait_for_status(status_reader: Reader[Status], expected_lifecycle: str | No
     Returns:
         The newest status, which may have another state; None if there was no status.
     """
-    newest_status: Status | None = None
+    newest_status: RobotStatus | None = None
     deadline_s = time.monotonic() + STATUS_TIMEOUT_S
     while time.monotonic() < deadline_s:
         new_statuses = status_reader.drain()
@@ -335,7 +346,7 @@ def _wait_for_status(status_reader: Reader[Status], expected_lifecycle: str | No
     return newest_status
 
 
-def _read_description(session: Session, link: Link) -> Description:
+def _read_description(session: Session, link: ConnectionSettings) -> RobotDescription:
     """Wait for the description that the host of a robot publishes, and check that there is only one host.
 
     Args:
@@ -346,9 +357,9 @@ def _read_description(session: Session, link: Link) -> Description:
         NotConnectedError: No host publishes a description.
         RefusedError: Several hosts publish one.
     """
-    reader = session.declare_latched_reader(keys.DESCRIPTION, Description)
+    reader = session.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
     deadline_s = time.monotonic() + DESCRIPTION_TIMEOUT_S
-    descriptions: list[Description] = []
+    descriptions: list[RobotDescription] = []
     while not descriptions and time.monotonic() < deadline_s:
         time.sleep(0.05)
         descriptions = reader.drain()

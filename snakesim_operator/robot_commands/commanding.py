@@ -11,7 +11,7 @@ from snakesim_hal.programs.arguments import (
     add_network_arguments,
     add_unchecked_argument,
 )
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.robot_commands.simulator_commands import SIMULATOR_COMMANDS
 
@@ -167,7 +167,7 @@ COMMANDS: Commands = (
         details="The stop stays latched, also over a restart of the host, until `snakesim robot reset`.",
         examples=("estop", "estop --namespace planar13"),
     ),
-    Noun(
+    CommandGroup(
         name="robot",
         heading="robot",
         help="Arm, disarm and reset a robot. Calibrate and check its joints. Convert robot files.",
@@ -197,7 +197,7 @@ COMMANDS: Commands = (
         run=_reset_robot,
         examples=("robot reset", "robot reset --namespace planar13"),
     ),
-    Noun(name="param", heading="robot", help="List, get and set parameters of the running controller."),
+    CommandGroup(name="param", heading="robot", help="List, get and set parameters of the running controller."),
     Command(
         name="param list",
         help="List all parameters of the controller: value, unit, range and description.",
@@ -219,7 +219,7 @@ COMMANDS: Commands = (
         run=_set_parameters,
         examples=("param set control.speed_kp_s=0.3", "param set control.speed_kp_s=0.3 --namespace planar13"),
     ),
-    Noun(name="fault", heading="robot", help="Inject faults into a run that allows it."),
+    CommandGroup(name="fault", heading="robot", help="Inject faults into a run that allows it."),
     Command(
         name="fault inject",
         help="Inject a fault into a run that allows it, or end it.",

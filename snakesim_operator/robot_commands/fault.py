@@ -5,7 +5,12 @@ from math import inf
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, shorten, suggest_word
 from snakesim_hal.base.terminal import PrintLine, print_json, print_line
-from snakesim_hal.model.fault_kinds import FAULT_KINDS, Injection, describe_fault_kinds, validate_and_complete_injection
+from snakesim_hal.model.fault_kinds import (
+    FAULT_KINDS,
+    FaultInjection,
+    describe_fault_kinds,
+    validate_and_complete_injection,
+)
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
@@ -78,7 +83,7 @@ def inject_fault(order: FaultOrder, selection: RobotSelection, print_text: Print
     return 0
 
 
-def _validate_order(order: FaultOrder) -> Injection:
+def _validate_order(order: FaultOrder) -> FaultInjection:
     """Validate the options of `snakesim fault inject`, and return the injection that they describe.
 
     Raises:
@@ -93,7 +98,7 @@ def _validate_order(order: FaultOrder) -> Injection:
             code="injection/unknown-fault",
         )
     injection = validate_and_complete_injection(
-        Injection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}"
+        FaultInjection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}"
     )
     if order.for_s is not None and not 0.0 < order.for_s < inf:
         raise ConfigError(f"--duration {order.for_s:g}: give more than 0 s", code="injection/unknown-fault")

@@ -25,7 +25,7 @@ from snakesim_hal.base.process import get_user_name
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.scenario import parse_set_option
 from snakesim_hal.network.session import Session, open_session
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, ControlState, ParametersRequest
 from snakesim_operator.base.robot_selection import RobotSelection
@@ -43,7 +43,7 @@ POLL_PERIOD_S = 0.01
 
 
 @dataclass(frozen=True)
-class Parameter:
+class RobotParameter:
     """One parameter, with its unit and range from the JSON Schema."""
 
     name: str  # without "control."
@@ -83,7 +83,7 @@ def format_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def parse_parameters(in_force: ControlParameters) -> list[Parameter]:
+def parse_parameters(in_force: ControlParameters) -> list[RobotParameter]:
     """Parse the published parameters of a controller.
 
     Args:
@@ -96,7 +96,7 @@ def parse_parameters(in_force: ControlParameters) -> list[Parameter]:
         schema = json.loads(in_force.schema)
         values = msgspec.json.decode(in_force.parameters, type=dict[str, Any])
         properties = _resolve_reference(schema, schema)["properties"]
-        parameters: list[Parameter] = []
+        parameters: list[RobotParameter] = []
         for name, value in values.items():
             description = _resolve_reference(schema, properties.get(name, {}))
             if len(parameters) < MAX_PARAMETERS:
@@ -114,7 +114,7 @@ def _resolve_reference(schema: dict[str, Any], part: dict[str, Any]) -> dict[str
     return schema["$defs"][reference.rpartition("/")[2]]
 
 
-def _parse_parameter(name: str, schema: dict[str, Any], value: Any) -> Parameter:
+def _parse_parameter(name: str, schema: dict[str, Any], value: Any) -> RobotParameter:
     """Return one parameter with its unit and range. Texts are shortened, because they come from the network.
 
     Args:
@@ -123,7 +123,7 @@ def _parse_parameter(name: str, schema: dict[str, Any], value: Any) -> Parameter
         value: Value in force.
     """
     choices = schema.get("enum")
-    return Parameter(
+    return RobotParameter(
         name[:MAX_NAME_CHARACTERS],
         value,
         unit=str(schema.get("unit", ""))[:MAX_NAME_CHARACTERS],
@@ -144,10 +144,12 @@ def _find_finite_number(schema: dict[str, Any], *names: str) -> float | None:
     return None
 
 
-def find_changed_parameters(before: ControlParameters, after: ControlParameters) -> list[tuple[Parameter, Parameter]]:
+def find_changed_parameters(
+    before: ControlParameters, after: ControlParameters
+) -> list[tuple[RobotParameter, RobotParameter]]:
     """Return the parameters whose values differ, each as it was before and as it is now."""
     old_parameters = {parameter.name: parameter for parameter in parse_parameters(before)}
-    pairs: list[tuple[Parameter, Parameter]] = []
+    pairs: list[tuple[RobotParameter, RobotParameter]] = []
     for new in parse_parameters(after):
         old = old_parameters.get(new.name)
         if old is not None and old.value != new.value:
@@ -226,7 +228,7 @@ def _wait_for_change(session: Session, before: ControlParameters) -> ControlPara
 
 
 def _wait_until_controller_continues(
-    state_reader: Reader[ControlState], after: ControlParameters | None, changes: Mapping[str, Any]
+    state_reader: SampleReader[ControlState], after: ControlParameters | None, changes: Mapping[str, Any]
 ) -> None:
     """Wait until the controller has run with changed parameters, but at most REPORT_TIMEOUT_S.
 

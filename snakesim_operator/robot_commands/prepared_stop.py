@@ -16,8 +16,8 @@ from typing import TypeVar
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.base.workers import Worker
-from snakesim_hal.network.session import Link, Session
+from snakesim_hal.base.workers import BackgroundThread
+from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.network.stop_port import Address, StopAnswer, StopRequester
 from snakesim_hal.wire import keys
 from snakesim_operator.base.robot_selection import RobotSelection
@@ -82,7 +82,12 @@ class _PortResults:
 class PreparedStop:
     """Stops the robot at one link. Every method may be called from any thread, and none but `stop` waits."""
 
-    def __init__(self, selection: RobotSelection, link: Link, on_result: Callable[[str, str], None] = lambda *_: None):
+    def __init__(
+        self,
+        selection: RobotSelection,
+        link: ConnectionSettings,
+        on_result: Callable[[str, str], None] = lambda *_: None,
+    ):
         """Prepare an emergency stop, which then needs no time to open sockets or to start threads.
 
         Args:
@@ -95,9 +100,9 @@ class PreparedStop:
         self._on_result = on_result
         self._user = get_user_name()  # looked up in a file
         # Threads.
-        self._coordinator_thread = Worker("stop")
-        self._datagram_thread = Worker("stop datagrams")
-        self._network_thread = Worker("stop network")
+        self._coordinator_thread = BackgroundThread("stop")
+        self._datagram_thread = BackgroundThread("stop datagrams")
+        self._network_thread = BackgroundThread("stop network")
         # What they use. The requester belongs to the thread of the datagrams.
         self._datagram_requester = StopRequester()
         self._local_ports: dict[Address, RobotAddress] = {}

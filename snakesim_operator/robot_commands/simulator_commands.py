@@ -4,7 +4,7 @@ import argparse
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.programs.arguments import add_network_arguments
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
 MAX_TICKS = 1_000_000  # this and the speeds are the limits of SimulatorRequest
@@ -71,7 +71,7 @@ def _validate_speed(speed: float) -> float:
 
 
 SIMULATOR_COMMANDS: Commands = (
-    Noun(name="sim", heading="robot", help="Pause, step, speed up, slow down or reset a simulator."),
+    CommandGroup(name="sim", heading="robot", help="Pause, step, speed up, slow down or reset a simulator."),
     Command(
         name="sim pause",
         help="Pause a simulator: robot time is paused, also for leases and ages.",

@@ -14,11 +14,11 @@ from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.endpoint import is_exposed
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, describe_differences
-from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import Description, Process, Status
+from snakesim_hal.wire.codec import MessageDecoder
+from snakesim_hal.wire.messages import ProcessInfo, RobotDescription, RobotStatus
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, get_namespace, make_robot_flags
 from snakesim_operator.results import last_run
 
@@ -27,16 +27,16 @@ SINGLE_ATTEMPT_TIMEOUT_S = 0.0  # as a time to connect: Zenoh tries once, and re
 
 
 @dataclass(frozen=True)
-class _RobotState:
+class _NewestMessages:
     """The newest messages of one robot on the network, as `snakesim status` prints them."""
 
-    link: Link
-    statuses: list[Status]  # newest status of each host with the robot's name; more than one means an impostor
-    processes: list[Process]  # running processes of the robot
-    description: Description | None  # from the host with the last of these statuses; None if none arrived
+    link: ConnectionSettings
+    statuses: list[RobotStatus]  # newest status of each host with the robot's name; more than one means an impostor
+    processes: list[ProcessInfo]  # running processes of the robot
+    description: RobotDescription | None  # from the host with the last of these statuses; None if none arrived
 
     @property
-    def status(self) -> Status:
+    def status(self) -> RobotStatus:
         """The status that is printed."""
         return self.statuses[-1]
 
@@ -58,7 +58,7 @@ def print_status(selection: RobotSelection, *, as_json: bool = False) -> int:
     """
     local_robots = selection.list_local_robots()
     local_endpoints = {robot.endpoint for robot in local_robots}
-    robots: list[_RobotState] = []
+    robots: list[_NewestMessages] = []
     for link in selection.list_networks():
         with contextlib.suppress(NotConnectedError):
             robots += _find_robots(link, _choose_connect_timeout_s(link, local_endpoints))
@@ -89,7 +89,7 @@ def _print_no_robot(selection: RobotSelection) -> None:
     print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenario list`")
 
 
-def _print_robot(robot: _RobotState) -> None:
+def _print_robot(robot: _NewestMessages) -> None:
     lines = [*_describe_robot(robot), *describe_processes(robot.processes)]
     if robot.is_impostor:
         lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
@@ -101,20 +101,20 @@ def _print_robot(robot: _RobotState) -> None:
 class _NetworkMessages:
     """Collects the messages of all robots on one network."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: ConnectionSettings) -> None:
         self._link = link
         self._decoders = {
-            keys.STATUS: Decoder(Status),
-            keys.PROCESS_ALL: Decoder(Process),
-            keys.DESCRIPTION: Decoder(Description),
+            keys.STATUS: MessageDecoder(RobotStatus),
+            keys.PROCESS_ALL: MessageDecoder(ProcessInfo),
+            keys.DESCRIPTION: MessageDecoder(RobotDescription),
         }
-        self.statuses: dict[str, dict[str | None, Status]] = {}  # by robot, then by host
-        self.descriptions: dict[tuple[str, str | None], Description] = {}  # by robot and host
-        self.processes: dict[str, list[Process]] = {}  # by robot
+        self.statuses: dict[str, dict[str | None, RobotStatus]] = {}  # by robot, then by host
+        self.descriptions: dict[tuple[str, str | None], RobotDescription] = {}  # by robot and host
+        self.processes: dict[str, list[ProcessInfo]] = {}  # by robot
 
     def read(self, session: Session) -> None:
         """Subscribe to status, descriptions and processes, and collect these messages for MESSAGE_WAIT_S."""
-        arrivals: Mailbox[Arrival] = Mailbox()
+        arrivals: Mailbox[ReceivedSample] = Mailbox()
         prefix = "" if self._link.namespace is not None else "**/"
         for key in self._decoders:
             session.on_latched_arrival(f"{prefix}{key}", arrivals.put)
@@ -128,7 +128,7 @@ class _NetworkMessages:
             with contextlib.suppress(WireError):
                 self._decode_and_store(arrival, live_process_keys)
 
-    def _decode_and_store(self, arrival: Arrival, live_process_keys: set[str]) -> None:
+    def _decode_and_store(self, arrival: ReceivedSample, live_process_keys: set[str]) -> None:
         """Decode a message and keep it. live: keys of the processes that run. Raises WireError."""
         decoder = self._decoders[keys.PROCESS_ALL]
         for key in (keys.STATUS, keys.DESCRIPTION):
@@ -137,16 +137,16 @@ class _NetworkMessages:
         message = decoder.decode(arrival.payload, arrival.encoding)
         name = self._link.namespace or get_namespace(arrival.key)
         match message:
-            case Status():
+            case RobotStatus():
                 self.statuses.setdefault(name, {})[message.host] = message
-            case Description():
+            case RobotDescription():
                 self.descriptions[name, message.host] = message
-            case Process():
+            case ProcessInfo():
                 if arrival.key in live_process_keys:
                     self.processes.setdefault(name, []).append(message)
 
 
-def _choose_connect_timeout_s(link: Link, local_endpoints: Collection[str]) -> float:
+def _choose_connect_timeout_s(link: ConnectionSettings, local_endpoints: Collection[str]) -> float:
     """Return the time in s for which to try to connect to a network.
 
     On loopback Zenoh reports at once whether a process listens, so one attempt is enough. Attempts are repeated where
@@ -161,7 +161,7 @@ def _choose_connect_timeout_s(link: Link, local_endpoints: Collection[str]) -> f
     return CONNECT_TIMEOUT_S
 
 
-def _find_robots(link: Link, connect_timeout_s: float) -> list[_RobotState]:
+def _find_robots(link: ConnectionSettings, connect_timeout_s: float) -> list[_NewestMessages]:
     """Return the robots on a network with their newest messages, sorted by name.
 
     Args:
@@ -174,16 +174,16 @@ def _find_robots(link: Link, connect_timeout_s: float) -> list[_RobotState]:
     messages = _NetworkMessages(link)
     with open_session(link, connect_timeout_s) as session:
         messages.read(session)
-    robots: list[_RobotState] = []
+    robots: list[_NewestMessages] = []
     for name, status_by_host in sorted(messages.statuses.items()):
         statuses = list(status_by_host.values())
         description = messages.descriptions.get((name, statuses[-1].host))
         processes = messages.processes.get(name, [])
-        robots.append(_RobotState(replace(link, namespace=name), statuses, processes, description))
+        robots.append(_NewestMessages(replace(link, namespace=name), statuses, processes, description))
     return robots
 
 
-def _convert_to_json(robot: _RobotState) -> dict[str, Any]:
+def _convert_to_json(robot: _NewestMessages) -> dict[str, Any]:
     return {
         "namespace": robot.link.namespace,
         "endpoint": robot.link.endpoint,
@@ -194,7 +194,7 @@ def _convert_to_json(robot: _RobotState) -> dict[str, Any]:
     }
 
 
-def describe_processes(processes: Sequence[Process]) -> list[str]:
+def describe_processes(processes: Sequence[ProcessInfo]) -> list[str]:
     """Return lines for each process: machine, version, uptime, and how its configuration differs from the host's."""
     host = next((entry for entry in processes if entry.name == HOST), None)
     lines: list[str] = []
@@ -211,7 +211,7 @@ def describe_processes(processes: Sequence[Process]) -> list[str]:
     return lines
 
 
-def _describe_robot(robot: _RobotState) -> list[str]:
+def _describe_robot(robot: _NewestMessages) -> list[str]:
     link = robot.link
     status = robot.status
     return [
@@ -233,7 +233,7 @@ def _format_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{word} {count}" for word, count in sorted(counts.items())) or "none"
 
 
-def _describe_limits(status: Status) -> list[str]:
+def _describe_limits(status: RobotStatus) -> list[str]:
     """Return lines about restrictions of the robot: pause, speed, derating, isolated joints, injected faults and so on.
 
     Args:
@@ -260,7 +260,7 @@ def _describe_limits(status: Status) -> list[str]:
     return lines
 
 
-def _describe_faults(status: Status) -> list[str]:
+def _describe_faults(status: RobotStatus) -> list[str]:
     """Return a line for each kind of fault, with its first tick and its count."""
     ticks_by_fault: dict[tuple[str, str, str], list[int]] = {}
     for fault in status.faults:
@@ -275,7 +275,7 @@ def _describe_faults(status: Status) -> list[str]:
     return lines
 
 
-def _suggest_next_commands(link: Link, status: Status) -> list[str]:
+def _suggest_next_commands(link: ConnectionSettings, status: RobotStatus) -> list[str]:
     """Return lines with the commands that the operator may type next, which depend on the state of the robot.
 
     Args:

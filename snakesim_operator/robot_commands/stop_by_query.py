@@ -5,11 +5,11 @@ import time
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.stop_port import find_stop_address
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, EstopRequest, Status
+from snakesim_hal.wire.messages import Answer, EstopRequest, RobotStatus
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, find_namespaces, get_namespace
 from snakesim_operator.robot_commands.command import verify_answers
 from snakesim_operator.robot_commands.stop_result import StopResult
@@ -17,7 +17,7 @@ from snakesim_operator.robot_commands.stop_result import StopResult
 QUERY_TIMEOUT_S = 1.0  # for the answers to one query
 
 
-def request_stop_on_network(link: Link, timeout_s: float) -> list[StopResult]:
+def request_stop_on_network(link: ConnectionSettings, timeout_s: float) -> list[StopResult]:
     """Connect to a network, and stop its robots by queries to their hosts.
 
     Connecting is repeated while a program listens at the endpoint but accepts no session.
@@ -39,7 +39,7 @@ def request_stop_on_network(link: Link, timeout_s: float) -> list[StopResult]:
                 return []
 
 
-def _has_listener(link: Link) -> bool:
+def _has_listener(link: ConnectionSettings) -> bool:
     """Return whether a program listens at the endpoint, even if it accepts no session."""
     host, port = find_stop_address(link.endpoint, listens=True)
     try:
@@ -49,7 +49,7 @@ def _has_listener(link: Link) -> bool:
         return False
 
 
-def request_stop_over_session(session: Session, link: Link, timeout_s: float) -> list[StopResult]:
+def request_stop_over_session(session: Session, link: ConnectionSettings, timeout_s: float) -> list[StopResult]:
     """Stop robots by queries to their hosts, and check the answers against the status that the hosts publish.
 
     The status subscriptions stay until the session is closed.
@@ -77,7 +77,7 @@ def request_stop_over_session(session: Session, link: Link, timeout_s: float) ->
 
 
 def _request_stop_from_hosts(
-    session: Session, link: Link, timeout_s: float, *, should_repeat: bool
+    session: Session, link: ConnectionSettings, timeout_s: float, *, should_repeat: bool
 ) -> dict[str, list[Answer]]:
     """Send the stop query to the hosts until at least one answers.
 
@@ -104,7 +104,9 @@ def _request_stop_from_hosts(
     return answers_by_robot
 
 
-def _make_verified_result(name: str, link: Link, answers: list[Answer], status_reader: Reader[Status]) -> StopResult:
+def _make_verified_result(
+    name: str, link: ConnectionSettings, answers: list[Answer], status_reader: SampleReader[RobotStatus]
+) -> StopResult:
     """Return the result for one robot, which is stopped only if its status confirms the answer and no host refused.
 
     Args:
@@ -125,7 +127,7 @@ def _make_verified_result(name: str, link: Link, answers: list[Answer], status_r
     )
 
 
-def _subscribe_to_status(session: Session, link: Link, name: str) -> Reader[Status]:
+def _subscribe_to_status(session: Session, link: ConnectionSettings, name: str) -> SampleReader[RobotStatus]:
     """Subscribe to the status of one robot, and return the reader."""
     key = keys.STATUS if link.namespace is not None else f"{name}/{keys.STATUS}"
-    return session.declare_latched_reader(key, Status)
+    return session.declare_latched_reader(key, RobotStatus)

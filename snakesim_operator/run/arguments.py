@@ -18,7 +18,7 @@ from snakesim_hal.programs.arguments import (
     load_scenario_from_arguments,
     read_session_option,
 )
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.recording.message import RAW_ONLY_HELP
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ COMMANDS: Commands = (
             "run peg_row --controller obstacle_aided --duration 10 --out runs/demo",
         ),
     ),
-    Noun(name="start", heading="robot", help="Start one process of a robot that is distributed over machines."),
+    CommandGroup(name="start", heading="robot", help="Start one process of a robot that is distributed over machines."),
     Command(
         name="start host",
         help="Start the HAL host of a robot, which moves the drives or the simulator.",

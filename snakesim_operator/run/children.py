@@ -52,7 +52,7 @@ class ProcessOutput:
 
 
 @dataclass
-class Child:
+class ChildProcess:
     """A child process and its output."""
 
     name: str
@@ -85,7 +85,7 @@ def start_child(
     *,
     pass_fds: Sequence[int] = (),
     extra_env: Mapping[str, str] = MappingProxyType({}),
-) -> Child:
+) -> ChildProcess:
     """Start a Python module as a child that dies with this process.
 
     The child gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in
@@ -120,10 +120,10 @@ def start_child(
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
         os.close(write_end)
-    return Child(name, process, ProcessOutput(read_end, on_output))
+    return ChildProcess(name, process, ProcessOutput(read_end, on_output))
 
 
-def request_child_end(child: Child) -> None:
+def request_child_end(child: ChildProcess) -> None:
     """Request the end of a running child: send SIGTERM, and SIGCONT so that a frozen child receives it.
 
     A child that is still starting has no signal handler and ends immediately. It has no data that could be lost.
@@ -134,7 +134,7 @@ def request_child_end(child: Child) -> None:
         child.process.send_signal(signal.SIGCONT)
 
 
-def stop_children(children: Sequence[Child]) -> None:
+def stop_children(children: Sequence[ChildProcess]) -> None:
     """Request the end of every child, wait for STOP_TIMEOUT_S, kill those that still run, and wait for these."""
     for child in children:
         request_child_end(child)

@@ -15,14 +15,14 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import EMULATED, REAL, UNKNOWN
 from snakesim_hal.network.local_registry import get_robot_state_folder
 from snakesim_hal.run_log.host_record import HostRecord
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.base import extras
 from snakesim_operator.results import last_run
 from snakesim_operator.results.missing_data import EXIT_INCOMPLETE, describe_unwritten_data
 from snakesim_operator.results.run_ending import COMPLETE, describe_early_end
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import REPORT_FILENAME, SUMMARY_FILENAME
-from snakesim_operator.results.summary import Restart, RunSummary, get_distance_m, get_estimates, summarize_run
+from snakesim_operator.results.summary import ProcessRestart, RunSummary, get_distance_m, get_estimates, summarize_run
 from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.run_files import RunFiles
 
@@ -32,12 +32,12 @@ EXIT_COMPLETE, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 130
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunConclusion:
     """Results of a run that are not in its folder."""
 
     host_record: HostRecord | None  # statistics of the host; None if they are unknown
-    description: Description | None
-    restarts: Sequence[Restart] = ()
+    description: RobotDescription | None
+    restarts: Sequence[ProcessRestart] = ()
     host_count: int = 1
     recording_losses: Sequence[str] = ()  # reasons why the recording is incomplete
     slow_services: Sequence[
@@ -46,7 +46,7 @@ class Outcome:
 
 
 def write_and_print_results(
-    config: RunConfig, files: RunFiles, ending: RunEnding, outcome: Outcome, *, stay: bool = False
+    config: RunConfig, files: RunFiles, ending: RunEnding, outcome: RunConclusion, *, stay: bool = False
 ) -> int:
     """Write the results of a run, print them, and close its files.
 
@@ -108,7 +108,7 @@ def _describe_ending(ending: RunEnding) -> str:
 
 
 def _write_and_print_summary(
-    files: RunFiles, ending: RunEnding, outcome: Outcome, host: HostRecord
+    files: RunFiles, ending: RunEnding, outcome: RunConclusion, host: HostRecord
 ) -> tuple[list[str], str]:
     """Write summary and report of a run, and print the summary.
 
@@ -139,7 +139,7 @@ def _write_and_print_summary(
 
 
 def write_results(
-    files: RunFiles, folder: Path, ending: RunEnding, outcome: Outcome, *, report: bool = True
+    files: RunFiles, folder: Path, ending: RunEnding, outcome: RunConclusion, *, report: bool = True
 ) -> tuple[RunRecord, RunSummary]:
     """Load the record of a run from disk, and write its summary and report.
 
@@ -170,7 +170,9 @@ def write_results(
     return record, summary
 
 
-def _print_run_end(files: RunFiles, ending: RunEnding, outcome: Outcome, missing: Sequence[str], verdict: str) -> None:
+def _print_run_end(
+    files: RunFiles, ending: RunEnding, outcome: RunConclusion, missing: Sequence[str], verdict: str
+) -> None:
     if files.folder is not None:
         _print_paths(files.folder)
     if verdict:
@@ -199,7 +201,7 @@ def _print_paths(folder: Path) -> None:
         )
 
 
-def _print_stored_emergency_stop(robot: Description) -> None:
+def _print_stored_emergency_stop(robot: RobotDescription) -> None:
     """Print how to reset a stored emergency stop of the robot, if there is one."""
     stop = get_robot_state_folder(robot.robot, robot.backend, robot.hardware) / ESTOP
     if stop.is_file():

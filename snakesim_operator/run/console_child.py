@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_operator.base import extras
 from snakesim_operator.base.console_port import open_console_ports
 from snakesim_operator.run import children
@@ -28,7 +28,7 @@ def require_console() -> None:
 
 @contextlib.contextmanager
 def run_console(
-    common_arguments: Sequence[str], link: Link, files: RunFiles, report: Callable[[str], None]
+    common_arguments: Sequence[str], link: ConnectionSettings, files: RunFiles, report: Callable[[str], None]
 ) -> Iterator[None]:
     """Run the console in two child processes, the front process and the page server, while the context is active.
 

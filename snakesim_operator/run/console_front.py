@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_operator.base.console_port import TOKEN_VARIABLE, ConsolePorts
 from snakesim_operator.run import children
 
 FRONT_MODULE = "snakesim_operator.features.console.front"
 
 
-def start_console_front(ports: ConsolePorts, link: Link | None, on_output: Callable[[bytes], object]) -> children.Child:
+def start_console_front(
+    ports: ConsolePorts, link: ConnectionSettings | None, on_output: Callable[[bytes], object]
+) -> children.ChildProcess:
     """Start the front server of a console as a child process.
 
     Args:
@@ -30,7 +32,7 @@ def start_console_front(ports: ConsolePorts, link: Link | None, on_output: Calla
     return children.start_child("console front", arguments, on_output, pass_fds=[browsers_fd], extra_env=token)
 
 
-def _make_robot_arguments(link: Link | None) -> list[str]:
+def _make_robot_arguments(link: ConnectionSettings | None) -> list[str]:
     """Return the command-line arguments by which the front server finds the robot."""
     if link is None:
         return ["--recording"]

@@ -6,7 +6,7 @@ from functools import partial
 
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import write_config
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_hal.programs.host_program import run_host_program
 from snakesim_hal.programs.preflight import validate_backend_config
 from snakesim_hal.programs.service_program import read_process_options
@@ -37,6 +37,6 @@ def run_host(arguments: argparse.Namespace) -> int:
         return run_host_program(options, partial(_report_network, link))
 
 
-def _report_network(link: Link) -> None:
+def _report_network(link: ConnectionSettings) -> None:
     """Print where the host can be reached, once it can."""
     print_line(f"network: {link.endpoint}, namespace {link.namespace}; Ctrl-C ends it")

@@ -42,10 +42,10 @@ from snakesim_operator.results.recording_contents import SERVICE_OUTPUT_KEYS
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import CONFIG_FILENAME
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.conclusion import Outcome, add_end_causes, write_and_print_results, write_results
+from snakesim_operator.run.conclusion import RunConclusion, add_end_causes, write_and_print_results, write_results
 from snakesim_operator.run.ending import RunEnding, end_run_on_signals
 from snakesim_operator.run.pinned_process import call_in_pinned_process
-from snakesim_operator.run.progress import Progress
+from snakesim_operator.run.progress import RunProgress
 from snakesim_operator.run.run import open_run_files, require_recorder
 from snakesim_operator.run.run_files import RunFiles
 
@@ -88,7 +88,7 @@ class ControlFailure:
 
 
 @dataclass(frozen=True)
-class Result:
+class InProcessResult:
     """Results of a run that is over; `summary.ended` is how it ended."""
 
     record: RunRecord  # every tick, and what control and guidance reported
@@ -104,7 +104,7 @@ def simulate(
     until_goal: bool = False,
     stall_timeout_s: float | None = None,
     turn_limit_s: float | None = None,
-) -> Result:
+) -> InProcessResult:
     """Run a configuration in this process, and return what was recorded.
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
@@ -168,7 +168,7 @@ def simulate(
         add_end_causes(ending, create_host_record(run.host), config)
         record, summary = write_results(files, files.folder, ending, outcome, report=out is not None)
         # No local variable holds the failure: its traceback holds this function's frame.
-        return Result(record, summary, has_stalled, ControlFailure.from_error(run.pop_errors().get(CONTROL)))
+        return InProcessResult(record, summary, has_stalled, ControlFailure.from_error(run.pop_errors().get(CONTROL)))
 
 
 def run_in_process(
@@ -203,7 +203,7 @@ def run_in_process(
             f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander_name}, in one process"
         )
         with end_run_on_signals(ending):
-            with Progress(config) as progress:
+            with RunProgress(config) as progress:
                 _, outcome, _ = _run_until_over(
                     config,
                     files,
@@ -227,7 +227,7 @@ def _run_until_over(
     config: RunConfig,
     files: RunFiles,
     ending: RunEnding,
-    progress: Progress | None,
+    progress: RunProgress | None,
     recorded_keys: Iterable[str],
     *,
     until_goal: bool,
@@ -235,7 +235,7 @@ def _run_until_over(
     raw_only: bool,
     step_times: SharedStepTimes | None = None,
     turn_limit_s: float | None = None,
-) -> tuple[InProcessRun, Outcome, bool]:
+) -> tuple[InProcessRun, RunConclusion, bool]:
     """Run a configuration until it is over, and write its record and its recording.
 
     Args:
@@ -281,7 +281,7 @@ def _run_until_over(
     for failure in run.failed_services:
         ending.add_cause(failure)
     losses = [recording.failure] if recording is not None and recording.failure else []
-    outcome = Outcome(
+    outcome = RunConclusion(
         create_host_record(run.host),
         run.host.description,
         recording_losses=losses,

@@ -6,7 +6,7 @@ import socket
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.endpoint import DEFAULT_PORT, require_loopback_up
 from snakesim_hal.network.free_ports import LOOPBACK, find_free_port, is_tcp_port_free
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.network.stop_port import find_stop_address, open_stop_port
 from snakesim_hal.wire import keys
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, find_namespaces
@@ -14,7 +14,9 @@ from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, find_namespaces
 MAX_ATTEMPTS = 10  # with ports that were free a moment ago
 
 
-def reserve_endpoint(endpoint: str | None, router_link: Link | None, namespace: str) -> tuple[Link, socket.socket]:
+def reserve_endpoint(
+    endpoint: str | None, router_link: ConnectionSettings | None, namespace: str
+) -> tuple[ConnectionSettings, socket.socket]:
     """Reserve the endpoint at which the processes of a run connect: open the stop port with the same number.
 
     The caller keeps the stop port bound until the run is over. So two runs that start at the same moment cannot get the
@@ -38,7 +40,7 @@ def reserve_endpoint(endpoint: str | None, router_link: Link | None, namespace: 
     require_loopback_up(endpoint or f"tcp/{LOOPBACK}:{DEFAULT_PORT}")
     if endpoint is not None:
         host, port = find_stop_address(endpoint, listens=True)
-        return Link(endpoint, namespace), open_stop_port(host, port)
+        return ConnectionSettings(endpoint, namespace), open_stop_port(host, port)
     for attempt in range(1 + MAX_ATTEMPTS):
         port = DEFAULT_PORT if attempt == 0 else find_free_port()
         try:
@@ -46,12 +48,12 @@ def reserve_endpoint(endpoint: str | None, router_link: Link | None, namespace: 
         except NotConnectedError:
             continue
         if is_tcp_port_free(port):
-            return Link(f"tcp/{LOOPBACK}:{port}", namespace), stop_port
+            return ConnectionSettings(f"tcp/{LOOPBACK}:{port}", namespace), stop_port
         stop_port.close()
     raise NotConnectedError("no free port on the loopback interface", code="network/port-in-use")
 
 
-def check_no_other_robot(endpoint: str | None, router_link: Link | None) -> None:
+def check_no_other_robot(endpoint: str | None, router_link: ConnectionSettings | None) -> None:
     """Check that no other robot has the name or the endpoint of the run that starts.
 
     Args:
@@ -71,7 +73,10 @@ def check_no_other_robot(endpoint: str | None, router_link: Link | None) -> None
                     code="robot/already-running",
                 )
     elif endpoint is not None:
-        with contextlib.suppress(NotConnectedError), open_session(Link(endpoint), CONNECT_TIMEOUT_S) as session:
+        with (
+            contextlib.suppress(NotConnectedError),
+            open_session(ConnectionSettings(endpoint), CONNECT_TIMEOUT_S) as session,
+        ):
             others = ", ".join(find_namespaces(session)) or "another host"
             raise RefusedError(
                 f"{others} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "

@@ -10,15 +10,22 @@ from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.session import Session
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory, make_arm_request
+from snakesim_hal.wire.messages import (
+    ControlState,
+    LifecycleRequest,
+    RobotDescription,
+    RobotStatus,
+    Trajectory,
+    make_arm_request,
+)
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.results.run_ending import GOAL_REQUESTER
 from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.patience import StartupTimeout
 from snakesim_operator.run.process_faults import ProcessFaults
 from snakesim_operator.run.processor_waits import ProcessorWaits
-from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.supervisor import HOST, Supervisor
+from snakesim_operator.run.progress import RunProgress
+from snakesim_operator.run.supervisor import HOST, RunSupervisor
 
 RUN_ON_AFTER_FAULT_S = 1.5  # the host continues for so long after a fault, so that the safe stop is in the record
 POLL_S = 0.05
@@ -39,7 +46,7 @@ class RunMonitor:
         self,
         config: RunConfig,
         session: Session,
-        supervisor: Supervisor,
+        supervisor: RunSupervisor,
         ending: RunEnding,
         print_text: Callable[[str], None],
         *,
@@ -65,7 +72,7 @@ class RunMonitor:
         self._stay = stay
         self._unchecked = unchecked
         self._faults = ProcessFaults(config, session, supervisor, print_text)
-        self._progress = Progress(config)
+        self._progress = RunProgress(config)
         self._startup_timeout = StartupTimeout(config.services, config.start_limit_s)
         self._processor_waits = ProcessorWaits(config.lease_ns * 1e-9)
 
@@ -80,8 +87,8 @@ class RunMonitor:
         session.on_token_change(self._on_recorder_alive, keys.alive_key(RECORDER))
 
         # What the host published.
-        self._status: Status | None = None
-        self._robot: Description | None = None
+        self._status: RobotStatus | None = None
+        self._robot: RobotDescription | None = None
         self._host_count = supervisor.host_count
         self._polls_without_status = 0  # polls instead of time: a pause of this process is no silence of the host
         self._silence: str | None = None  # a sentence, if the host is silent
@@ -204,7 +211,7 @@ class RunMonitor:
         else:
             self._note_robot_fault(status)
 
-    def _note_robot_fault(self, status: Status) -> None:
+    def _note_robot_fault(self, status: RobotStatus) -> None:
         """Note the first fault that stops the whole robot as the reason for the end of the run."""
         fault = next((fault for fault in status.faults if fault.reach == "robot"), None)
         if fault is None:
@@ -215,7 +222,7 @@ class RunMonitor:
             if slow is not None:
                 self._ending.add_cause(slow, first=True)
 
-    def _describe_slow_computer(self, status: Status) -> str | None:
+    def _describe_slow_computer(self, status: RobotStatus) -> str | None:
         """Describe the measurements that show that this computer is too slow for the run; None if there are none."""
         evidence: list[str] = []
         wait = self._processor_waits.find_longest()
@@ -230,7 +237,7 @@ class RunMonitor:
             return None
         return f"this computer is too slow: {', '.join(evidence)}"
 
-    def _describe_silence(self, status: Status) -> str | None:
+    def _describe_silence(self, status: RobotStatus) -> str | None:
         """Describe that the host runs but sends no status; None if it sends its status, or has ended."""
         if self._polls_without_status * POLL_S < MAX_SILENCE_S or not self._supervisor.is_host_running():
             return None
@@ -239,7 +246,7 @@ class RunMonitor:
         activity = PROCESS_STATES.get(state, "is there")
         return f"the host has sent no status for {MAX_SILENCE_S:g} s, since tick {status.tick}; its process {activity}"
 
-    def _print_recovery(self, status: Status) -> None:
+    def _print_recovery(self, status: RobotStatus) -> None:
         """Print a new fault or emergency stop once, and how to recover from it."""
         if status.lifecycle not in ("fault", "estop"):
             self._last_latched = None
@@ -294,7 +301,7 @@ class RunMonitor:
         """Note that the recorder has subscribed and receives all further messages. Called in Zenoh's thread."""
         self._recorder_is_ready |= present
 
-    def _request_arming(self, robot: Description) -> None:
+    def _request_arming(self, robot: RobotDescription) -> None:
         """Request arming over the private channel, which reaches only the host that this run has started."""
         host = self._supervisor.host
         assert host is not None

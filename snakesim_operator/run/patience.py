@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 
-from snakesim_hal.wire.messages import Status
+from snakesim_hal.wire.messages import RobotStatus
 
 # A longer pause between two statuses means that the host or this process is slow, so the excess does not count.
 MAX_STATUS_PERIOD_S = 1.0
@@ -25,11 +25,11 @@ class StartupTimeout:
         """
         self.timeout_s = timeout_s
         self._services = frozenset(services)
-        self._last_status: Status | None = None
+        self._last_status: RobotStatus | None = None
         self._last_arrival_s = 0.0
         self._elapsed_s = 0.0
 
-    def update_and_check_expired(self, status: Status | None, now_s: float) -> bool:
+    def update_and_check_expired(self, status: RobotStatus | None, now_s: float) -> bool:
         """Add the time since the previous status, and return whether the sum exceeds the timeout.
 
         While ticks advance, robot time (the timestamps of the statuses) is added. Otherwise real time is added, at most
@@ -53,7 +53,7 @@ class StartupTimeout:
             self._elapsed_s += min(elapsed_s, MAX_STATUS_PERIOD_S)
         return self._elapsed_s > self.timeout_s
 
-    def _should_restart(self, last_status: Status, status: Status) -> bool:
+    def _should_restart(self, last_status: RobotStatus, status: RobotStatus) -> bool:
         """Return whether the count restarts: the robot is ready, a service is missing, or the services have changed."""
         if status.ready_to_arm or self._services.difference(status.alive):
             return True

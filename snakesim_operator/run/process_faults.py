@@ -12,15 +12,15 @@ from queue import SimpleQueue
 
 from snakesim_hal.base.errors import ConfigError, RefusedError, WireError
 from snakesim_hal.base.process import step_wall_clock
-from snakesim_hal.model.fault_kinds import RUN, Injection, InjectionPlan, validate_and_complete_injection
+from snakesim_hal.model.fault_kinds import RUN, FaultInjection, InjectionPlan, validate_and_complete_injection
 from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Query
+from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import Answer, Clock, Description, FaultRequest, LifecycleState
-from snakesim_operator.run.supervisor import Supervisor
+from snakesim_hal.wire.codec import MessageDecoder
+from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState, RobotDescription
+from snakesim_operator.run.supervisor import RunSupervisor
 
 REQUEST_ROUTING_PROCESSES = ("host", "router")
 MAX_REASON_CHARACTERS = 500
@@ -53,7 +53,7 @@ class ProcessFaults:
     """Injects the faults that the scenario plans, and those that clients request on `fault/run`."""
 
     def __init__(
-        self, config: RunConfig, session: Session, supervisor: Supervisor, print_text: Callable[[str], None]
+        self, config: RunConfig, session: Session, supervisor: RunSupervisor, print_text: Callable[[str], None]
     ) -> None:
         """Prepare the faults of processes that the scenario plans, and accept requests for further ones.
 
@@ -71,13 +71,13 @@ class ProcessFaults:
         )
         self._time = RobotTime(session) if self._has_plan() else None  # each clock message wakes this process
         self._resume_time_by_process: dict[str, float] = {}  # name of a process -> monotonic time at which it continues
-        self._requested_injections: list[Injection] = []  # begin at the next `apply_due_faults`
+        self._requested_injections: list[FaultInjection] = []  # begin at the next `apply_due_faults`
         self._clock_offset_s = 0.0
-        self._decoder = Decoder(FaultRequest)
-        self._queries: SimpleQueue[Query] = SimpleQueue()
+        self._decoder = MessageDecoder(FaultRequest)
+        self._queries: SimpleQueue[IncomingQuery] = SimpleQueue()
         session.on_query(keys.fault_key(RUN), self._queries.put)
 
-    def describe_refusal(self, robot: Description) -> str | None:
+    def describe_refusal(self, robot: RobotDescription) -> str | None:
         """Describe why the planned faults are not allowed on a robot; None if they are, or if there are none."""
         if not self._has_plan():
             return None
@@ -87,7 +87,7 @@ class ProcessFaults:
         """Return whether a planned fault has not started yet."""
         return self._plan.next_transition_s() != inf
 
-    def apply_due_faults(self, robot: Description | None, lifecycle: LifecycleState) -> None:
+    def apply_due_faults(self, robot: RobotDescription | None, lifecycle: LifecycleState) -> None:
         """Start and end the faults that are due, and respond to requests.
 
         Args:
@@ -123,7 +123,9 @@ class ProcessFaults:
         if self._clock_offset_s:
             step_wall_clock(-self._clock_offset_s)
 
-    def _handle_request(self, query: Query, robot: Description | None, lifecycle: LifecycleState) -> Answer:
+    def _handle_request(
+        self, query: IncomingQuery, robot: RobotDescription | None, lifecycle: LifecycleState
+    ) -> Answer:
         """Start or end a fault as requested, if that is allowed, and return the response.
 
         Args:
@@ -144,7 +146,7 @@ class ProcessFaults:
             request = self._decoder.decode(query.payload, query.encoding)
             end_s = request.for_s or inf
             injection = validate_and_complete_injection(
-                Injection(request.kind, request.target, 0.0, end_s, request.amount)
+                FaultInjection(request.kind, request.target, 0.0, end_s, request.amount)
             )
             if request.end:
                 self._end_fault(injection)
@@ -162,7 +164,7 @@ class ProcessFaults:
             return refuse(str(error), "not_permitted")
         return Answer(ok=True, reason=f"begins: {injection.kind}:{injection.target}", lifecycle=lifecycle)
 
-    def _describe_prohibition(self, robot: Description) -> str | None:
+    def _describe_prohibition(self, robot: RobotDescription) -> str | None:
         """Describe why faults may not be injected into a robot; None if they may."""
         if robot.emulated or self._is_injection_allowed:
             return None
@@ -171,7 +173,7 @@ class ProcessFaults:
             "`allow_fault_injection = true` in the scenario, or --set allow_fault_injection=true"
         )
 
-    def _validate_injection(self, injection: Injection) -> None:
+    def _validate_injection(self, injection: FaultInjection) -> None:
         """Raise ConfigError for a requested fault that this run cannot inject, or could not end."""
         if injection.executing_part != RUN:
             raise ConfigError(
@@ -190,7 +192,7 @@ class ProcessFaults:
                 code="injection/not-supported",
             )
 
-    def _start_fault(self, injection: Injection) -> None:
+    def _start_fault(self, injection: FaultInjection) -> None:
         """Inject a fault now: send a signal to a process, or step the wall clock."""
         self._print_text(f"injected fault: {injection.kind}:{injection.target}")
         if injection.target_type != "process":
@@ -202,7 +204,7 @@ class ProcessFaults:
         if injection.kind == "freeze":
             self._resume_time_by_process[injection.target] = time.monotonic() + injection.end_s - injection.start_s
 
-    def _end_fault(self, injection: Injection) -> None:
+    def _end_fault(self, injection: FaultInjection) -> None:
         """End a freeze before its time. Raises ConfigError for a fault that is not active."""
         if injection.target not in self._resume_time_by_process:
             raise ConfigError(

@@ -25,7 +25,7 @@ class ThreadUsage(NamedTuple):
     ready: bool  # ready to run, or running
 
 
-class Sample(NamedTuple):
+class WaitSample(NamedTuple):
     """How long each process had waited for a processor, up to one point in time."""
 
     time_s: float
@@ -72,7 +72,7 @@ class ProcessorWaits:
         self._read = read
         self._clock = clock
         self._last_change: dict[int, tuple[ThreadUsage, float]] = {}  # of each thread: its usage, and when that was new
-        self._samples: deque[Sample] = deque()
+        self._samples: deque[WaitSample] = deque()
 
     def take_sample(self, pids: Mapping[str, int]) -> None:
         """Sample the counters of processes, given as process ids by name. Call this several times per lease."""
@@ -81,7 +81,7 @@ class ProcessorWaits:
         waited_s: dict[str, float] = {}
         for name, threads in usages.items():
             waited_s[name] = sum(self._update_waited_s(thread, usage, now_s) for thread, usage in threads.items())
-        self._samples.append(Sample(now_s, waited_s))
+        self._samples.append(WaitSample(now_s, waited_s))
         while len(self._samples) > 2 and now_s - self._samples[1].time_s > HISTORY_S:
             self._samples.popleft()
 
@@ -101,10 +101,10 @@ class ProcessorWaits:
                     longest = wait
         return longest
 
-    def _find_sample_after_lease(self, first: Sample, later: list[Sample]) -> Sample | None:
+    def _find_sample_after_lease(self, first: WaitSample, later: list[WaitSample]) -> WaitSample | None:
         return next((sample for sample in later if sample.time_s - first.time_s >= self._lease_s), None)
 
-    def _find_long_waits(self, first: Sample, last: Sample) -> list[LongWait]:
+    def _find_long_waits(self, first: WaitSample, last: WaitSample) -> list[LongWait]:
         """Return the processes that waited too long between two samples."""
         window_s = last.time_s - first.time_s
         max_wait_s = MIN_LONG_WAIT_FRACTION * max(self._lease_s, 0.5 * window_s)

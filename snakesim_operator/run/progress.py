@@ -6,7 +6,7 @@ from typing import Self
 
 from snakesim_hal.base.terminal import overwrite_line, print_line
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import ControlState, Status
+from snakesim_hal.wire.messages import ControlState, RobotStatus
 
 TERMINAL_PERIOD_S = 0.1  # between two updates of the line on a terminal
 PLAIN_PERIOD_S = 5.0  # between two lines in a file or pipe
@@ -36,7 +36,7 @@ class StatusLine:
             print_line(text)
 
 
-class Progress(StatusLine):
+class RunProgress(StatusLine):
     """Shows the progress of a run as a status line."""
 
     def __init__(self, config: RunConfig) -> None:
@@ -52,7 +52,7 @@ class Progress(StatusLine):
         # The robot.
         self._origin: tuple[float, float] | None = None  # wall and robot time at arming, in s
         self._armed_s = 0.0  # armed robot time so far, which a run's duration counts
-        self._last_status: Status | None = None
+        self._last_status: RobotStatus | None = None
         self._was_armed = False
 
     def reset(self) -> None:
@@ -61,7 +61,7 @@ class Progress(StatusLine):
         self._last_status = None
         self._armed_s = 0.0
 
-    def update(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
+    def update(self, status: RobotStatus | None, control: ControlState | None, *, armed: bool) -> None:
         """Update the progress line, if an update is due.
 
         Args:
@@ -88,14 +88,14 @@ class Progress(StatusLine):
             self.show_text(text)
         self._last_text = text
 
-    def _count_armed_time(self, status: Status) -> None:
+    def _count_armed_time(self, status: RobotStatus) -> None:
         """Add the robot time since the last status, if the robot was armed then."""
         last = self._last_status
         self._last_status = status
         if last is not None and last.lifecycle == "armed":
             self._armed_s += max(status.tick - last.tick, 0) / self._rate_hz
 
-    def _describe_run(self, status: Status, control: ControlState | None, now: float) -> str:
+    def _describe_run(self, status: RobotStatus, control: ControlState | None, now: float) -> str:
         parts = [
             f"{min(self._armed_s, self._duration_s):6.2f} of {self._duration_s:g} s",
             *self._describe_speed(status, now),
@@ -108,7 +108,7 @@ class Progress(StatusLine):
             parts += _describe_control(control)
         return "  ".join(parts)
 
-    def _describe_speed(self, status: Status, now: float) -> list[str]:
+    def _describe_speed(self, status: RobotStatus, now: float) -> list[str]:
         """Return the speed relative to real time, and the wall time left; empty shortly after arming."""
         assert self._origin is not None
         origin_wall_s, origin_robot_s = self._origin

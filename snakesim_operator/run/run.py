@@ -19,7 +19,7 @@ from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig, encode_config
 from snakesim_hal.network.endpoint import require_safe_listening_endpoint
 from snakesim_hal.network.local_registry import LocalRobot, register_robot
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_hal.service import SERVICE_START_LIMIT_S
@@ -32,7 +32,7 @@ from snakesim_operator.run.folder import choose_default_folder, lock_run_folder
 from snakesim_operator.run.meeting import check_no_other_robot, reserve_endpoint
 from snakesim_operator.run.monitor import RUN_ON_AFTER_FAULT_S, RunMonitor
 from snakesim_operator.run.run_files import RunFiles
-from snakesim_operator.run.supervisor import HOST, Supervisor
+from snakesim_operator.run.supervisor import HOST, RunSupervisor
 
 CONNECT_TIMEOUT_S = 0.5
 REPORT_PERIOD_S = 20.0  # between two lines on the terminal while the host has not opened its network
@@ -72,12 +72,12 @@ class RunRequest:
         return self.config.robot.name
 
     @property
-    def router_link(self) -> Link | None:
+    def router_link(self) -> ConnectionSettings | None:
         """Link to the router of a lab that the run joins; None if its processes connect on this computer."""
         if self.session is not None:
-            return Link.from_session_file(self.session, self.robot_namespace)
+            return ConnectionSettings.from_session_file(self.session, self.robot_namespace)
         if self.router is not None:
-            return Link(self.router, self.robot_namespace)
+            return ConnectionSettings(self.router, self.robot_namespace)
         return None
 
 
@@ -95,7 +95,7 @@ def run_in_processes(request: RunRequest) -> int:
     link, stop_port = reserve_endpoint(request.endpoint, request.router_link, request.robot_namespace)
     ending = RunEnding()
     with contextlib.closing(stop_port), open_run_files(request.config, request.out) as (files, config_file):
-        supervisor = Supervisor(files, ending, print_line, stop_port, stay=request.stay)
+        supervisor = RunSupervisor(files, ending, print_line, stop_port, stay=request.stay)
         processes = _RunProcesses(request, supervisor, link, files, config_file)
         robot = LocalRobot.from_connection(
             link, request.config.robot.name, request.config.backend, stop_port, str(config_file.absolute())
@@ -122,12 +122,12 @@ def _check_request(request: RunRequest) -> None:
     check_no_other_robot(request.endpoint, request.router_link)
 
 
-def _conclude_run(request: RunRequest, supervisor: Supervisor, files: RunFiles, ending: RunEnding) -> int:
+def _conclude_run(request: RunRequest, supervisor: RunSupervisor, files: RunFiles, ending: RunEnding) -> int:
     """Write and print the results of a run, close its files, and return the exit code."""
     # Imported only now, because the start of the robot does not need it.
-    from snakesim_operator.run.conclusion import Outcome, write_and_print_results
+    from snakesim_operator.run.conclusion import RunConclusion, write_and_print_results
 
-    outcome = Outcome(
+    outcome = RunConclusion(
         host_record=supervisor.read_host_record(),
         description=supervisor.get_description(),
         restarts=supervisor.restarts,
@@ -206,7 +206,12 @@ class _RunProcesses:
     """Starts the processes of one run: router, host, services and recorder, each with its command line."""
 
     def __init__(
-        self, request: RunRequest, supervisor: Supervisor, link: Link, files: RunFiles, config_file: Path
+        self,
+        request: RunRequest,
+        supervisor: RunSupervisor,
+        link: ConnectionSettings,
+        files: RunFiles,
+        config_file: Path,
     ) -> None:
         self.request = request
         self.supervisor = supervisor
@@ -285,7 +290,7 @@ def _run_until_over(processes: _RunProcesses, ending: RunEnding) -> None:
         supervisor.end_all_processes()
 
 
-def _print_start(config: RunConfig, link: Link) -> None:
+def _print_start(config: RunConfig, link: ConnectionSettings) -> None:
     print_line(
         f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander_name}, {config.clock_mode}"
     )
@@ -295,7 +300,7 @@ def _print_start(config: RunConfig, link: Link) -> None:
 
 
 @contextlib.contextmanager
-def _open_run_session(link: Link, supervisor: Supervisor, ending: RunEnding) -> Iterator[Session]:
+def _open_run_session(link: ConnectionSettings, supervisor: RunSupervisor, ending: RunEnding) -> Iterator[Session]:
     """Connect to the network of the run, and retry until the host has opened it.
 
     Args:

@@ -23,14 +23,14 @@ DISK_TIMEOUT_S = 5.0  # for a disk that hangs
 
 
 @dataclass
-class _Task:
+class _FileOperation:
     """One operation on a file. For a rename, `content` is the new name."""
 
     kind: Literal["append", "put", "rename"]
     name: str
     content: bytes
 
-    def can_merge(self, other: "_Task") -> bool:
+    def can_merge(self, other: "_FileOperation") -> bool:
         """Return whether the content of another task can be added to this one."""
         appends_to_same_file = self.kind == other.kind == "append" and self.name == other.name
         return appends_to_same_file and len(self.content) < MAX_MERGED_BYTES
@@ -51,7 +51,7 @@ class RunFiles:
         self._failure = ""  # of the last attempt
         self._warned = False
         self._lost = ""  # why data was lost
-        self._tasks: deque[_Task] = deque()
+        self._tasks: deque[_FileOperation] = deque()
         self._waiting_bytes = 0
         self._appended: dict[str, int] = {}  # bytes, by name
         self._handles: dict[str, int] = {}
@@ -66,16 +66,16 @@ class RunFiles:
             self._lost = self._lost or f"{name} is longer than {MAX_LOG_BYTES >> 20} MiB: the rest of it is lost"
             return
         self._appended[name] = appended_bytes
-        self._add_task(_Task("append", name, content))
+        self._add_task(_FileOperation("append", name, content))
 
     def write_file(self, name: str, content: bytes) -> None:
         """Write a whole file atomically, in place of an earlier one."""
-        self._add_task(_Task("put", name, content))
+        self._add_task(_FileOperation("put", name, content))
 
     def rename(self, name: str, to: str) -> None:
         """Rename a file that was appended to; later appends start a new file."""
         self._appended.pop(name, None)
-        self._add_task(_Task("rename", name, to.encode()))
+        self._add_task(_FileOperation("rename", name, to.encode()))
 
     def warn(self, failure: str) -> None:
         """Warn once that a file cannot be written, by this or another process."""
@@ -102,7 +102,7 @@ class RunFiles:
             return f"{self.folder}: the disk has not answered for {DISK_TIMEOUT_S:g} s"
         return self._lost
 
-    def _add_task(self, task: _Task) -> None:
+    def _add_task(self, task: _FileOperation) -> None:
         with self._changed:
             if self.folder is None:
                 return
@@ -155,7 +155,7 @@ class RunFiles:
                 self._lost = self._lost or f"{self.folder}: {task.name} was not written: {error}"
             self._changed.notify_all()
 
-    def _try_task(self, task: _Task) -> str:
+    def _try_task(self, task: _FileOperation) -> str:
         """Try to carry out a task. The unwritten rest of an append stays in the task.
 
         Returns:
@@ -174,7 +174,7 @@ class RunFiles:
             return f"{self.folder}: {error.strerror}"
         return ""
 
-    def _append(self, folder: Path, task: _Task) -> None:
+    def _append(self, folder: Path, task: _FileOperation) -> None:
         """Append the content of a task to its file. A new file that stays empty on a full disk is removed."""
         path = folder / task.name
         if task.name not in self._handles:

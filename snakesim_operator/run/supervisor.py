@@ -19,10 +19,10 @@ from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.network.run_key import RUN_KEY, new_run_key
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import Description
-from snakesim_operator.results.summary import Restart
+from snakesim_hal.wire.messages import RobotDescription
+from snakesim_operator.results.summary import ProcessRestart
 from snakesim_operator.run import children
-from snakesim_operator.run.children import Child
+from snakesim_operator.run.children import ChildProcess
 from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.run_files import RunFiles
 
@@ -41,7 +41,7 @@ class SupervisedProcess:
     name: str
     arguments: Sequence[str]
     may_restart: bool
-    child: Child
+    child: ChildProcess
     vital: bool = True  # whether the run ends when this process ends
     started_s: float = field(default_factory=time.monotonic)
     delay_s: float = MIN_RESTART_DELAY_S
@@ -68,7 +68,7 @@ class SupervisedProcess:
         return self.restart_due_s is not None and time.monotonic() >= self.restart_due_s
 
 
-class Supervisor:
+class RunSupervisor:
     """Supervises all processes of a run."""
 
     def __init__(
@@ -91,7 +91,7 @@ class Supervisor:
             stay: Whether processes that end are restarted, once the run has started up.
         """
         # What the run reports about its processes.
-        self.restarts: list[Restart] = []
+        self.restarts: list[ProcessRestart] = []
         self.losses_by_process: dict[str, str] = {}  # last output of each ended process that was not vital
         self.has_started_up = False  # until then a restart would not help a process that ends
 
@@ -123,14 +123,14 @@ class Supervisor:
         child = self._launch(name, arguments)
         self._processes[name] = SupervisedProcess(name, arguments, may_restart, child, vital)
 
-    def _launch(self, name: str, arguments: Sequence[str]) -> Child:
+    def _launch(self, name: str, arguments: Sequence[str]) -> ChildProcess:
         """Start a process of the run, whose output is appended to its log."""
         on_output = partial(self._files.append, f"{name}.log")
         if name == HOST:
             return self._launch_host(arguments, on_output)
         return children.start_child(name, arguments, on_output, extra_env=self._secret)
 
-    def _launch_host(self, arguments: Sequence[str], on_output: Callable[[bytes], object]) -> Child:
+    def _launch_host(self, arguments: Sequence[str], on_output: Callable[[bytes], object]) -> ChildProcess:
         """Start a host that inherits the stop port and its end of a new private channel."""
         supervisor_end, host_end = socket_pair()
         with host_end:
@@ -156,7 +156,7 @@ class Supervisor:
             return msgspec.json.decode(content, type=HostRecord)
         return None
 
-    def get_description(self) -> Description | None:
+    def get_description(self) -> RobotDescription | None:
         """Return the description that the host sent; None while it is unknown."""
         return self.host.description if self.host is not None else None
 
@@ -174,7 +174,7 @@ class Supervisor:
 
     def _note_restart(self, name: str, how: str, delay_s: float) -> None:
         elapsed_s = time.monotonic() - self._start_time_s
-        self.restarts.append(Restart(name=name, how=how, at_s=round(elapsed_s, 3), after_s=delay_s))
+        self.restarts.append(ProcessRestart(name=name, how=how, at_s=round(elapsed_s, 3), after_s=delay_s))
 
     @property
     def process_names(self) -> list[str]:
@@ -327,6 +327,6 @@ class Supervisor:
                 self._print_text(line)
 
 
-def _was_starting(child: Child) -> bool:
+def _was_starting(child: ChildProcess) -> bool:
     """Return whether the request to end reached a host or recorder before it had a handler for that signal."""
     return child.is_end_requested and child.process.returncode == -signal.SIGTERM

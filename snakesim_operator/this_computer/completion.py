@@ -56,7 +56,7 @@ complete -o bashdefault -o default -F _snakesim snakesim
 
 
 @dataclass
-class Completions:
+class CommandCompletions:
     """The words that can follow one command; the path of the command is empty, ` run`, ` robot arm` and so on."""
 
     path: str
@@ -89,7 +89,7 @@ def generate_completion_script(parser: argparse.ArgumentParser, shell: str) -> I
     yield from text.replace("@WORDS@", "\n".join(words)).splitlines()
 
 
-def _find_completions(parser: argparse.ArgumentParser, command_path: str) -> Iterator[Completions]:
+def _find_completions(parser: argparse.ArgumentParser, command_path: str) -> Iterator[CommandCompletions]:
     """Yield the completions of a command, then those of each of its subcommands.
 
     Args:
@@ -97,8 +97,8 @@ def _find_completions(parser: argparse.ArgumentParser, command_path: str) -> Ite
         command_path: Words of the command behind `snakesim`, each after a space, such as ` robot arm`; empty for
             `snakesim` itself.
     """
-    completions = Completions(command_path)
-    subcommand_completions: list[Completions] = []
+    completions = CommandCompletions(command_path)
+    subcommand_completions: list[CommandCompletions] = []
     for action in parser._actions:
         is_internal = action.help == argparse.SUPPRESS and action.option_strings  # only other processes use it
         if is_internal:

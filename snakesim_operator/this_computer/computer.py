@@ -65,7 +65,7 @@ print(load_shared_library(LAWS_LIBRARY).problem)
 """
 
 
-class Finding(msgspec.Struct, frozen=True, kw_only=True):
+class ComputerFinding(msgspec.Struct, frozen=True, kw_only=True):
     """One line of the report."""
 
     what: str
@@ -75,17 +75,17 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
     code: str | None = None  # of the error that was found
 
 
-def check_python() -> Iterator[Finding]:
+def check_python() -> Iterator[ComputerFinding]:
     """Check the version of the interpreter."""
     detail = f"{sys.version.split()[0]} at {sys.executable}"
     if sys.version_info >= MIN_PYTHON:
-        yield Finding(what="Python", state="ok", detail=detail)
+        yield ComputerFinding(what="Python", state="ok", detail=detail)
     else:
         fix = ["make setup PYTHON=python3.11"]
-        yield Finding(what="Python", state="fail", detail=f"{detail}; 3.11 or newer is needed", fix=fix)
+        yield ComputerFinding(what="Python", state="fail", detail=f"{detail}; 3.11 or newer is needed", fix=fix)
 
 
-def check_packages() -> Iterator[Finding]:
+def check_packages() -> Iterator[ComputerFinding]:
     """Check whether the packages that SnakeSIM requires, by its package metadata, are installed.
 
     Yields:
@@ -110,10 +110,12 @@ def check_packages() -> Iterator[Finding]:
         if extra in missing_by_extra:
             yield _make_missing_packages_finding(extra, missing_by_extra[extra])
         else:
-            yield Finding(what=_format_packages_label(extra), state="ok", detail=", ".join(installed_by_extra[extra]))
+            yield ComputerFinding(
+                what=_format_packages_label(extra), state="ok", detail=", ".join(installed_by_extra[extra])
+            )
 
 
-def _make_missing_packages_finding(extra: str, names: list[str]) -> Finding:
+def _make_missing_packages_finding(extra: str, names: list[str]) -> ComputerFinding:
     """Make the finding for missing packages. An extra may be left out on purpose, so it is no failure.
 
     Args:
@@ -124,27 +126,27 @@ def _make_missing_packages_finding(extra: str, names: list[str]) -> Finding:
     packages = ", ".join(names)
     if extra:
         fix = ["make setup", f"python -m pip install 'snakesim[{extra}]'"]
-        return Finding(what=what, state="ok", detail=f"left out, needs: {packages}", fix=fix)
+        return ComputerFinding(what=what, state="ok", detail=f"left out, needs: {packages}", fix=fix)
     fix = ["make setup", "python -m pip install --force-reinstall snakesim"]
-    return Finding(what=what, state="fail", detail=f"missing: {packages}", fix=fix)
+    return ComputerFinding(what=what, state="fail", detail=f"missing: {packages}", fix=fix)
 
 
 def _format_packages_label(extra: str) -> str:
     return f"packages [{extra}]" if extra else "packages"
 
 
-def check_laws() -> Iterator[Finding]:
+def check_laws() -> Iterator[ComputerFinding]:
     """Check that the simulator's ground and friction laws run in C."""
     if not extras.is_installed("sim"):
         return
     what = "Physics in C"
     problem = _run_python_program(PHYSICS_LIBRARY_PROBE_PROGRAM)
     if not problem:
-        yield Finding(what=what, state="ok", detail="ground and friction are computed in MuJoCo's engine")
+        yield ComputerFinding(what=what, state="ok", detail="ground and friction are computed in MuJoCo's engine")
         return
     detail = f"{LAWS_LIBRARY.python_cost}, with the same results: {problem}"
     fix = ["sudo apt install gcc libc6-dev", "python -m pip install ziglang"]
-    yield Finding(what=what, state="warn", detail=detail, fix=fix)
+    yield ComputerFinding(what=what, state="warn", detail=detail, fix=fix)
 
 
 def _run_python_program(program: str) -> str:
@@ -162,7 +164,7 @@ def _run_python_program(program: str) -> str:
     return completed.stdout.strip() or completed.stderr.strip()[-MAX_ERROR_LENGTH:]
 
 
-def check_opengl() -> Iterator[Finding]:
+def check_opengl() -> Iterator[ComputerFinding]:
     """Check that MuJoCo can render without a screen. Color images, videos and the model `rendered` need that."""
     if not extras.is_installed("sim"):
         return
@@ -173,11 +175,11 @@ def check_opengl() -> Iterator[Finding]:
             detail = f"{renderer.upper()} draws without a screen"
             if renderer != "egl":
                 detail += f"; set MUJOCO_GL={renderer} for every run"
-            yield Finding(what="OpenGL", state="ok", detail=detail)
+            yield ComputerFinding(what="OpenGL", state="ok", detail=detail)
             return
         errors.append(f"{renderer.upper()}: {error}")
     detail = f"no color images and videos: {'; '.join(errors)}"
-    yield Finding(what="OpenGL", state="warn", detail=detail, fix=["sudo apt install libegl1 libgl1-mesa-dri"])
+    yield ComputerFinding(what="OpenGL", state="warn", detail=detail, fix=["sudo apt install libegl1 libgl1-mesa-dri"])
 
 
 def _find_render_error(renderer: str) -> str | None:
@@ -210,7 +212,7 @@ def _find_render_error(renderer: str) -> str | None:
     return error_lines[-1][:MAX_ERROR_LENGTH]
 
 
-def check_can() -> Iterator[Finding]:
+def check_can() -> Iterator[ComputerFinding]:
     """Check that the kernel has SocketCAN, and that its interfaces are up."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
@@ -220,20 +222,20 @@ def check_can() -> Iterator[Finding]:
         )
         run_in_vm = "python3 deploy/vm/with_vcan.py -- .venv/bin/snakesim run triplet --backend can"
         fix = ["sudo modprobe -a can_raw vcan", run_in_vm]
-        yield Finding(what="CAN", state="warn", detail=detail, fix=fix)
+        yield ComputerFinding(what="CAN", state="warn", detail=detail, fix=fix)
         return
     interfaces: list[str] = []
     for type_file in Path("/sys/class/net").glob("*/type"):
         if type_file.read_text().strip() == ARPHRD_CAN:
             interfaces.append(type_file.parent.name)
     if not interfaces:
-        yield Finding(what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"])
+        yield ComputerFinding(what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"])
         return
     up_interfaces = [name for name in interfaces if _is_interface_up(name)]
     down_interfaces = [name for name in interfaces if name not in up_interfaces]
     detail = f"up: {', '.join(up_interfaces) or 'none'}"
     fix = [f"sudo ip link set {name} up" for name in down_interfaces]
-    yield Finding(what="CAN", state="warn" if down_interfaces else "ok", detail=detail, fix=fix)
+    yield ComputerFinding(what="CAN", state="warn" if down_interfaces else "ok", detail=detail, fix=fix)
 
 
 def _is_interface_up(name: str) -> bool:
@@ -244,20 +246,22 @@ def _is_interface_up(name: str) -> bool:
     return bool(flags & IFF_UP)
 
 
-def check_kvm() -> Iterator[Finding]:
+def check_kvm() -> Iterator[ComputerFinding]:
     """Check that virtual machines, in which CAN is tested, are fast."""
     device = Path("/dev/kvm")
     if os.access(device, os.R_OK | os.W_OK):
-        yield Finding(what="KVM", state="ok", detail=f"{device} can be used")
+        yield ComputerFinding(what="KVM", state="ok", detail=f"{device} can be used")
     elif device.exists():
         fix = ["sudo usermod -aG kvm $USER    # then log in again"]
-        yield Finding(what="KVM", state="warn", detail=f"no permission for {device}; VMs for CAN are slow", fix=fix)
+        yield ComputerFinding(
+            what="KVM", state="warn", detail=f"no permission for {device}; VMs for CAN are slow", fix=fix
+        )
     else:
         detail = f"no {device}: VMs for CAN are emulated, and slow; switch virtualization on in the BIOS or the cloud"
-        yield Finding(what="KVM", state="warn", detail=detail)
+        yield ComputerFinding(what="KVM", state="warn", detail=detail)
 
 
-def check_clocks() -> Iterator[Finding]:
+def check_clocks() -> Iterator[ComputerFinding]:
     """Check how late a process without priority wakes up, and whether wall time is synchronized.
 
     Robot time depends on wake-ups only.
@@ -265,12 +269,12 @@ def check_clocks() -> Iterator[Finding]:
     yield _check_wake_ups()
     if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)) == ADJTIMEX_TIME_ERROR:
         detail = "not synchronized; only dates of records and of other machines' certificates depend on it"
-        yield Finding(what="wall clock", state="warn", detail=detail, fix=["sudo timedatectl set-ntp true"])
+        yield ComputerFinding(what="wall clock", state="warn", detail=detail, fix=["sudo timedatectl set-ntp true"])
     else:
-        yield Finding(what="wall clock", state="ok", detail="synchronized")
+        yield ComputerFinding(what="wall clock", state="ok", detail="synchronized")
 
 
-def _check_wake_ups() -> Finding:
+def _check_wake_ups() -> ComputerFinding:
     """Sleep many times, and report how late the process wakes up."""
     delays_s: list[float] = []
     for _ in range(WAKE_UP_COUNT):
@@ -285,18 +289,18 @@ def _check_wake_ups() -> Finding:
     )
     if p99_s > MAX_WAKE_UP_DELAY_S:
         fix = ["uptime    # is something else running?"]
-        return Finding(what="wake-ups", state="warn", detail=detail, fix=fix)
-    return Finding(what="wake-ups", state="ok", detail=detail)
+        return ComputerFinding(what="wake-ups", state="warn", detail=detail, fix=fix)
+    return ComputerFinding(what="wake-ups", state="ok", detail=detail)
 
 
-def check_real_time() -> Iterator[Finding]:
+def check_real_time() -> Iterator[ComputerFinding]:
     """Check that this user may have what host and services need in real time: priority, locked memory, open files."""
     yield _check_priority()
     yield _check_memory_lock()
     yield _check_open_files()
 
 
-def _check_priority() -> Finding:
+def _check_priority() -> ComputerFinding:
     """Try a real-time priority, and restore the priority of this process."""
     policy_before = os.sched_getscheduler(0)
     parameters_before = os.sched_getparam(0)
@@ -308,25 +312,27 @@ def _check_priority() -> Finding:
             f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs miss ticks on a busy machine"
         )
         fix = [_format_limit_command(f"rtprio {HOST_PRIORITY}")]
-        return Finding(what="priority", state="warn", detail=detail, fix=fix)
-    return Finding(what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted")
+        return ComputerFinding(what="priority", state="warn", detail=detail, fix=fix)
+    return ComputerFinding(what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted")
 
 
-def _check_memory_lock() -> Finding:
+def _check_memory_lock() -> ComputerFinding:
     """Try to lock the memory of this process, and unlock it again."""
     refusal = lock_memory()
     ctypes.CDLL(None).munlockall()
     if refusal is None:
-        return Finding(what="memory lock", state="ok", detail="granted")
-    return Finding(what="memory lock", state="warn", detail=refusal, fix=[_format_limit_command("memlock unlimited")])
+        return ComputerFinding(what="memory lock", state="ok", detail="granted")
+    return ComputerFinding(
+        what="memory lock", state="warn", detail=refusal, fix=[_format_limit_command("memlock unlimited")]
+    )
 
 
-def _check_open_files() -> Finding:
+def _check_open_files() -> ComputerFinding:
     soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     detail = f"{soft_limit}, at most {hard_limit}"
     if hard_limit == resource.RLIM_INFINITY or hard_limit >= MIN_OPEN_FILES:
-        return Finding(what="open files", state="ok", detail=detail)
-    return Finding(what="open files", state="warn", detail=detail, fix=[_format_limit_command("nofile 8192")])
+        return ComputerFinding(what="open files", state="ok", detail=detail)
+    return ComputerFinding(what="open files", state="warn", detail=detail, fix=[_format_limit_command("nofile 8192")])
 
 
 def _format_limit_command(limit: str) -> str:
@@ -334,17 +340,19 @@ def _format_limit_command(limit: str) -> str:
     return f'echo "$USER - {limit}" | sudo tee -a {LIMITS_FILE}    # then log in again'
 
 
-def check_disk() -> Iterator[Finding]:
+def check_disk() -> Iterator[ComputerFinding]:
     """Check that runs can be recorded in the present folder, where `runs/` is made."""
     folder = Path.cwd()
     free_bytes = shutil.disk_usage(folder).free
     if not os.access(folder, os.W_OK):
-        yield Finding(what="disk", state="warn", detail=f"{folder} is read-only; give runs an --out", fix=["cd ~"])
+        yield ComputerFinding(
+            what="disk", state="warn", detail=f"{folder} is read-only; give runs an --out", fix=["cd ~"]
+        )
         return
     detail = f"{free_bytes / GB:.1f} GB free in {folder}"
     if free_bytes >= WARN_FREE_BYTES:
-        yield Finding(what="disk", state="ok", detail=detail)
+        yield ComputerFinding(what="disk", state="ok", detail=detail)
         return
     fix = ["du -sh runs/* | sort -h    # and remove what is not needed"]
     state = "warn" if free_bytes >= MIN_FREE_BYTES else "fail"
-    yield Finding(what="disk", state=state, detail=detail, fix=fix)
+    yield ComputerFinding(what="disk", state=state, detail=detail, fix=fix)

@@ -7,11 +7,11 @@ import msgspec
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.this_computer import computer
-from snakesim_operator.this_computer.computer import Finding
+from snakesim_operator.this_computer.computer import ComputerFinding
 from snakesim_operator.this_computer.kernel import check_kernel
 from snakesim_operator.this_computer.network_findings import check_ports, check_routers
 
-CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+CHECKS: tuple[Callable[[], Iterator[ComputerFinding]], ...] = (
     computer.check_python,
     computer.check_packages,
     computer.check_laws,
@@ -35,7 +35,7 @@ def run_doctor(selection: RobotSelection, *, as_json: bool) -> int:
     Returns:
         The exit code: 1 if a run is not possible, 0 otherwise.
     """
-    findings: list[Finding] = []
+    findings: list[ComputerFinding] = []
     for check in (*CHECKS, check_ports, lambda: check_routers(selection)):
         for finding in check():
             findings.append(finding)
@@ -50,7 +50,7 @@ def run_doctor(selection: RobotSelection, *, as_json: bool) -> int:
     return 1 if failed_checks else 0
 
 
-def _print_finding(finding: Finding) -> None:
+def _print_finding(finding: ComputerFinding) -> None:
     print_line(f"{finding.state:<5}{finding.what:<21}{finding.detail}")
     for fix in finding.fix:
         print_line(f"     {'':<21}$ {fix}")

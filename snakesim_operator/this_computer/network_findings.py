@@ -10,23 +10,23 @@ from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.local_registry import list_local_robots
 from snakesim_hal.network.session import open_session
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_namespaces
-from snakesim_operator.this_computer.computer import Finding
+from snakesim_operator.this_computer.computer import ComputerFinding
 
 
-def check_ports() -> Iterator[Finding]:
+def check_ports() -> Iterator[ComputerFinding]:
     """Check whether the default endpoint is free, or used by a robot or by another program."""
     host, _, port = DEFAULT_ENDPOINT.partition("/")[2].rpartition(":")
     what = f"port {port}"
     robots = [robot for robot in list_local_robots() if robot.endpoint == DEFAULT_ENDPOINT]
     used_protocols = _find_used_protocols(host, int(port))
     if robots:
-        yield Finding(what=what, state="ok", detail=f"used by {robots[0].namespace}, process {robots[0].pid}")
+        yield ComputerFinding(what=what, state="ok", detail=f"used by {robots[0].namespace}, process {robots[0].pid}")
     elif used_protocols:
         protocols = " and ".join(used_protocols)
         detail = f"{protocols} used by another program; runs choose other ports, which the commands find here"
-        yield Finding(what=what, state="warn", detail=detail, fix=[f"ss -lntup | grep {port}"])
+        yield ComputerFinding(what=what, state="warn", detail=detail, fix=[f"ss -lntup | grep {port}"])
     else:
-        yield Finding(what=what, state="ok", detail="free")
+        yield ComputerFinding(what=what, state="ok", detail="free")
 
 
 def _find_used_protocols(host: str, port: int) -> list[str]:
@@ -43,7 +43,7 @@ def _find_used_protocols(host: str, port: int) -> list[str]:
     return used
 
 
-def check_routers(selection: RobotSelection) -> Iterator[Finding]:
+def check_routers(selection: RobotSelection) -> Iterator[ComputerFinding]:
     """Check that a Zenoh router answers at every named endpoint, or that has a robot of this computer."""
     links = selection.list_networks() if selection.endpoint or list_local_robots() else []
     for link in links:
@@ -55,7 +55,7 @@ def check_routers(selection: RobotSelection) -> Iterator[Finding]:
         except SnakesimError as error:
             fix = ["snakesim start router    # there; and is a firewall between?"]
             detail = f"{link.endpoint}: {error}"
-            yield Finding(what="endpoint", state="fail", detail=detail, fix=fix, code=error.code)
+            yield ComputerFinding(what="endpoint", state="fail", detail=detail, fix=fix, code=error.code)
             continue
         detail = f"{link.endpoint} answers in {duration_s * 1e3:.0f} ms: {robots}"
-        yield Finding(what="endpoint", state="ok", detail=detail)
+        yield ComputerFinding(what="endpoint", state="ok", detail=detail)

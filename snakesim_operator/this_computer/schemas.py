@@ -103,7 +103,7 @@ def _format_key_space_page() -> str:
         "",
         "Kinds: a *stream* is published regularly and old samples are useless; a *latched* value is kept for",
         "later subscribers, who must query it; a *query* is answered with an [Answer](messages/Answer.json);",
-        "*liveliness* is a token that vanishes with its process. A *tick* lasts `Description.period_ns`.",
+        "*liveliness* is a token that vanishes with its process. A *tick* lasts `RobotDescription.period_ns`.",
         "",
     ]
     return "\n".join(rows)

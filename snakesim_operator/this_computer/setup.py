@@ -13,7 +13,7 @@ from snakesim_hal.programs.arguments import (
     add_scenario_arguments,
     load_scenario_from_arguments,
 )
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 
 
 def _add_config(parser: argparse.ArgumentParser) -> None:
@@ -102,7 +102,7 @@ COMMANDS: Commands = (
         run=_run_router,
         examples=("start router", "start router lab/hub/router.main.json5"),
     ),
-    Noun(name="scenario", heading="files and computers", help="List what is shipped to be run."),
+    CommandGroup(name="scenario", heading="files and computers", help="List what is shipped to be run."),
     Command(
         name="scenario list",
         help="List the shipped scenarios, robots, scenes and suites.",

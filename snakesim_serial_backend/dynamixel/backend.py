@@ -13,13 +13,13 @@ from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.emulator import MAX_CURRENT, MODEL, EmulatedDynamixel, EmulatedModel
 from snakesim_serial_backend.dynamixel.load import PORT_LOAD
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
-from snakesim_serial_backend.dynamixel.port import Port
-from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, Servo
-from snakesim_serial_backend.dynamixel.servos import Servos, ServosContext
+from snakesim_serial_backend.dynamixel.port import DynamixelPort
+from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, DynamixelServo
+from snakesim_serial_backend.dynamixel.servos import DynamixelContext, DynamixelServos
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
 from snakesim_serial_backend.port_load import PortLoad
 from snakesim_serial_backend.servo_backend import OpenedPort, ServoBackend, find_travel_rad
-from snakesim_serial_backend.wire import Pty, is_emulated
+from snakesim_serial_backend.wire import PseudoTerminal, is_emulated
 
 UNKNOWN_CURRENT_UNIT_A = 0.00269  # of an emulated servo whose model the driver refuses
 
@@ -38,9 +38,9 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
         cls.validate_port_load(config, settings, joints)
 
     @classmethod
-    def open_servos(cls, opened_port: OpenedPort[EmulatedDynamixel]) -> Servos:
-        port = Port(opened_port.wire, opened_port.response_gap_s)
-        context = ServosContext(
+    def open_servos(cls, opened_port: OpenedPort[EmulatedDynamixel]) -> DynamixelServos:
+        port = DynamixelPort(opened_port.wire, opened_port.response_gap_s)
+        context = DynamixelContext(
             servos=[make_servo(joint, port, opened_port.settings) for joint in opened_port.joints],
             port=port,
             readings=opened_port.readings,
@@ -49,7 +49,7 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
             response_timeout_s=opened_port.response_timeout_s,
             clock_ns=opened_port.clock_ns,
         )
-        return Servos(context)
+        return DynamixelServos(context)
 
     @classmethod
     def make_emulator(
@@ -57,7 +57,7 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
         joints: Sequence[Joint],
         settings: DynamixelSettings,
         body: EmulatedBody,
-        ptys: Sequence[Pty],
+        ptys: Sequence[PseudoTerminal],
         clock: DriverClock,
     ) -> EmulatedDynamixel:
         model = select_emulated_model(settings)
@@ -65,12 +65,12 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
         return EmulatedDynamixel(body, ptys, torque_constants_nm_per_a, settings.baud, clock.now_ns, model)
 
 
-def make_servo(joint: Joint, port: Port, settings: DynamixelSettings) -> Servo:
+def make_servo(joint: Joint, port: DynamixelPort, settings: DynamixelSettings) -> DynamixelServo:
     """Return a servo with the parameters of its joint, converted to its horn."""
     drive = joint.drive
     limits = joint.limits
     lower_rad, upper_rad = find_travel_rad(joint)
-    return Servo(
+    return DynamixelServo(
         id=joint.id,
         name=joint.name,
         port=port,

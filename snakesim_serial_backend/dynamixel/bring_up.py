@@ -10,12 +10,12 @@ from collections.abc import Iterator, Sequence
 
 from snakesim_hal.base.errors import BackendError
 from snakesim_serial_backend.dynamixel import registers
-from snakesim_serial_backend.dynamixel.packets import LAST_ID, Packet
-from snakesim_serial_backend.dynamixel.port import Port
-from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, Servo
+from snakesim_serial_backend.dynamixel.packets import LAST_ID, DynamixelPacket
+from snakesim_serial_backend.dynamixel.port import DynamixelPort
+from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, DynamixelServo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.request_port import ATTEMPTS
-from snakesim_serial_backend.servo_bus import GARBLED, Registers
+from snakesim_serial_backend.servo_bus import GARBLED, RegisterRange
 from snakesim_serial_backend.servo_checks import NO_ANSWER, find_shared_id
 
 # Registers that are written at every start.
@@ -24,12 +24,14 @@ STARTUP_REGISTERS = {registers.STATUS_LEVEL: 2, registers.TORQUE_ENABLE: 0, regi
 EEPROM_VALUES = {registers.OPERATING_MODE: registers.CURRENT_BASED_POSITION, registers.DELAY: 0}
 TORQUE_AT_START = 0x01  # bit of the startup configuration
 # Registers in which two servos differ: position, voltage, temperature.
-MEASURED = Registers(registers.PRESENT, registers.TEMPERATURE + 1 - registers.PRESENT)
+MEASURED = RegisterRange(registers.PRESENT, registers.TEMPERATURE + 1 - registers.PRESENT)
 
 _log = logging.getLogger("snakesim.dynamixel")
 
 
-def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
+def bring_up(
+    servos: Sequence[DynamixelServo], port: DynamixelPort, settings: DynamixelSettings
+) -> list[tuple[DynamixelPacket, DynamixelPacket]]:
     """Find all servos of a port, check them, and write the registers that the driver needs. Torque is off afterwards.
 
     Args:
@@ -48,8 +50,8 @@ def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -
 
 
 def _bring_up_with_extended_timeouts(
-    servos: Sequence[Servo], port: Port, settings: DynamixelSettings
-) -> list[tuple[Packet, Packet]]:
+    servos: Sequence[DynamixelServo], port: DynamixelPort, settings: DynamixelSettings
+) -> list[tuple[DynamixelPacket, DynamixelPacket]]:
     """Bring up the servos, as `bring_up` declares, while the port waits longer for responses."""
     pings, problem_by_name = _find_servos(servos, settings.bring_up_limit_s)
     problems: list[str] = []
@@ -73,7 +75,7 @@ def _bring_up_with_extended_timeouts(
     ]
 
 
-def _find_servo_problem(servo: Servo, ping: Packet | None, settings: DynamixelSettings) -> str:
+def _find_servo_problem(servo: DynamixelServo, ping: DynamixelPacket | None, settings: DynamixelSettings) -> str:
     """Return why a servo cannot be used; empty if it can. ping: its answer to a ping, None without one."""
     if ping is None:
         return NO_ANSWER
@@ -92,7 +94,9 @@ def _find_servo_problem(servo: Servo, ping: Packet | None, settings: DynamixelSe
     )
 
 
-def _find_servos(servos: Sequence[Servo], timeout_s: float) -> tuple[dict[str, Packet], dict[str, str]]:
+def _find_servos(
+    servos: Sequence[DynamixelServo], timeout_s: float
+) -> tuple[dict[str, DynamixelPacket], dict[str, str]]:
     """Ping all servos until all have responded, or until a timeout.
 
     Args:
@@ -104,7 +108,7 @@ def _find_servos(servos: Sequence[Servo], timeout_s: float) -> tuple[dict[str, P
         by the name of the servo.
     """
     deadline_s = time.monotonic() + timeout_s
-    responses_by_name: dict[str, Packet] = {}
+    responses_by_name: dict[str, DynamixelPacket] = {}
     problem_by_name: dict[str, str] = {}
     while True:
         for servo in servos:
@@ -120,7 +124,7 @@ def _find_servos(servos: Sequence[Servo], timeout_s: float) -> tuple[dict[str, P
             return responses_by_name, problem_by_name
 
 
-def _find_model_problem(servo: Servo, number: int, settings: DynamixelSettings) -> str:
+def _find_model_problem(servo: DynamixelServo, number: int, settings: DynamixelSettings) -> str:
     """Check the model of a servo, and store the torque of its current unit.
 
     Args:
@@ -158,7 +162,7 @@ def _find_firmware_problem(firmware: int) -> str:
     return ""
 
 
-def _find_eeprom_problem(eeprom: Packet) -> str:
+def _find_eeprom_problem(eeprom: DynamixelPacket) -> str:
     """Return which EEPROM register of a servo has an unsafe value, and what to do; an empty string if none has."""
     drive_mode = eeprom.data[registers.DRIVE_MODE]
     (offset,) = struct.unpack_from("<i", eeprom.data, registers.HOMING_OFFSET)
@@ -182,7 +186,7 @@ def _find_eeprom_problem(eeprom: Packet) -> str:
     return ""
 
 
-def _find_current_limit_problem(servo: Servo, eeprom: Packet) -> str:
+def _find_current_limit_problem(servo: DynamixelServo, eeprom: DynamixelPacket) -> str:
     """Return why a servo's own limit does not suit its joint; empty if it does."""
     (servo.max_current,) = struct.unpack_from("<H", eeprom.data, registers.CURRENT_LIMIT)
     limit_nm = servo.max_current * servo.torque_unit_nm
@@ -195,7 +199,7 @@ def _find_current_limit_problem(servo: Servo, eeprom: Packet) -> str:
     return ""
 
 
-def _describe_unknown_servos(servos: Sequence[Servo], port: Port) -> Iterator[str]:
+def _describe_unknown_servos(servos: Sequence[DynamixelServo], port: DynamixelPort) -> Iterator[str]:
     """Yield a line for each servo that answers and is no joint's: perhaps it is one that is missing."""
     ids = {servo.id for servo in servos}
     for ping in port.scan():
@@ -204,7 +208,7 @@ def _describe_unknown_servos(servos: Sequence[Servo], port: Port) -> Iterator[st
             yield f"  id {ping.id} on {port.wire.port} is no joint's: {registers.get_model_name(number)}"
 
 
-def _write_registers(servo: Servo) -> None:
+def _write_registers(servo: DynamixelServo) -> None:
     """Write the registers that the driver needs; torque is off afterwards.
 
     EEPROM registers are written only where they differ, because each write wears out their memory.
@@ -231,7 +235,7 @@ def _write_registers(servo: Servo) -> None:
         )
 
 
-def _read_measurements(servo: Servo) -> Packet:
+def _read_measurements(servo: DynamixelServo) -> DynamixelPacket:
     """Read the motion registers of a servo, and check that its angle is unambiguous within its travel.
 
     Raises:
@@ -250,7 +254,7 @@ def _read_measurements(servo: Servo) -> Packet:
     return status
 
 
-def _read_registers(servo: Servo, address: int, size: int) -> Packet:
+def _read_registers(servo: DynamixelServo, address: int, size: int) -> DynamixelPacket:
     """Read registers of a servo. Raises BackendError without an answer."""
     status = servo.port.try_to_read(servo.id, address, size)
     if status is None:
@@ -258,7 +262,7 @@ def _read_registers(servo: Servo, address: int, size: int) -> Packet:
     return status
 
 
-def _try_to_write(servo: Servo, address: int, value: int) -> Packet | None:
+def _try_to_write(servo: DynamixelServo, address: int, value: int) -> DynamixelPacket | None:
     """Write a register of a servo, several times if need be, and return its answer; None without one."""
     for _ in range(ATTEMPTS):
         status = servo.port.write(servo.id, address, bytes([value]))

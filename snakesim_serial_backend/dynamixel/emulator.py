@@ -11,20 +11,20 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.packets import (
     ALERT,
     BROADCAST_ID,
-    Decoder,
-    Instruction,
-    Packet,
-    Refusal,
+    DynamixelDecoder,
+    DynamixelErrorCode,
+    DynamixelInstruction,
+    DynamixelPacket,
     encode_fast_status,
     encode_packet,
 )
 from snakesim_serial_backend.servo_backend import ServoEmulator
-from snakesim_serial_backend.wire import Pty
+from snakesim_serial_backend.wire import PseudoTerminal
 
 MODEL = 1120  # XM540-W270, if the settings name no model
 FIRMWARE = 46
@@ -55,11 +55,11 @@ class EmulatedModel(NamedTuple):
 
 
 @dataclass
-class EmulatedServo:
+class EmulatedDynamixelServo:
     """One servo: its control table, and what the table does not hold."""
 
     table: bytearray
-    port: Pty
+    port: PseudoTerminal
     torque_unit_nm: float  # torque of one unit of current
     turn_offset_counts: int = 0  # angle at which its present position was 0 when it woke up
     last_packet_us: float = 0.0  # when it received its last packet
@@ -90,7 +90,7 @@ class EmulatedDynamixel(ServoEmulator):
     def __init__(
         self,
         body: EmulatedBody,
-        ports: Sequence[Pty],
+        ports: Sequence[PseudoTerminal],
         torque_constants_nm_per_a: Sequence[float],
         baud: int,
         clock_ns: Callable[[], int],
@@ -106,21 +106,21 @@ class EmulatedDynamixel(ServoEmulator):
             clock_ns: Function that returns a steady time in ns, with any origin.
             model: Model of all servos.
         """
-        self.servos: list[EmulatedServo] = []
+        self.servos: list[EmulatedDynamixelServo] = []
         for joint, port, torque_constant_nm_per_a in zip(body.joints, ports, torque_constants_nm_per_a, strict=True):
-            servo = EmulatedServo(bytearray(registers.SIZE), port, model.current_a * torque_constant_nm_per_a)
+            servo = EmulatedDynamixelServo(bytearray(registers.SIZE), port, model.current_a * torque_constant_nm_per_a)
             servo.write_register("H", registers.MODEL, model.number)
             self._write_factory_settings(servo, joint.id, baud)
             servo.write_register("H", registers.MIN_VOLTAGE, round(joint.limits.min_voltage_v / registers.VOLTS))
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
-        self._decoders = [Decoder() for _ in self._bus_ends]
+        self._decoders = [DynamixelDecoder() for _ in self._bus_ends]
         self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
         for i in range(len(self.servos)):
             self.restart(i)
 
     @staticmethod
-    def _write_factory_settings(servo: EmulatedServo, id_: int, baud: int) -> None:
+    def _write_factory_settings(servo: EmulatedDynamixelServo, id_: int, baud: int) -> None:
         """Set the registers that a servo keeps without power."""
         servo.table[FIRMWARE_VERSION] = FIRMWARE
         servo.table[ID] = id_
@@ -140,13 +140,13 @@ class EmulatedDynamixel(ServoEmulator):
             self.catch_up()
             for port, decoder, data in zip(self._bus_ends, self._decoders, received, strict=True):
                 for packet in decoder.feed(data):
-                    if packet.instruction != Instruction.STATUS:
+                    if packet.instruction != DynamixelInstruction.STATUS:
                         self._handle_packet(port, packet)
             self.simulate_to_now()
 
     # --- packets ----------------------------------------------------------------------------------------------
 
-    def _handle_packet(self, port: Pty, packet: Packet) -> None:
+    def _handle_packet(self, port: PseudoTerminal, packet: DynamixelPacket) -> None:
         """Handle a packet for one servo or for several servos of a port."""
         listening_servos = [
             i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)
@@ -156,12 +156,12 @@ class EmulatedDynamixel(ServoEmulator):
             self.servos[i].last_packet_us = self.body.now_us
         parameters = packet.parameters
         match packet.instruction:
-            case Instruction.SYNC_WRITE:
+            case DynamixelInstruction.SYNC_WRITE:
                 self._execute_sync_write(parameters, index_by_id)
-            case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ:
+            case DynamixelInstruction.SYNC_READ | DynamixelInstruction.FAST_SYNC_READ:
                 indices = [index_by_id.get(id_) for id_ in parameters[4:]]
                 self._execute_sync_read(port, packet.instruction, parameters[:4], indices)
-            case Instruction.PING if packet.id == BROADCAST_ID:
+            case DynamixelInstruction.PING if packet.id == BROADCAST_ID:
                 for _, i in sorted(index_by_id.items()):
                     self._execute_instruction(i, packet.instruction, parameters)
             case instruction if packet.id in index_by_id:
@@ -179,21 +179,21 @@ class EmulatedDynamixel(ServoEmulator):
         """
         servo = self.servos[i]
         match instruction:
-            case Instruction.PING:
+            case DynamixelInstruction.PING:
                 self._send_status(i, bytes(servo.table[:2]) + bytes([servo.table[FIRMWARE_VERSION]]))
-            case Instruction.READ:
+            case DynamixelInstruction.READ:
                 data, refusal = self._read_registers(i, parameters)
                 self._send_status(i, data, refusal, self._read_second_servo(i, parameters))
-            case Instruction.WRITE:
+            case DynamixelInstruction.WRITE:
                 (address,) = struct.unpack_from("<H", parameters)
                 refusal = self._write_registers(i, address, parameters[2:])
                 self._send_status(i, b"", refusal)
-            case Instruction.REBOOT:
+            case DynamixelInstruction.REBOOT:
                 self._send_status(i, b"")
                 self.body.start_boot(i)
                 self.restart(i)
             case _:
-                self._send_status(i, b"", Refusal.INSTRUCTION)
+                self._send_status(i, b"", DynamixelErrorCode.INSTRUCTION)
 
     def _execute_sync_write(self, parameters: bytes, index_by_id: Mapping[int, int]) -> None:
         """Execute a sync write: address, size, and an id with data for each servo."""
@@ -204,7 +204,7 @@ class EmulatedDynamixel(ServoEmulator):
                 self._write_registers(i, address, parameters[start + 1 : start + 1 + size])
 
     def _execute_sync_read(
-        self, port: Pty, instruction: int, register_range: bytes, indices: Sequence[int | None]
+        self, port: PseudoTerminal, instruction: int, register_range: bytes, indices: Sequence[int | None]
     ) -> None:
         """Send the responses to a sync read, in the order of the ids in the packet.
 
@@ -223,7 +223,7 @@ class EmulatedDynamixel(ServoEmulator):
                 break
             data, refusal = self._read_registers(i, register_range)
             second_data = self._read_second_servo(i, register_range)
-            if instruction == Instruction.SYNC_READ:
+            if instruction == DynamixelInstruction.SYNC_READ:
                 self._send_status(i, data, refusal, second_data)
             else:
                 error = refusal | self._get_alert_bit(i)
@@ -242,13 +242,13 @@ class EmulatedDynamixel(ServoEmulator):
             return
         servo = self.servos[i]
         error = bytes([refusal | self._get_alert_bit(i)])
-        status = encode_packet(servo.id, Instruction.STATUS, error + data)
+        status = encode_packet(servo.id, DynamixelInstruction.STATUS, error + data)
         if not self.body.is_duplicated(i):
             servo.port.send(status)
             return
         if second_data is None:
             second_data = data
-        second_status = encode_packet(servo.id, Instruction.STATUS, error + second_data)
+        second_status = encode_packet(servo.id, DynamixelInstruction.STATUS, error + second_data)
         if servo.table[registers.DELAY] == self._second_servo_delays[i]:
             servo.port.send(simulate_collision(status, second_status))
         else:
@@ -264,7 +264,7 @@ class EmulatedDynamixel(ServoEmulator):
         """Return the data of registers, and the refusal, 0 for none. registers: address and size."""
         address, size = struct.unpack("<HH", register_range)
         if address + size > registers.SIZE:
-            return b"", Refusal.ACCESS
+            return b"", DynamixelErrorCode.ACCESS
         self._update_measurements(i)
         return bytes(self.servos[i].table[address : address + size]), 0
 
@@ -306,9 +306,9 @@ class EmulatedDynamixel(ServoEmulator):
         servo = self.servos[i]
         end = address + len(data)
         if not any(first <= address and end <= last for first, last in WRITABLE):
-            return Refusal.ACCESS
+            return DynamixelErrorCode.ACCESS
         if address < registers.TORQUE_ENABLE and servo.is_torque_on:
-            return Refusal.ACCESS
+            return DynamixelErrorCode.ACCESS
         table = servo.table[:]
         table[address:end] = data
         refusal = self._find_write_refusal(servo, table, address, end)
@@ -323,25 +323,25 @@ class EmulatedDynamixel(ServoEmulator):
         return 0
 
     @staticmethod
-    def _find_write_refusal(servo: EmulatedServo, table: bytearray, address: int, end: int) -> int:
+    def _find_write_refusal(servo: EmulatedDynamixelServo, table: bytearray, address: int, end: int) -> int:
         """Return the refusal of a write, 0 for none. table: the control table after it; address, end: what it sets."""
-        after = EmulatedServo(table, servo.port, servo.torque_unit_nm)
+        after = EmulatedDynamixelServo(table, servo.port, servo.torque_unit_nm)
         sets_watchdog = address <= registers.WATCHDOG < end
         sets_goals = address < registers.GOAL_POSITION + 4 and end > FIRST_GOAL
         if servo.table[registers.WATCHDOG] == registers.TRIPPED and sets_goals:
-            return Refusal.RANGE
+            return DynamixelErrorCode.RANGE
         if table[registers.OPERATING_MODE] not in OPERATING_MODES or (
             sets_watchdog and table[registers.WATCHDOG] > 127
         ):
-            return Refusal.RANGE
+            return DynamixelErrorCode.RANGE
         if table[registers.TORQUE_ENABLE] > 1 or table[registers.DELAY] > 254:
-            return Refusal.RANGE
+            return DynamixelErrorCode.RANGE
         if sets_goals and abs(after.read_register("h", registers.GOALS)) > after.read_register(
             "H", registers.CURRENT_LIMIT
         ):
-            return Refusal.LIMIT
+            return DynamixelErrorCode.LIMIT
         if table[registers.TORQUE_ENABLE] and servo.table[registers.HARDWARE_ERROR] & servo.table[SHUTDOWN]:
-            return Refusal.FAILED
+            return DynamixelErrorCode.FAILED
         return 0
 
     # --- motors -----------------------------------------------------------------------------------------------
@@ -382,12 +382,12 @@ class EmulatedDynamixel(ServoEmulator):
             if goal_counts is None:
                 goal_counts = servo.read_register("i", registers.GOAL_POSITION) + servo.turn_offset_counts
             self.body.drive_motor(
-                i, Mode.POSITION, goal_counts * registers.RAD, limit_nm, stiffness, damping, speed_rad_s
+                i, JointMode.POSITION, goal_counts * registers.RAD, limit_nm, stiffness, damping, speed_rad_s
             )
         elif servo.is_torque_on and mode == registers.CURRENT_CONTROL:
-            self.body.drive_motor(i, Mode.TORQUE, current * servo.torque_unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
+            self.body.drive_motor(i, JointMode.TORQUE, current * servo.torque_unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
         else:
-            self.body.drive_motor(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
+            self.body.drive_motor(i, JointMode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
     def on_step(self, now_us: float) -> None:
         """Let watchdogs expire, and detect servos that are too hot or have too little supply voltage."""

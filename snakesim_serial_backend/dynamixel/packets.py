@@ -28,7 +28,7 @@ POLYNOMIAL = 0x8005  # of the CRC
 PART_OVERHEAD = 4  # bytes of a servo's part in a fast status around its data: error, id, CRC
 
 
-class Instruction(IntEnum):
+class DynamixelInstruction(IntEnum):
     """What a packet requests; STATUS is an answer."""
 
     PING = 0x01
@@ -41,7 +41,7 @@ class Instruction(IntEnum):
     FAST_SYNC_READ = 0x8A
 
 
-class Refusal(IntEnum):
+class DynamixelErrorCode(IntEnum):
     """Why a servo did not execute an instruction: the error of a status, without the alert."""
 
     FAILED = 1
@@ -54,7 +54,7 @@ class Refusal(IntEnum):
 
 
 @dataclass(frozen=True)
-class Packet:
+class DynamixelPacket:
     """One packet; a status' first parameter is its error."""
 
     id: int
@@ -111,12 +111,12 @@ def encode_packet(id_: int, instruction: int, parameters: bytes = b"") -> bytes:
 
 def encode_read_request(id_: int, address: int, size: int) -> bytes:
     """Return a packet that reads registers of one servo."""
-    return encode_packet(id_, Instruction.READ, struct.pack("<HH", address, size))
+    return encode_packet(id_, DynamixelInstruction.READ, struct.pack("<HH", address, size))
 
 
 def encode_sync_read_request(ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
     """Return a packet that reads the same registers of several servos; they answer in this order."""
-    instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
+    instruction = DynamixelInstruction.FAST_SYNC_READ if fast else DynamixelInstruction.SYNC_READ
     return encode_packet(BROADCAST_ID, instruction, struct.pack("<HH", address, size) + bytes(ids))
 
 
@@ -127,7 +127,9 @@ def encode_sync_write(address: int, data_by_id: Sequence[tuple[int, bytes]]) -> 
     """
     _, first_data = data_by_id[0]
     values = b"".join(bytes([id_]) + data for id_, data in data_by_id)
-    return encode_packet(BROADCAST_ID, Instruction.SYNC_WRITE, struct.pack("<HH", address, len(first_data)) + values)
+    return encode_packet(
+        BROADCAST_ID, DynamixelInstruction.SYNC_WRITE, struct.pack("<HH", address, len(first_data)) + values
+    )
 
 
 def encode_fast_status(parts: Sequence[tuple[int, int, bytes]], requested: int) -> bytes:
@@ -139,14 +141,14 @@ def encode_fast_status(parts: Sequence[tuple[int, int, bytes]], requested: int) 
     """
     _, _, first_data = parts[0]
     part_size = len(first_data) + PART_OVERHEAD
-    packet = HEADER + struct.pack("<BHB", BROADCAST_ID, 1 + requested * part_size, Instruction.STATUS)
+    packet = HEADER + struct.pack("<BHB", BROADCAST_ID, 1 + requested * part_size, DynamixelInstruction.STATUS)
     for error, id_, data in parts:
         packet += bytes([error, id_]) + data
         packet += struct.pack("<H", crc16(packet))
     return packet
 
 
-class Decoder(StreamDecoder[Packet]):
+class DynamixelDecoder(StreamDecoder[DynamixelPacket]):
     """Finds packets in a stream of bytes; noise, and packets with a wrong CRC, are skipped."""
 
     header: ClassVar[bytes] = HEADER
@@ -158,33 +160,33 @@ class Decoder(StreamDecoder[Packet]):
             return None
         return length
 
-    def decode(self, data: bytes) -> Packet | None:
+    def decode(self, data: bytes) -> DynamixelPacket | None:
         """Return the packet that these bytes are; None for a wrong CRC, or a status without an error."""
         (crc,) = struct.unpack("<H", data[-SUFFIX_BYTES:])
         if crc16(data[:-SUFFIX_BYTES]) != crc:
             return None
         id_ = data[4]
         body = data[PREFIX_BYTES:-SUFFIX_BYTES]
-        if id_ == BROADCAST_ID and body[0] == Instruction.STATUS:
+        if id_ == BROADCAST_ID and body[0] == DynamixelInstruction.STATUS:
             # A fast status is not stuffed. Its last CRC belongs to the last servo's part.
-            return Packet(id_, body[0], data[PREFIX_BYTES + 1 :])
+            return DynamixelPacket(id_, body[0], data[PREFIX_BYTES + 1 :])
         body = body.replace(STUFFED_HEADER_PREFIX, HEADER_PREFIX)
-        if body[0] == Instruction.STATUS and len(body) == 1:
+        if body[0] == DynamixelInstruction.STATUS and len(body) == 1:
             return None
-        return Packet(id_, body[0], body[1:])
+        return DynamixelPacket(id_, body[0], body[1:])
 
-    def feed_statuses(self, data: bytes) -> Iterator[Packet]:
+    def feed_statuses(self, data: bytes) -> Iterator[DynamixelPacket]:
         """Add received bytes, and yield the statuses that are complete now."""
-        return (packet for packet in self.feed(data) if packet.instruction == Instruction.STATUS)
+        return (packet for packet in self.feed(data) if packet.instruction == DynamixelInstruction.STATUS)
 
 
-def split_fast_status(packet: Packet, size: int) -> list[Packet]:
+def split_fast_status(packet: DynamixelPacket, size: int) -> list[DynamixelPacket]:
     """Return the statuses in the answer to a fast sync read of `size` bytes each.
 
     Only the packet's own CRC has been checked, which covers all parts.
     """
     part_size = size + PART_OVERHEAD
-    statuses: list[Packet] = []
+    statuses: list[DynamixelPacket] = []
     for start in range(0, len(packet.parameters), part_size):
         part = packet.parameters[start : start + part_size]
         if len(part) == part_size:
@@ -192,14 +194,14 @@ def split_fast_status(packet: Packet, size: int) -> list[Packet]:
     return statuses
 
 
-def split_damaged_fast_status(data: bytes, size: int) -> list[Packet]:
+def split_damaged_fast_status(data: bytes, size: int) -> list[DynamixelPacket]:
     """Return the statuses that are intact in a fast answer that ends early, or is garbled from some servo on."""
     start = data.find(HEADER + bytes([BROADCAST_ID]))
     if start < 0:
         return []
     packet = data[start:]
     part_size = size + PART_OVERHEAD
-    statuses: list[Packet] = []
+    statuses: list[DynamixelPacket] = []
     for start in range(PREFIX_BYTES + 1, len(packet) - part_size + 1, part_size):
         end = start + part_size
         (crc,) = struct.unpack("<H", packet[end - 2 : end])
@@ -209,9 +211,9 @@ def split_damaged_fast_status(data: bytes, size: int) -> list[Packet]:
     return statuses
 
 
-def _decode_fast_status_part(part: bytes) -> Packet:
+def _decode_fast_status_part(part: bytes) -> DynamixelPacket:
     """Return one servo's part of a fast status as a status of its own: error, id, data, CRC."""
     error = part[:1]
     id_ = part[1]
     data = part[2:-2]
-    return Packet(id_, Instruction.STATUS, error + data)
+    return DynamixelPacket(id_, DynamixelInstruction.STATUS, error + data)

@@ -7,9 +7,9 @@ from snakesim_serial_backend.dynamixel.packets import (
     BROADCAST_ID,
     LAST_ID,
     PART_OVERHEAD,
-    Decoder,
-    Instruction,
-    Packet,
+    DynamixelDecoder,
+    DynamixelInstruction,
+    DynamixelPacket,
     encode_packet,
     encode_read_request,
     encode_sync_read_request,
@@ -17,14 +17,14 @@ from snakesim_serial_backend.dynamixel.packets import (
     split_damaged_fast_status,
     split_fast_status,
 )
-from snakesim_serial_backend.request_port import Answers, RequestPort
+from snakesim_serial_backend.request_port import RequestPort, RequestResponses
 from snakesim_serial_backend.wire import SerialWire
 
 SCAN_S = 0.003  # in which each id may answer a ping to all
 PING_SIZE = 3  # bytes of data in the answer to a ping: model and firmware
 
 
-class Port(RequestPort[Packet]):
+class DynamixelPort(RequestPort[DynamixelPacket]):
     """The requests of protocol 2.0.
 
     Attributes:
@@ -36,37 +36,40 @@ class Port(RequestPort[Packet]):
         super().__init__(wire, response_gap_s)
         self.fast = True
 
-    def ping(self, id_: int) -> Answers[Packet]:
+    def ping(self, id_: int) -> RequestResponses[DynamixelPacket]:
         """Request the model (2 bytes) and firmware of a servo."""
-        return self._request_all_responses(id_, encode_packet(id_, Instruction.PING), PING_SIZE, 1)
+        return self._request_all_responses(id_, encode_packet(id_, DynamixelInstruction.PING), PING_SIZE, 1)
 
-    def read_alone(self, id_: int, address: int, size: int) -> Answers[Packet]:
+    def read_alone(self, id_: int, address: int, size: int) -> RequestResponses[DynamixelPacket]:
         """Read registers of a servo, and wait for a second answer, too."""
         return self._request_all_responses(id_, encode_read_request(id_, address, size), size, 2)
 
-    def scan(self) -> list[Packet]:
+    def scan(self) -> list[DynamixelPacket]:
         """Return the answers of all servos to a ping to all."""
         response_gap_s = self._response_gap_s + LAST_ID * SCAN_S
         return list(
             self._send_request(
-                self._make_decoder(), encode_packet(BROADCAST_ID, Instruction.PING), response_gap_s, response_gap_s
+                self._make_decoder(),
+                encode_packet(BROADCAST_ID, DynamixelInstruction.PING),
+                response_gap_s,
+                response_gap_s,
             )
         )
 
-    def read(self, id_: int, address: int, size: int) -> Packet | None:
+    def read(self, id_: int, address: int, size: int) -> DynamixelPacket | None:
         """Read registers of a servo; None without an answer that is complete."""
         return self._request_single_response(id_, encode_read_request(id_, address, size), size)
 
-    def write(self, id_: int, address: int, data: bytes) -> Packet | None:
+    def write(self, id_: int, address: int, data: bytes) -> DynamixelPacket | None:
         """Write registers of a servo, and return its answer; its `error` is 0 if the servo accepted them."""
         parameters = struct.pack("<H", address) + data
-        return self._request_single_response(id_, encode_packet(id_, Instruction.WRITE, parameters), 0)
+        return self._request_single_response(id_, encode_packet(id_, DynamixelInstruction.WRITE, parameters), 0)
 
     def reboot(self, id_: int) -> None:
         """Restart a servo."""
-        self._request_single_response(id_, encode_packet(id_, Instruction.REBOOT), 0)
+        self._request_single_response(id_, encode_packet(id_, DynamixelInstruction.REBOOT), 0)
 
-    def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, Packet]:
+    def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, DynamixelPacket]:
         """Read the same registers of several servos at once.
 
         Returns:
@@ -88,10 +91,10 @@ class Port(RequestPort[Packet]):
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _make_decoder(self) -> Decoder:
-        return Decoder()
+    def _make_decoder(self) -> DynamixelDecoder:
+        return DynamixelDecoder()
 
-    def _request_fast(self, count: int, request: bytes, size: int) -> list[Packet]:
+    def _request_fast(self, count: int, request: bytes, size: int) -> list[DynamixelPacket]:
         """Send a fast sync read, and return the parts of the answer that are intact.
 
         Args:

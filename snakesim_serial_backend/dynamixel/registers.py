@@ -76,7 +76,7 @@ class HardwareError(IntFlag):
 
 
 @dataclass(frozen=True)
-class Model:
+class DynamixelModel:
     """What is known of a model by its number."""
 
     name: str
@@ -84,18 +84,18 @@ class Model:
 
 
 MODELS = {
-    1000: Model("XH430-W350", 0.00269),
-    1010: Model("XH430-W210", 0.00269),
-    1020: Model("XM430-W350", 0.00269),
-    1030: Model("XM430-W210", 0.00269),
-    1120: Model("XM540-W270", 0.00269),
-    1130: Model("XM540-W150", 0.00269),
-    1190: Model("XL330-M077", 0.001),
-    1200: Model("XL330-M288", 0.001),
-    1210: Model("XC330-T181", 0.001),
-    1220: Model("XC330-T288", 0.001),
-    1230: Model("XC330-M181", 0.001),
-    1240: Model("XC330-M288", 0.001),
+    1000: DynamixelModel("XH430-W350", 0.00269),
+    1010: DynamixelModel("XH430-W210", 0.00269),
+    1020: DynamixelModel("XM430-W350", 0.00269),
+    1030: DynamixelModel("XM430-W210", 0.00269),
+    1120: DynamixelModel("XM540-W270", 0.00269),
+    1130: DynamixelModel("XM540-W150", 0.00269),
+    1190: DynamixelModel("XL330-M077", 0.001),
+    1200: DynamixelModel("XL330-M288", 0.001),
+    1210: DynamixelModel("XC330-T181", 0.001),
+    1220: DynamixelModel("XC330-T288", 0.001),
+    1230: DynamixelModel("XC330-M181", 0.001),
+    1240: DynamixelModel("XC330-M288", 0.001),
 }
 WITHOUT_CURRENT = {
     350: "XL320",

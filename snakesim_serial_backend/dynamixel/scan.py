@@ -4,8 +4,8 @@ import struct
 from collections.abc import Iterator
 
 from snakesim_serial_backend.dynamixel import registers
-from snakesim_serial_backend.dynamixel.packets import Packet
-from snakesim_serial_backend.dynamixel.port import Port
+from snakesim_serial_backend.dynamixel.packets import DynamixelPacket
+from snakesim_serial_backend.dynamixel.port import DynamixelPort
 from snakesim_serial_backend.wire import SerialWire
 
 GAP_S = 0.2  # silence that ends an answer: longer than any servo's return delay
@@ -17,12 +17,12 @@ COLUMNS = (
 
 def scan(wire: SerialWire) -> Iterator[dict[str, str]]:
     """Yield a row of text, by `COLUMNS`, for each servo that answers on a port at its baud rate."""
-    port = Port(wire, GAP_S)
+    port = DynamixelPort(wire, GAP_S)
     for ping in port.scan():
         yield _describe_servo(port, ping)
 
 
-def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
+def _describe_servo(port: DynamixelPort, ping: DynamixelPacket) -> dict[str, str]:
     """Return the row of the scan for one servo, by the names in `COLUMNS`.
 
     Args:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from snakesim_serial_backend.dynamixel import registers
-from snakesim_serial_backend.dynamixel.port import Port
+from snakesim_serial_backend.dynamixel.port import DynamixelPort
 from snakesim_serial_backend.servo_bus import SerialServo
 
 REVOLUTION_RAD = 2 * math.pi  # rad
@@ -13,7 +13,7 @@ OUT_OF_REACH = 1.2  # factor on the angle at which full torque would be reached
 
 
 @dataclass(kw_only=True)
-class Servo(SerialServo[Port]):
+class DynamixelServo(SerialServo[DynamixelPort]):
     """A servo of one joint. Angles and torques are those of its horn."""
 
     # How it is built.

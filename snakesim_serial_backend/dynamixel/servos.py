@@ -14,37 +14,37 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from snakesim_drivers.kit.drives import BusCommand
-from snakesim_drivers.kit.findings import Finding
-from snakesim_hal.wire.messages import Mode
+from snakesim_drivers.kit.findings import FaultFinding
+from snakesim_hal.wire.messages import JointMode
 from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.bring_up import bring_up
-from snakesim_serial_backend.dynamixel.packets import Packet
-from snakesim_serial_backend.dynamixel.port import Port
-from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, Servo
+from snakesim_serial_backend.dynamixel.packets import DynamixelPacket
+from snakesim_serial_backend.dynamixel.port import DynamixelPort
+from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, DynamixelServo
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from snakesim_serial_backend.servo_bus import Registers, SerialServos, ServoBusContext
+from snakesim_serial_backend.servo_bus import RegisterRange, SerialServos, ServoBusContext
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServosContext(ServoBusContext[Servo, Packet]):
+class DynamixelContext(ServoBusContext[DynamixelServo, DynamixelPacket]):
     """What the driver type gets to operate the servos of one port."""
 
-    port: Port
+    port: DynamixelPort
     settings: DynamixelSettings
 
 
-class Servos(SerialServos[Servo, Packet]):
+class DynamixelServos(SerialServos[DynamixelServo, DynamixelPacket]):
     """All servos of a port, tail to head."""
 
-    motion: ClassVar[Registers] = Registers(registers.PRESENT, registers.present_form.size)
-    state: ClassVar[Registers] = Registers(registers.TORQUE_ENABLE, registers.STATE_SIZE)
-    health: ClassVar[Registers] = Registers(registers.TORQUE_ENABLE, registers.HEALTH_SIZE)
+    motion: ClassVar[RegisterRange] = RegisterRange(registers.PRESENT, registers.present_form.size)
+    state: ClassVar[RegisterRange] = RegisterRange(registers.TORQUE_ENABLE, registers.STATE_SIZE)
+    health: ClassVar[RegisterRange] = RegisterRange(registers.TORQUE_ENABLE, registers.HEALTH_SIZE)
     torque_enable: ClassVar[int] = registers.TORQUE_ENABLE
 
-    def __init__(self, context: ServosContext) -> None:
+    def __init__(self, context: DynamixelContext) -> None:
         """Prepare to drive the servos of a port that is open; nothing is sent."""
         super().__init__(context)
-        self._port: Port = context.port
+        self._port: DynamixelPort = context.port
         self._settings = context.settings
         self._watchdog_register = bytes([round(context.settings.watchdog_s / registers.WATCHDOG_S)])
 
@@ -56,7 +56,7 @@ class Servos(SerialServos[Servo, Packet]):
             self.handle_response(i, present)
             self._store_health(i, health)
 
-    def handle_response(self, i: int, status: Packet) -> None:
+    def handle_response(self, i: int, status: DynamixelPacket) -> None:
         """Store the motion and torque that a servo has reported in the readings."""
         servo = self.servos[i]
         current, velocity, position = registers.present_form.unpack(status.data)
@@ -73,7 +73,7 @@ class Servos(SerialServos[Servo, Packet]):
         self._readings.set_torque(i, current * servo.torque_unit_nm)
         servo.current_a = abs(current) * servo.torque_unit_nm / servo.torque_constant_nm_per_a
 
-    def _store_health(self, i: int, status: Packet) -> None:
+    def _store_health(self, i: int, status: DynamixelPacket) -> None:
         """Store a servo's supply and temperature in the readings, and also its state."""
         self._store_state(i, status)
         data = status.data  # registers from TORQUE_ENABLE on
@@ -82,7 +82,7 @@ class Servos(SerialServos[Servo, Packet]):
         temperature_c = float(data[registers.TEMPERATURE - registers.TORQUE_ENABLE])
         self._readings.set_temperatures(i, temperature_c, temperature_c)
 
-    def _store_state(self, i: int, status: Packet) -> None:
+    def _store_state(self, i: int, status: DynamixelPacket) -> None:
         """Store whether a servo's torque is on, and what has switched it off."""
         servo = self.servos[i]
         data = status.data  # registers from TORQUE_ENABLE on
@@ -136,14 +136,14 @@ class Servos(SerialServos[Servo, Packet]):
         for i in servos_to_enable:
             self.servos[i].record_switch(is_torque_requested=True, now_ns=self._clock_ns())
 
-    def _encode_goal_registers(self, i: int, mode: Mode, target: float, limit_nm: float) -> bytes:
+    def _encode_goal_registers(self, i: int, mode: JointMode, target: float, limit_nm: float) -> bytes:
         """Return the goal registers of a setpoint; a mode that servos do not have gets no current."""
         servo = self.servos[i]
         goal_rad = float(self._readings.angle_rad[i])
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 goal_rad = target
-            case Mode.TORQUE if target:
+            case JointMode.TORQUE if target:
                 goal_rad = servo.out_of_reach_rad(target)
                 limit_nm = min(abs(target), limit_nm)
             case _:
@@ -169,17 +169,17 @@ class Servos(SerialServos[Servo, Packet]):
                 servo.boot_start_ns = self._clock_ns()
                 self._silent_servos.add(i)
 
-    def _find_stop_reason(self, i: int) -> Finding | None:
+    def _find_stop_reason(self, i: int) -> FaultFinding | None:
         servo = self.servos[i]
         if servo.errors:
             cause = (
                 f"{servo.label} reports {registers.describe_errors(servo.errors)}; `snakesim robot reset` restarts it"
             )
-            return Finding("drive_fault", cause, i, affects_only_joint=True)
+            return FaultFinding("drive_fault", cause, i, affects_only_joint=True)
         if servo.watchdog == registers.TRIPPED:
             cause = f"{servo.label} was stopped by its bus watchdog, as it got no packet in time"
-            return Finding("drive_fault", cause, i, affects_only_joint=True)
+            return FaultFinding("drive_fault", cause, i, affects_only_joint=True)
         if servo.is_torque_requested and servo.health_read_ns > servo.torque_switched_ns and not servo.enabled:
             cause = f"{servo.label} does not follow: its torque is off: it has restarted"
-            return Finding("drive_not_armed", cause, i, affects_only_joint=True)
+            return FaultFinding("drive_not_armed", cause, i, affects_only_joint=True)
         return None

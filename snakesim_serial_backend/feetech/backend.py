@@ -14,13 +14,13 @@ from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.emulator import EmulatedFeetech
 from snakesim_serial_backend.feetech.load import PORT_LOAD
 from snakesim_serial_backend.feetech.packets import LAST_ID
-from snakesim_serial_backend.feetech.port import Port
-from snakesim_serial_backend.feetech.servo import Servo
-from snakesim_serial_backend.feetech.servos import Servos, ServosContext
+from snakesim_serial_backend.feetech.port import FeetechPort
+from snakesim_serial_backend.feetech.servo import FeetechServo
+from snakesim_serial_backend.feetech.servos import FeetechContext, FeetechServos
 from snakesim_serial_backend.feetech.settings import NAME, FeetechSettings
 from snakesim_serial_backend.port_load import PortLoad
 from snakesim_serial_backend.servo_backend import OpenedPort, ServoBackend, find_travel_rad
-from snakesim_serial_backend.wire import Pty, is_emulated
+from snakesim_serial_backend.wire import PseudoTerminal, is_emulated
 
 
 class FeetechBackend(ServoBackend[EmulatedFeetech]):
@@ -41,9 +41,9 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
         cls.validate_port_load(config, settings, joints)
 
     @classmethod
-    def open_servos(cls, opened_port: OpenedPort[EmulatedFeetech]) -> Servos:
-        port = Port(opened_port.wire, opened_port.response_gap_s)
-        context = ServosContext(
+    def open_servos(cls, opened_port: OpenedPort[EmulatedFeetech]) -> FeetechServos:
+        port = FeetechPort(opened_port.wire, opened_port.response_gap_s)
+        context = FeetechContext(
             servos=[make_servo(joint, port, opened_port.settings) for joint in opened_port.joints],
             port=port,
             readings=opened_port.readings,
@@ -52,7 +52,7 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
             response_timeout_s=opened_port.response_timeout_s,
             clock_ns=opened_port.clock_ns,
         )
-        return Servos(context)
+        return FeetechServos(context)
 
     @classmethod
     def make_emulator(
@@ -60,17 +60,17 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
         joints: Sequence[Joint],
         settings: FeetechSettings,
         body: EmulatedBody,
-        ptys: Sequence[Pty],
+        ptys: Sequence[PseudoTerminal],
         clock: DriverClock,
     ) -> EmulatedFeetech:
         stall_torques_nm = [get_stall_torque_nm(joint, settings) for joint in joints]
         return EmulatedFeetech(body, ptys, stall_torques_nm, settings.baud, settings.speed_unit_counts_s, clock.now_ns)
 
 
-def make_servo(joint: Joint, port: Port, settings: FeetechSettings) -> Servo:
+def make_servo(joint: Joint, port: FeetechPort, settings: FeetechSettings) -> FeetechServo:
     """Return a servo with the parameters of its joint, converted to its horn."""
     lower_rad, upper_rad = find_travel_rad(joint)
-    return Servo(
+    return FeetechServo(
         id=joint.id,
         name=joint.name,
         port=port,

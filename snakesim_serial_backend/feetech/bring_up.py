@@ -8,12 +8,18 @@ from collections.abc import Iterator, Sequence
 
 from snakesim_hal.base.errors import BackendError
 from snakesim_serial_backend.feetech import registers
-from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, Packet, ServoError, decode_sign_magnitude
-from snakesim_serial_backend.feetech.port import Port
-from snakesim_serial_backend.feetech.servo import SLACK_RAD, Servo
+from snakesim_serial_backend.feetech.packets import (
+    OFFSET_SIGN_BIT,
+    SIGN_BIT,
+    FeetechPacket,
+    ServoError,
+    decode_sign_magnitude,
+)
+from snakesim_serial_backend.feetech.port import FeetechPort
+from snakesim_serial_backend.feetech.servo import SLACK_RAD, FeetechServo
 from snakesim_serial_backend.feetech.settings import FeetechSettings
 from snakesim_serial_backend.request_port import ATTEMPTS, RequestPort
-from snakesim_serial_backend.servo_bus import Registers
+from snakesim_serial_backend.servo_bus import RegisterRange
 from snakesim_serial_backend.servo_checks import NO_ANSWER, find_shared_id
 
 EEPROM_VALUES = {
@@ -22,13 +28,13 @@ EEPROM_VALUES = {
     registers.OPERATING_MODE: registers.POSITION_MODE,
 }  # written where they differ
 PROTECTIONS = ServoError.OVERHEATING | ServoError.OVERLOAD  # that must switch the torque off
-MEASURED = Registers(registers.PRESENT, registers.present_form.size)  # in which two servos differ
+MEASURED = RegisterRange(registers.PRESENT, registers.present_form.size)  # in which two servos differ
 MAX_TEMPERATURE_C = 80  # that a servo may allow itself; the maker delivers 70
 
 
 def bring_up(
-    servos: Sequence[Servo], port: RequestPort[Packet], settings: FeetechSettings
-) -> list[tuple[Packet, Packet]]:
+    servos: Sequence[FeetechServo], port: RequestPort[FeetechPacket], settings: FeetechSettings
+) -> list[tuple[FeetechPacket, FeetechPacket]]:
     """Find all servos of a port, check them, and write the registers that the driver needs. Torque is off afterwards.
 
     Args:
@@ -61,7 +67,7 @@ def bring_up(
         ]
 
 
-def _find_servos(servos: Sequence[Servo], timeout_s: float) -> set[str]:
+def _find_servos(servos: Sequence[FeetechServo], timeout_s: float) -> set[str]:
     """Ping all servos until all have responded, or until a timeout, and return the names of those that responded.
 
     Garbled bytes count as a response, too: the check for a shared id explains them.
@@ -78,7 +84,7 @@ def _find_servos(servos: Sequence[Servo], timeout_s: float) -> set[str]:
             return found_names
 
 
-def _find_servo_problem(servo: Servo, settings: FeetechSettings) -> str:
+def _find_servo_problem(servo: FeetechServo, settings: FeetechSettings) -> str:
     """Return why a servo cannot be used; empty if it can."""
     shared_id = find_shared_id(servo, MEASURED)
     if shared_id:
@@ -111,7 +117,7 @@ def _find_model_problem(eeprom: bytes, settings: FeetechSettings) -> str:
     return ""
 
 
-def _find_travel_problem(servo: Servo, eeprom: bytes) -> str:
+def _find_travel_problem(servo: FeetechServo, eeprom: bytes) -> str:
     """Check homing offset and position limits in the EEPROM of a servo against the travel of its joint.
 
     Args:
@@ -146,7 +152,7 @@ def _find_travel_problem(servo: Servo, eeprom: bytes) -> str:
     return ""
 
 
-def _find_protection_problem(servo: Servo, eeprom: bytes) -> str:
+def _find_protection_problem(servo: FeetechServo, eeprom: bytes) -> str:
     """Check that the protections in the EEPROM of a servo switch its torque off: heat, overload, and voltage range.
 
     Args:
@@ -192,7 +198,7 @@ def _find_protection_problem(servo: Servo, eeprom: bytes) -> str:
     return ""
 
 
-def _find_torque_limit_problem(servo: Servo, eeprom: bytes) -> str:
+def _find_torque_limit_problem(servo: FeetechServo, eeprom: bytes) -> str:
     """Return why a servo's own torque limit does not suit its joint; empty if it does."""
     servo.max_per_mille = min(_word(eeprom, registers.MAX_TORQUE), registers.PER_MILLE)
     limit_nm = servo.max_per_mille / registers.PER_MILLE * servo.stall_torque_nm
@@ -205,16 +211,16 @@ def _find_torque_limit_problem(servo: Servo, eeprom: bytes) -> str:
     return ""
 
 
-def _describe_unknown_servos(servos: Sequence[Servo]) -> Iterator[str]:
+def _describe_unknown_servos(servos: Sequence[FeetechServo]) -> Iterator[str]:
     """Yield a line for each servo that answers and is no joint's: perhaps it is one that is missing."""
-    port: Port = servos[0].port
+    port: FeetechPort = servos[0].port
     ids = {servo.id for servo in servos}
     for ping in port.scan():
         if ping.id not in ids:
             yield f"  id {ping.id} on {port.wire.port} is no joint's"
 
 
-def _write_registers(servo: Servo) -> None:
+def _write_registers(servo: FeetechServo) -> None:
     """Switch the torque off, and write the registers that the driver needs. Raises BackendError."""
     _write_and_verify(servo, registers.TORQUE_ENABLE, 0)
     eeprom = _read_registers(servo, 0, registers.EEPROM_SIZE).data
@@ -229,7 +235,7 @@ def _write_registers(servo: Servo) -> None:
     _write_and_verify(servo, registers.LOCK, registers.LOCKED)
 
 
-def _write_and_verify(servo: Servo, address: int, value: int) -> None:
+def _write_and_verify(servo: FeetechServo, address: int, value: int) -> None:
     """Write a register, and read it back: an answer does not tell whether a servo accepted it. Raises BackendError."""
     for _ in range(ATTEMPTS):
         servo.port.write(servo.id, address, bytes([value]))
@@ -242,7 +248,7 @@ def _write_and_verify(servo: Servo, address: int, value: int) -> None:
     )
 
 
-def _read_measurements(servo: Servo) -> Packet:
+def _read_measurements(servo: FeetechServo) -> FeetechPacket:
     """Read what a servo measures. Raises BackendError for an angle outside the travel of its joint."""
     status = _read_registers(servo, registers.PRESENT, registers.present_form.size)
     position = decode_sign_magnitude(_word(status.data, 0), SIGN_BIT)
@@ -257,7 +263,7 @@ def _read_measurements(servo: Servo) -> Packet:
     return status
 
 
-def _read_registers(servo: Servo, address: int, size: int) -> Packet:
+def _read_registers(servo: FeetechServo, address: int, size: int) -> FeetechPacket:
     """Read registers of a servo. Raises BackendError without an answer."""
     status = servo.port.try_to_read(servo.id, address, size)
     if status is None:

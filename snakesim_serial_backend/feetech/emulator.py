@@ -9,22 +9,22 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.packets import (
     BROADCAST_ID,
     OFFSET_SIGN_BIT,
     SIGN_BIT,
-    Decoder,
-    Instruction,
-    Packet,
+    FeetechDecoder,
+    FeetechInstruction,
+    FeetechPacket,
     ServoError,
     decode_sign_magnitude,
     encode_packet,
     encode_sign_magnitude,
 )
 from snakesim_serial_backend.servo_backend import ServoEmulator
-from snakesim_serial_backend.wire import Pty
+from snakesim_serial_backend.wire import PseudoTerminal
 
 MODEL = 777  # STS3215
 FIRMWARE = (3, 10)
@@ -34,11 +34,11 @@ SECOND_SERVO_COUNTS = 500  # how far from a servo a second one with its id is
 
 
 @dataclass
-class EmulatedServo:
+class EmulatedFeetechServo:
     """One servo: its control table, and what the table does not hold."""
 
     table: bytearray
-    port: Pty
+    port: PseudoTerminal
     stall_torque_nm: float
 
     def read_word(self, address: int) -> int:
@@ -66,7 +66,7 @@ class EmulatedFeetech(ServoEmulator):
     def __init__(
         self,
         body: EmulatedBody,
-        ports: Sequence[Pty],
+        ports: Sequence[PseudoTerminal],
         stall_torques_nm: Sequence[float],
         baud: int,
         speed_unit_counts_s: float,
@@ -83,15 +83,15 @@ class EmulatedFeetech(ServoEmulator):
             clock_ns: Function that returns a steady time in ns, with any origin.
         """
         self._speed_unit_rad_s = speed_unit_counts_s * registers.RAD
-        self.servos: list[EmulatedServo] = []
+        self.servos: list[EmulatedFeetechServo] = []
         for joint, port, stall_torque_nm in zip(body.joints, ports, stall_torques_nm, strict=True):
-            servo = EmulatedServo(bytearray(registers.SIZE), port, stall_torque_nm)
+            servo = EmulatedFeetechServo(bytearray(registers.SIZE), port, stall_torque_nm)
             _write_factory_settings(servo, joint.id, baud)
             servo.table[registers.MIN_VOLTAGE] = round(joint.limits.min_voltage_v / registers.VOLTS)
             servo.table[registers.MAX_VOLTAGE] = min(round(joint.supply.voltage_v / registers.VOLTS) + 20, 255)
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
-        self._decoders = [Decoder() for _ in self._bus_ends]
+        self._decoders = [FeetechDecoder() for _ in self._bus_ends]
         self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
         for i in range(len(self.servos)):
             self.restart(i)
@@ -107,18 +107,18 @@ class EmulatedFeetech(ServoEmulator):
 
     # --- packets ----------------------------------------------------------------------------------------------
 
-    def _handle_packet(self, port: Pty, packet: Packet) -> None:
+    def _handle_packet(self, port: PseudoTerminal, packet: FeetechPacket) -> None:
         """Handle a packet for one servo or for several servos of a port."""
         listening_servos = [
             i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)
         ]
         index_by_id = {self.servos[i].id: i for i in listening_servos}
         match packet.code:
-            case Instruction.SYNC_WRITE:
+            case FeetechInstruction.SYNC_WRITE:
                 self._execute_sync_write(packet.parameters, index_by_id)
-            case Instruction.SYNC_READ:
+            case FeetechInstruction.SYNC_READ:
                 self._execute_sync_read(packet.parameters, index_by_id)
-            case Instruction.PING if packet.id == BROADCAST_ID:
+            case FeetechInstruction.PING if packet.id == BROADCAST_ID:
                 for _, i in sorted(index_by_id.items()):
                     self._send_status(i, b"")
             case _ if packet.id in index_by_id:
@@ -126,15 +126,15 @@ class EmulatedFeetech(ServoEmulator):
             case _:
                 pass
 
-    def _execute_instruction(self, i: int, packet: Packet) -> None:
+    def _execute_instruction(self, i: int, packet: FeetechPacket) -> None:
         """Execute an instruction to one servo, and answer it."""
         match packet.code:
-            case Instruction.PING:
+            case FeetechInstruction.PING:
                 self._send_status(i, b"")
-            case Instruction.READ:
+            case FeetechInstruction.READ:
                 address, size = packet.parameters
                 self._send_status(i, self._read_registers(i, address, size), self._read_second_servo(i, address, size))
-            case Instruction.WRITE:
+            case FeetechInstruction.WRITE:
                 self._write_registers(i, packet.parameters[0], packet.parameters[1:])
                 if self.servos[i].table[registers.STATUS_LEVEL]:
                     self._send_status(i, b"")
@@ -238,7 +238,7 @@ class EmulatedFeetech(ServoEmulator):
         joint = self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
         if not servo.is_torque_on or servo.table[registers.OPERATING_MODE] != registers.POSITION_MODE:
-            self.body.drive_motor(i, Mode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
+            self.body.drive_motor(i, JointMode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
             return
         offset = decode_sign_magnitude(servo.read_word(registers.HOMING_OFFSET), OFFSET_SIGN_BIT)
         goal = decode_sign_magnitude(servo.read_word(registers.GOALS), SIGN_BIT)
@@ -251,7 +251,7 @@ class EmulatedFeetech(ServoEmulator):
         stiffness = joint.motor.stiffness_nm_per_rad / joint.drive.gear**2
         damping = joint.motor.damping_nm_s_per_rad / joint.drive.gear**2
         goal_rad = registers.to_angle_rad(goal + offset)
-        self.body.drive_motor(i, Mode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
+        self.body.drive_motor(i, JointMode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
 
     def on_step(self, now_us: float) -> None:
         """Detect servos that are too hot or have too little supply voltage."""
@@ -268,7 +268,7 @@ class EmulatedFeetech(ServoEmulator):
                 self._drive_motor(i)
 
 
-def _write_factory_settings(servo: EmulatedServo, id_: int, baud: int) -> None:
+def _write_factory_settings(servo: EmulatedFeetechServo, id_: int, baud: int) -> None:
     """Set the registers that a servo keeps without power."""
     servo.table[registers.FIRMWARE : registers.FIRMWARE + 2] = bytes(FIRMWARE)
     servo.write_word(registers.MODEL, MODEL)

@@ -25,7 +25,7 @@ LOAD_SIGN_BIT = 10
 OFFSET_SIGN_BIT = 11
 
 
-class Instruction(IntEnum):
+class FeetechInstruction(IntEnum):
     """What a packet requests."""
 
     PING = 0x01
@@ -51,7 +51,7 @@ class ServoError(IntFlag):
 
 
 @dataclass(frozen=True)
-class Packet:
+class FeetechPacket:
     """One packet."""
 
     id: int
@@ -82,7 +82,7 @@ def encode_packet(id_: int, code: int, parameters: bytes = b"") -> bytes:
 
 def encode_sync_read(ids: Sequence[int], address: int, size: int) -> bytes:
     """Return a packet that reads the same registers of several servos; they answer in this order."""
-    return encode_packet(BROADCAST_ID, Instruction.SYNC_READ, bytes([address, size, *ids]))
+    return encode_packet(BROADCAST_ID, FeetechInstruction.SYNC_READ, bytes([address, size, *ids]))
 
 
 def encode_sync_write(address: int, data_by_id: Sequence[tuple[int, bytes]]) -> bytes:
@@ -92,7 +92,7 @@ def encode_sync_write(address: int, data_by_id: Sequence[tuple[int, bytes]]) -> 
     """
     _, first_data = data_by_id[0]
     values = b"".join(bytes([id_]) + data for id_, data in data_by_id)
-    return encode_packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes([address, len(first_data)]) + values)
+    return encode_packet(BROADCAST_ID, FeetechInstruction.SYNC_WRITE, bytes([address, len(first_data)]) + values)
 
 
 def decode_sign_magnitude(word: int, sign_bit: int) -> int:
@@ -110,7 +110,7 @@ def encode_sign_magnitude(value: int, sign_bit: int) -> int:
     return value
 
 
-class Decoder(StreamDecoder[Packet]):
+class FeetechDecoder(StreamDecoder[FeetechPacket]):
     """Finds packets in a stream of bytes; noise, and packets with a wrong checksum, are skipped."""
 
     header: ClassVar[bytes] = HEADER
@@ -122,11 +122,11 @@ class Decoder(StreamDecoder[Packet]):
             return None
         return PREFIX_BYTES + length
 
-    def decode(self, data: bytes) -> Packet | None:
+    def decode(self, data: bytes) -> FeetechPacket | None:
         if checksum(data[2:-1]) != data[-1]:
             return None
-        return Packet(data[2], data[4], data[5:-1])
+        return FeetechPacket(data[2], data[4], data[5:-1])
 
-    def feed_statuses(self, data: bytes) -> Iterator[Packet]:
+    def feed_statuses(self, data: bytes) -> Iterator[FeetechPacket]:
         """Add received bytes, and yield the statuses that are complete now: all packets to the driver."""
         return self.feed(data)

@@ -5,47 +5,56 @@ from collections.abc import Sequence
 from snakesim_serial_backend.feetech.packets import (
     BROADCAST_ID,
     LAST_ID,
-    Decoder,
-    Instruction,
-    Packet,
+    FeetechDecoder,
+    FeetechInstruction,
+    FeetechPacket,
     encode_packet,
     encode_sync_read,
     encode_sync_write,
 )
-from snakesim_serial_backend.request_port import Answers, RequestPort
+from snakesim_serial_backend.request_port import RequestPort, RequestResponses
 
 SCAN_S = 0.003  # in which each id may answer a ping to all
 
 
-class Port(RequestPort[Packet]):
+class FeetechPort(RequestPort[FeetechPacket]):
     """The requests of Feetech's protocol."""
 
-    def ping(self, id_: int) -> Answers[Packet]:
+    def ping(self, id_: int) -> RequestResponses[FeetechPacket]:
         """Request a sign of life of a servo, which has no data."""
-        return self._request_all_responses(id_, encode_packet(id_, Instruction.PING), 0, 1)
+        return self._request_all_responses(id_, encode_packet(id_, FeetechInstruction.PING), 0, 1)
 
-    def read_alone(self, id_: int, address: int, size: int) -> Answers[Packet]:
+    def read_alone(self, id_: int, address: int, size: int) -> RequestResponses[FeetechPacket]:
         """Read registers of a servo, and wait for a second answer, too."""
-        return self._request_all_responses(id_, encode_packet(id_, Instruction.READ, bytes([address, size])), size, 2)
+        return self._request_all_responses(
+            id_, encode_packet(id_, FeetechInstruction.READ, bytes([address, size])), size, 2
+        )
 
-    def scan(self) -> list[Packet]:
+    def scan(self) -> list[FeetechPacket]:
         """Return the answers of all servos to a ping to all."""
         response_gap_s = self._response_gap_s + LAST_ID * SCAN_S
         return list(
             self._send_request(
-                self._make_decoder(), encode_packet(BROADCAST_ID, Instruction.PING), response_gap_s, response_gap_s
+                self._make_decoder(),
+                encode_packet(BROADCAST_ID, FeetechInstruction.PING),
+                response_gap_s,
+                response_gap_s,
             )
         )
 
-    def read(self, id_: int, address: int, size: int) -> Packet | None:
+    def read(self, id_: int, address: int, size: int) -> FeetechPacket | None:
         """Read registers of a servo; None without an answer that is complete."""
-        return self._request_single_response(id_, encode_packet(id_, Instruction.READ, bytes([address, size])), size)
+        return self._request_single_response(
+            id_, encode_packet(id_, FeetechInstruction.READ, bytes([address, size])), size
+        )
 
-    def write(self, id_: int, address: int, data: bytes) -> Packet | None:
+    def write(self, id_: int, address: int, data: bytes) -> FeetechPacket | None:
         """Write registers of a servo, and return its answer, which does not tell whether it accepted them."""
-        return self._request_single_response(id_, encode_packet(id_, Instruction.WRITE, bytes([address]) + data), 0)
+        return self._request_single_response(
+            id_, encode_packet(id_, FeetechInstruction.WRITE, bytes([address]) + data), 0
+        )
 
-    def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, Packet]:
+    def read_all(self, ids: Sequence[int], address: int, size: int) -> dict[int, FeetechPacket]:
         """Read the same registers of several servos at once.
 
         Returns:
@@ -64,5 +73,5 @@ class Port(RequestPort[Packet]):
         if data_by_id:
             self.wire.send(encode_sync_write(address, data_by_id))
 
-    def _make_decoder(self) -> Decoder:
-        return Decoder()
+    def _make_decoder(self) -> FeetechDecoder:
+        return FeetechDecoder()

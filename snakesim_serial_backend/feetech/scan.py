@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 from snakesim_serial_backend.feetech import registers
-from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, Packet, decode_sign_magnitude
-from snakesim_serial_backend.feetech.port import Port
+from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, FeetechPacket, decode_sign_magnitude
+from snakesim_serial_backend.feetech.port import FeetechPort
 from snakesim_serial_backend.wire import SerialWire
 
 GAP_S = 0.2  # silence that ends an answer: longer than any servo's return delay
@@ -16,12 +16,12 @@ COLUMNS = (
 
 def scan(wire: SerialWire) -> Iterator[dict[str, str]]:
     """Yield a row of text, by `COLUMNS`, for each servo that answers on a port at its baud rate."""
-    port = Port(wire, GAP_S)
+    port = FeetechPort(wire, GAP_S)
     for ping in port.scan():
         yield _describe_servo(port, ping)
 
 
-def _describe_servo(port: Port, ping: Packet) -> dict[str, str]:
+def _describe_servo(port: FeetechPort, ping: FeetechPacket) -> dict[str, str]:
     """Return the row of a servo. ping: its answer to a ping."""
     row = dict.fromkeys(COLUMNS, "-")
     row |= {"port": port.wire.port, "baud": str(port.wire.baud), "id": str(ping.id)}

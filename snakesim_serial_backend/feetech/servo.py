@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 
-from snakesim_serial_backend.feetech.port import Port
+from snakesim_serial_backend.feetech.port import FeetechPort
 from snakesim_serial_backend.servo_bus import SerialServo
 
 SLACK_RAD = 0.3  # beyond its travel, where a servo may wake up
 
 
 @dataclass(kw_only=True)
-class Servo(SerialServo[Port]):
+class FeetechServo(SerialServo[FeetechPort]):
     """A servo of one joint. Angles and torques are those of its horn."""
 
     # How it is built.

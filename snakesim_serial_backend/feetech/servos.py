@@ -17,32 +17,32 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from snakesim_drivers.kit.drives import BusCommand
-from snakesim_drivers.kit.findings import Finding
-from snakesim_hal.wire.messages import Mode
+from snakesim_drivers.kit.findings import FaultFinding
+from snakesim_hal.wire.messages import JointMode
 from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.bring_up import bring_up
-from snakesim_serial_backend.feetech.packets import SIGN_BIT, Packet, decode_sign_magnitude
-from snakesim_serial_backend.feetech.servo import Servo
+from snakesim_serial_backend.feetech.packets import SIGN_BIT, FeetechPacket, decode_sign_magnitude
+from snakesim_serial_backend.feetech.servo import FeetechServo
 from snakesim_serial_backend.feetech.settings import FeetechSettings
-from snakesim_serial_backend.servo_bus import Registers, SerialServos, ServoBusContext
+from snakesim_serial_backend.servo_bus import RegisterRange, SerialServos, ServoBusContext
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServosContext(ServoBusContext[Servo, Packet]):
+class FeetechContext(ServoBusContext[FeetechServo, FeetechPacket]):
     """What the driver type gets to operate the servos of one port."""
 
     settings: FeetechSettings
 
 
-class Servos(SerialServos[Servo, Packet]):
+class FeetechServos(SerialServos[FeetechServo, FeetechPacket]):
     """All servos of a port, tail to head."""
 
-    motion: ClassVar[Registers] = Registers(registers.PRESENT, registers.present_form.size)
-    state: ClassVar[Registers] = Registers(registers.TORQUE_ENABLE, registers.STATE_SIZE)
-    health: ClassVar[Registers] = Registers(registers.TORQUE_ENABLE, registers.STATE_SIZE)
+    motion: ClassVar[RegisterRange] = RegisterRange(registers.PRESENT, registers.present_form.size)
+    state: ClassVar[RegisterRange] = RegisterRange(registers.TORQUE_ENABLE, registers.STATE_SIZE)
+    health: ClassVar[RegisterRange] = RegisterRange(registers.TORQUE_ENABLE, registers.STATE_SIZE)
     torque_enable: ClassVar[int] = registers.TORQUE_ENABLE
 
-    def __init__(self, context: ServosContext) -> None:
+    def __init__(self, context: FeetechContext) -> None:
         """Prepare to drive the servos of a port that is open; nothing is sent."""
         super().__init__(context)
         self._settings = context.settings
@@ -81,7 +81,7 @@ class Servos(SerialServos[Servo, Packet]):
                 servo.unsupervised_s = (now_ns - self._last_setpoint_ns) * 1e-9
         self._last_setpoint_ns = now_ns
 
-    def handle_response(self, i: int, status: Packet) -> None:
+    def handle_response(self, i: int, status: FeetechPacket) -> None:
         """Store the motion, voltage and temperature that a servo has reported in the readings."""
         servo = self.servos[i]
         position, speed, _load, voltage, temperature = registers.present_form.unpack(status.data)
@@ -91,13 +91,13 @@ class Servos(SerialServos[Servo, Packet]):
         self._readings.set_supply(i, voltage * registers.VOLTS, servo.current_a)
         self._readings.set_temperatures(i, float(temperature), float(temperature))
 
-    def _store_health(self, i: int, status: Packet) -> None:
+    def _store_health(self, i: int, status: FeetechPacket) -> None:
         """Store a servo's current and state; voltage and temperature come with its motion."""
         current = int.from_bytes(status.data[registers.CURRENT - registers.TORQUE_ENABLE :][:2], "little")
         self.servos[i].current_a = decode_sign_magnitude(current, SIGN_BIT) * registers.CURRENT_A
         self._store_state(i, status)
 
-    def _store_state(self, i: int, status: Packet) -> None:
+    def _store_state(self, i: int, status: FeetechPacket) -> None:
         """Store whether a servo's torque is on, and whether it still has what was sent to it."""
         servo = self.servos[i]
         acceleration = status.data[registers.ACCELERATION_ADDRESS - registers.TORQUE_ENABLE]
@@ -122,7 +122,7 @@ class Servos(SerialServos[Servo, Packet]):
         now_ns = self._clock_ns()
         self._last_setpoint_ns = now_ns
         all_servos = range(len(self.servos))
-        position_servos = {i for i in command.enabled_drives if command.modes[i] == Mode.POSITION}
+        position_servos = {i for i in command.enabled_drives if command.modes[i] == JointMode.POSITION}
         position_servos -= {i for i in all_servos if self.servos[i].unsupervised_s or self.servos[i].has_restarted}
         if not command.may_enable:
             position_servos &= {i for i in all_servos if self.servos[i].is_torque_requested}
@@ -166,19 +166,19 @@ class Servos(SerialServos[Servo, Packet]):
                 servo.record_switch(is_torque_requested=False, now_ns=self._clock_ns())
                 servo.has_restarted = False
 
-    def _find_stop_reason(self, i: int) -> Finding | None:
+    def _find_stop_reason(self, i: int) -> FaultFinding | None:
         servo = self.servos[i]
         if servo.errors:
             cause = f"{servo.label} reports {registers.describe_errors(servo.errors)}"
-            return Finding("drive_fault", cause, i, affects_only_joint=True)
+            return FaultFinding("drive_fault", cause, i, affects_only_joint=True)
         if servo.unsupervised_s:
             cause = (
                 f"{servo.label} held its last angle for {servo.unsupervised_s:.2f} s while the driver did not run, "
                 "because it has no watchdog; now its torque is off"
             )
-            return Finding("drive_fault", cause, i, affects_only_joint=True)
+            return FaultFinding("drive_fault", cause, i, affects_only_joint=True)
         is_off = servo.is_torque_requested and servo.health_read_ns > servo.torque_switched_ns and not servo.enabled
         if servo.has_restarted or is_off:
             cause = f"{servo.label} does not follow: its torque was switched off, or it has restarted"
-            return Finding("drive_not_armed", cause, i, affects_only_joint=True)
+            return FaultFinding("drive_not_armed", cause, i, affects_only_joint=True)
         return None

@@ -20,7 +20,7 @@ from snakesim_sim_backend.batch.simulations import (
     ContactArrays,
     Mask,
     MotorArrays,
-    Simulations,
+    SimulationBatch,
 )
 from snakesim_sim_backend.laws.native_laws import CONTACT_COUNT, CONTACT_NUMBERS, FOOT_NUMBERS, MEMORY_NUMBERS
 from snakesim_sim_backend.laws.version import FRICTION_INSTANCE
@@ -36,7 +36,7 @@ from snakesim_sim_backend.state.divergence import (
 PLUGIN = mujoco.mjtObj.mjOBJ_PLUGIN
 
 
-class BatchedSimulations(Simulations):
+class BatchedSimulations(SimulationBatch):
     """The states of all robots are rows of a batch."""
 
     def __init__(self, robots: int, joints: int, threads: int) -> None:

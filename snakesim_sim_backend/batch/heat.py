@@ -1,4 +1,4 @@
-"""Winding temperatures of the motors of many robots: `Thermal` on arrays of shape (robots, joints)."""
+"""Winding temperatures of the motors of many robots: `ThermalModel` on arrays of shape (robots, joints)."""
 
 from collections.abc import Sequence
 

@@ -8,12 +8,12 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.programs.preflight import decode_backend_settings
-from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.laws.version import TOUCHES_INSTANCE
 from snakesim_sim_backend.model.build import SimModel, build_sim_model
 from snakesim_sim_backend.model.tether import TetherRope
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.state.contacts import ObstacleContactReader
 from snakesim_sim_backend.state.divergence import log_mujoco_warnings
 from snakesim_sim_backend.state.start import place_and_settle_robot
@@ -28,8 +28,8 @@ class PlacedRobot:
     config: RunConfig
     sim: SimModel
     data: mujoco.MjData
-    physics: Physics
-    motors: Motors  # off
+    physics: PhysicsStepper
+    motors: ModelMotors  # off
     contact_reader: ObstacleContactReader
     contact_plugin_state: Floats | None  # see `find_contact_slice`; None if the laws run in Python
 
@@ -69,8 +69,8 @@ def create_settled_robot(config: RunConfig) -> PlacedRobot:
     settings = decode_backend_settings(config, SimBackend)
     sim = build_sim_model(config, settings, stores_contacts_in_state=True)
     data = mujoco.MjData(sim.model)
-    physics = Physics(sim, data)
-    motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale)
+    physics = PhysicsStepper(sim, data)
+    motors = ModelMotors(sim.model, data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale)
     place_and_settle_robot(sim, data, physics, config, motors, settings.settle_s)
     if settings.tether is not None:
         TetherRope(sim.model, data, settings.tether).tighten()

@@ -7,7 +7,7 @@ import numpy as np
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import JointState, Mode, Power
+from snakesim_hal.wire.messages import JointMode, JointState, Power
 from snakesim_sim_backend.actuators import INPUT_INDEX_BY_MODE, INPUTS_PER_MOTOR
 from snakesim_sim_backend.batch.batched import BatchedSimulations
 from snakesim_sim_backend.batch.heat import HeatArrays
@@ -15,11 +15,11 @@ from snakesim_sim_backend.batch.noise import NoiseStreams
 from snakesim_sim_backend.batch.placed import create_settled_robot
 from snakesim_sim_backend.batch.samples import Mask, Ticks
 from snakesim_sim_backend.batch.sensors import SensorArrays, encode_sensor_timing
-from snakesim_sim_backend.batch.simulations import LoopedSimulations, Simulations
+from snakesim_sim_backend.batch.simulations import LoopedSimulations, SimulationBatch
 from snakesim_sim_backend.laws.version import choose_laws
 
 
-def _open_simulations(robots: int, joints: int, threads: int) -> Simulations:
+def _open_simulations(robots: int, joints: int, threads: int) -> SimulationBatch:
     """Return a batch of simulations, or a loop over one or where the laws run in Python."""
     if robots == 1 or choose_laws() == "python":
         return LoopedSimulations(robots, joints)
@@ -105,7 +105,7 @@ class SimulatedRobots:
         self.sensors.sample(ticks, only_this_robot, self._simulations, self._heat.winding_c, is_reset=True)
         return True
 
-    def enact(self, mode: Mode, target: Floats, torque_limit_nm: Floats, robots: Mask) -> None:
+    def enact(self, mode: JointMode, target: Floats, torque_limit_nm: Floats, robots: Mask) -> None:
         """Set new targets and torque limits of the motors of some robots, in the mode that their motors have already.
 
         Args:
@@ -152,7 +152,7 @@ class SimulatedRobots:
         has_motor_dynamics = simulations.motor_state.shape[1] > 0
         if has_motor_dynamics:
             # The motor state (MuJoCo's activation) is the torque. Clamp it to limits that have decreased, as
-            # `Motors.apply_pending_torque_limits` does.
+            # `ModelMotors.apply_pending_torque_limits` does.
             motor_state = simulations.motor_state
             np.minimum(motor_state, self._max_torque_nm, out=motor_state)
             np.maximum(motor_state, self._min_torque_nm, out=motor_state)

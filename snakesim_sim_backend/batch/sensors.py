@@ -13,11 +13,11 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.sensors import Sensors
+from snakesim_hal.model.sensors import SensorSections
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.batch.noise import NoiseStreams
 from snakesim_sim_backend.batch.samples import DelayedValues, Mask, SamplingTicks, Ticks
-from snakesim_sim_backend.batch.simulations import NO_CONTACT_ARRAYS, ContactArrays, Simulations
+from snakesim_sim_backend.batch.simulations import NO_CONTACT_ARRAYS, ContactArrays, SimulationBatch
 from snakesim_sim_backend.sensors.timing import round_to_ticks
 
 NUMBERS_OF_POSE = 7  # position and quaternion
@@ -152,11 +152,12 @@ class SensorArrays:
             self.windings.restart(robot)
 
     def sample(
-        self, ticks: Ticks, active: Mask, simulations: Simulations, winding_c: Floats, *, is_reset: bool = False
+        self, ticks: Ticks, active: Mask, simulations: SimulationBatch, winding_c: Floats, *, is_reset: bool = False
     ) -> None:
-        """Read the sensors of the active robots at their current ticks, in the order of `Sensors.iterate_published`.
+        """Read the sensors of the active robots at their current ticks.
 
-        The order decides which random numbers each sensor uses, so that a robot has the same noise as in a single run.
+        The order is that of `SensorSuite.iterate_published`. It decides which random numbers each sensor uses, so that
+        a robot has the same noise as in a single run.
 
         Args:
             ticks: (robots,) current tick of each robot.
@@ -183,7 +184,7 @@ class SensorArrays:
                 self.windings.append_empty_tick()
         self._sample_joints(active, simulations, is_reset)
 
-    def _sample_contacts(self, due: Mask, simulations: Simulations, is_reset: bool) -> None:
+    def _sample_contacts(self, due: Mask, simulations: SimulationBatch, is_reset: bool) -> None:
         contacts = simulations.find_obstacle_contacts(due)
         sample = NO_CONTACTS if contacts is NO_CONTACT_ARRAYS else self._draw_contact_noise(contacts)
         if self._contact_delay_ticks:
@@ -235,7 +236,7 @@ class SensorArrays:
             return ContactSample(_select_contacts(contacts, fits_in_message), noise[fits_in_message])
         return ContactSample(contacts, noise)
 
-    def _sample_poses(self, due: Mask, simulations: Simulations, is_reset: bool) -> None:
+    def _sample_poses(self, due: Mask, simulations: SimulationBatch, is_reset: bool) -> None:
         """Store pose, velocity and random numbers of the robots that are due. Noise is added when a pose is read."""
         noise = self._no_pose_noise
         if self._pose_has_noise:
@@ -244,7 +245,7 @@ class SensorArrays:
         raw = np.concatenate((simulations.base_pose, simulations.base_velocity, noise), axis=1)
         self._raw_poses.add(raw, due, is_reset=is_reset)
 
-    def _sample_joints(self, active: Mask, simulations: Simulations, is_reset: bool) -> None:
+    def _sample_joints(self, active: Mask, simulations: SimulationBatch, is_reset: bool) -> None:
         """Read angles, velocities and torques of the active robots with noise, and deliver the reading that is due.
 
         Readings are delivered after the delay of the joint sensors, which is the length of `_joint_delay_queue`.
@@ -317,7 +318,7 @@ class SensorArrays:
         return np.array(forces_n)
 
 
-def _remove_mounted_sensors(sensors: Sensors) -> Sensors:
+def _remove_mounted_sensors(sensors: SensorSections) -> SensorSections:
     return msgspec.structs.replace(sensors, depth=[], range=[], custom=[])
 
 

@@ -12,7 +12,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_native.libraries import LAWS_LIBRARY
 from snakesim_native.load import load_shared_library
-from snakesim_sim_backend.actuators import INPUTS_PER_MOTOR, Motors
+from snakesim_sim_backend.actuators import INPUTS_PER_MOTOR, ModelMotors
 from snakesim_sim_backend.batch.placed import PlacedRobot, view_link_rotations
 from snakesim_sim_backend.laws.version import choose_laws
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
@@ -45,7 +45,7 @@ class ContactArrays:
 NO_CONTACT_ARRAYS = ContactArrays(np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 9)))
 
 
-class Simulations(ABC):
+class SimulationBatch(ABC):
     """Simulations of robots with equal joints, each in a scene of its own.
 
     Attributes:
@@ -66,7 +66,7 @@ class Simulations(ABC):
     torque_nm: Floats
     motor_state: Floats
     motor_inputs: Floats
-    motors: list[Motors]
+    motors: list[ModelMotors]
 
     @abstractmethod
     def load(self, robot: int, placed: PlacedRobot) -> bool:
@@ -101,16 +101,16 @@ class Simulations(ABC):
 class MotorArrays:
     """The arrays of one robot that its motors read and write, with the names that MjData gives them."""
 
-    def __init__(self, simulations: Simulations, robot: int) -> None:
+    def __init__(self, simulations: SimulationBatch, robot: int) -> None:
         self.act = simulations.motor_state[robot]
         self.actuator_force = simulations.torque_nm[robot]
         self.ctrl = simulations.motor_inputs[robot]
 
 
-NO_MOTORS: Motors = None  # pyright: ignore[reportAssignmentType] - of rows that are not loaded yet
+NO_MOTORS: ModelMotors = None  # pyright: ignore[reportAssignmentType] - of rows that are not loaded yet
 
 
-class LoopedSimulations(Simulations):
+class LoopedSimulations(SimulationBatch):
     """One MuJoCo state for each robot, stepped one after the other.
 
     For a single robot the arrays are views of MuJoCo's.

@@ -11,7 +11,7 @@ from snakesim_hal.wire.quantities import Vector
 FREE_DOFS = 6  # degrees of freedom of the base
 
 
-class Chain:
+class LinkChain:
     """The links of one simulation, tail to head.
 
     A wrench is a moment about the snake's center of mass, in N·m, followed by a force, in N; world frame. The

@@ -24,15 +24,15 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
-from snakesim_sim_backend.laws.chain import Chain
+from snakesim_sim_backend.laws.chain import LinkChain
 from snakesim_sim_backend.laws.directional import (
     BACKWARD,
     FORWARD,
     SIDEWAYS,
     VISCOUS_ACROSS,
     VISCOUS_ALONG,
-    Coefficients,
-    Underside,
+    DirectionalCoefficients,
+    LinkUndersides,
     apply_directional_friction,
     combine_coefficients,
 )
@@ -91,10 +91,10 @@ class ContactFriction:
         self,
         model: mujoco.MjModel,
         data: mujoco.MjData,
-        chain: Chain,
+        chain: LinkChain,
         link_geoms: Collection[int],
         memory: Floats,
-        underside: Underside,
+        underside: LinkUndersides,
     ) -> None:
         """Prepare the law for a compiled model.
 
@@ -177,7 +177,7 @@ class ContactFriction:
             fz = k * sz + d * dz
             scale = -_compute_limit_scale(mu_n, math.sqrt(fx * fx + fy * fy + fz * fz))
             force_w = (scale * fx, scale * fy, scale * fz)
-            coefficients = Coefficients(mu_n, *remaining[6:])
+            coefficients = DirectionalCoefficients(mu_n, *remaining[6:])
             if coefficients.is_directional:
                 neighbor, weight = self._underside.find_neighbor(link_body, remaining[0])
                 axis_w = self._underside.find_axis(link_body, neighbor, weight, (nx, ny, nz))
@@ -278,7 +278,9 @@ class ContactFriction:
         self._memory[1 : 1 + len(values)] = values
         self._memory[0] = len(friction_contacts)
 
-    def _find_coefficients(self, link_geom: int, other_geom: int, along_m: float, normal_w: Vector) -> Coefficients:
+    def _find_coefficients(
+        self, link_geom: int, other_geom: int, along_m: float, normal_w: Vector
+    ) -> DirectionalCoefficients:
         """Return the friction coefficients of a contact, which depend on the side of the link and on its neighbor.
 
         The underside of a link rubs with the coefficients of each direction, and all other sides with one coefficient.

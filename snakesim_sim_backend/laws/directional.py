@@ -41,7 +41,7 @@ MIN_AXIS = 0.1  # length of the mean of two directions; below it the body is fol
 NO_AXIS = (0.0, 0.0, 0.0)
 
 
-class Coefficients(NamedTuple):
+class DirectionalCoefficients(NamedTuple):
     """Coefficients of one contact or foot."""
 
     largest: float  # mu
@@ -65,20 +65,20 @@ class Coefficients(NamedTuple):
 
 def combine_coefficients(
     forward: float, backward: float, sideways: float, viscous_along: float, viscous_across: float, min_friction: float
-) -> Coefficients:
+) -> DirectionalCoefficients:
     """Return the coefficients of a contact, none of which is lower than `min_friction`."""
     forward = max(forward, min_friction)
     backward = max(backward, min_friction)
     sideways = max(sideways, min_friction)
     largest = max(forward, backward, sideways)
     if largest == 0.0:
-        return Coefficients(0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across)
-    return Coefficients(
+        return DirectionalCoefficients(0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across)
+    return DirectionalCoefficients(
         largest, forward / largest, backward / largest, sideways / largest, viscous_along, viscous_across
     )
 
 
-class Underside:
+class LinkUndersides:
     """The undersides of the links of one simulation."""
 
     def __init__(self, data: mujoco.MjData, first_body: int, lengths_m: list[float]) -> None:
@@ -140,7 +140,7 @@ def apply_directional_friction(
     force_w: Vector,
     slip_w: Vector,
     axis_w: Vector,
-    coefficients: Coefficients,
+    coefficients: DirectionalCoefficients,
     damping_per_viscous: float,
 ) -> Vector:
     """Reduce an isotropic friction force along and across the link, and add viscous friction.

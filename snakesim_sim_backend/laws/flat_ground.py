@@ -23,15 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.laws.chain import Chain
+from snakesim_sim_backend.laws.chain import LinkChain
 from snakesim_sim_backend.laws.directional import (
     BACKWARD,
     FORWARD,
     SIDEWAYS,
     VISCOUS_ACROSS,
     VISCOUS_ALONG,
-    Coefficients,
-    Underside,
+    DirectionalCoefficients,
+    LinkUndersides,
     apply_directional_friction,
     combine_coefficients,
 )
@@ -46,7 +46,7 @@ MIN_DIVISOR = 1e-12  # keeps 0 / 0 out of the friction of a foot without load
 
 
 @dataclass(frozen=True)
-class Feet:
+class GroundFeet:
     """The feet of a model on flat ground: one at the tail end of each link, and one at the head."""
 
     geoms: NDArray[np.int64]  # (n_feet,), tail to head
@@ -63,13 +63,13 @@ class Feet:
         return any(numbers[FORWARD:] != same for numbers in self.directions)
 
 
-def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: float) -> Feet:
+def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: float) -> GroundFeet:
     """Return the feet of a compiled model, whose geoms are called `foot_0` onwards."""
     masses_kg = model.body_mass[first_body : first_body + links]
     geoms = np.array([model.geom(f"foot_{i}").id for i in range(links + 1)])
     carried_kg = 0.5 * (np.append(masses_kg, 0.0) + np.append(0.0, masses_kg))
     friction = float(model.geom_friction[geoms[0], 0])
-    return Feet(geoms, first_body, carried_kg, radius_m, friction, model.geom_user[geoms].tolist())
+    return GroundFeet(geoms, first_body, carried_kg, radius_m, friction, model.geom_user[geoms].tolist())
 
 
 class FlatGround:
@@ -101,7 +101,7 @@ class FlatGround:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, feet: Feet, underside: Underside
+        self, model: mujoco.MjModel, data: mujoco.MjData, chain: LinkChain, feet: GroundFeet, underside: LinkUndersides
     ) -> None:
         """Prepare the law for a compiled model: compute stiffness and damping, and allocate all buffers.
 
@@ -144,7 +144,7 @@ class FlatGround:
         self._bind_mujoco_arrays(data, feet)
         self._allocate_buffers(count)
 
-    def _bind_mujoco_arrays(self, data: mujoco.MjData, feet: Feet) -> None:
+    def _bind_mujoco_arrays(self, data: mujoco.MjData, feet: GroundFeet) -> None:
         """Cache the views and flat indices of MuJoCo's arrays from which a step computes the friction of the feet.
 
         Args:
@@ -237,7 +237,7 @@ class FlatGround:
         normal_force_n *= self._minus_damping
         normal_force_n += self._minus_stiffness * height
         self.normal_force_n = np.maximum(normal_force_n, self._zeros)
-        coefficients: list[Coefficients] = []
+        coefficients: list[DirectionalCoefficients] = []
         slips: list[list[float]] = []
         if self._is_directional:
             coefficients = [self._find_coefficients(foot) for foot in range(len(self._bodies))]
@@ -265,7 +265,7 @@ class FlatGround:
         forces[3:] = forces[:2]
         self._add_link_wrenches()
 
-    def _find_coefficients(self, foot: int) -> Coefficients:
+    def _find_coefficients(self, foot: int) -> DirectionalCoefficients:
         """Return the coefficients of a foot, by how its links lie on the ground now."""
         numbers = self._directions[foot]
         viscous_across = numbers[VISCOUS_ACROSS]
@@ -282,7 +282,9 @@ class FlatGround:
             self.min_friction,
         )
 
-    def _apply_directional_friction(self, coefficients: list[Coefficients], slips: list[list[float]]) -> None:
+    def _apply_directional_friction(
+        self, coefficients: list[DirectionalCoefficients], slips: list[list[float]]
+    ) -> None:
         """Change the friction forces of the feet by the direction in which they slide."""
         for foot, of_foot in enumerate(coefficients):
             if of_foot.is_directional:

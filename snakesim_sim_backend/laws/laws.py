@@ -22,7 +22,7 @@ def find_normal_forces_n(solver_forces_n: Floats, solver_rows: NDArray[np.int32]
     return [forces_n[row] if row >= 0 else 0.0 for row in solver_rows.tolist()]
 
 
-class ContactForces(Protocol):
+class StepContacts(Protocol):
     """The contacts of the last physics step, in MuJoCo's order."""
 
     @property
@@ -50,14 +50,14 @@ class MeasuredContactForce(Protocol):
         ...
 
 
-class Laws(ABC):
+class PhysicsLaws(ABC):
     """Computes ground, friction and yielding obstacles of one simulation.
 
     Attributes:
         contacts: Forces of the contacts that MuJoCo finds.
     """
 
-    contacts: ContactForces
+    contacts: StepContacts
 
     @property
     @abstractmethod

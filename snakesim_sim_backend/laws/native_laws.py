@@ -16,7 +16,7 @@ import mujoco
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
-from snakesim_sim_backend.laws.laws import Laws, find_normal_forces_n
+from snakesim_sim_backend.laws.laws import PhysicsLaws, find_normal_forces_n
 from snakesim_sim_backend.laws.version import FRICTION_INSTANCE, MEASURED_FORCE_INSTANCE, load_library
 from snakesim_sim_backend.model.build import SimModel
 
@@ -93,7 +93,7 @@ class NativeMeasuredForce:
         return float(self._memory[MAX_MEAN_FORCE])
 
 
-class NativeLaws(Laws):
+class NativeLaws(PhysicsLaws):
     """Lets MuJoCo's engine compute the forces."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:

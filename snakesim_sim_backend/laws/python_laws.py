@@ -6,19 +6,19 @@ import mujoco
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.measured_force import MeasuredForce
-from snakesim_sim_backend.laws.chain import Chain
+from snakesim_sim_backend.laws.chain import LinkChain
 from snakesim_sim_backend.laws.contact_friction import ContactFriction, count_contact_values
-from snakesim_sim_backend.laws.directional import Underside
+from snakesim_sim_backend.laws.directional import LinkUndersides
 from snakesim_sim_backend.laws.flat_ground import VALUES_PER_FOOT, FlatGround
-from snakesim_sim_backend.laws.laws import Laws
-from snakesim_sim_backend.laws.yielding import Yielding
+from snakesim_sim_backend.laws.laws import PhysicsLaws
+from snakesim_sim_backend.laws.yielding import YieldingObstacles
 from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.state.contacts import ObstacleContactReader
 
 VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
-class PythonLaws(Laws):
+class PythonLaws(PhysicsLaws):
     """Computes the forces in Python, in every physics step."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
@@ -32,9 +32,9 @@ class PythonLaws(Laws):
         link_count = len(sim.link_geoms)
         self._model = model
         self._data = data
-        chain = Chain(data, sim.first_link_body, link_count)
+        chain = LinkChain(data, sim.first_link_body, link_count)
         half_lengths_m = model.geom_size[sim.link_geoms, 1]
-        underside = Underside(data, sim.first_link_body, (2.0 * half_lengths_m).tolist())
+        underside = LinkUndersides(data, sim.first_link_body, (2.0 * half_lengths_m).tolist())
 
         contacts_start = VALUES_PER_FOOT * (link_count + 1)  # the values of the feet come first in `userdata`
         memory = data.userdata[contacts_start : contacts_start + count_contact_values(link_count)]
@@ -47,7 +47,7 @@ class PythonLaws(Laws):
             self._ground = FlatGround(model, data, chain, sim.feet, underside)
             self._force_laws.append(self._ground.apply)
         if sim.yielding:
-            self._force_laws.append(Yielding(model, data, len(sim.yielding)).apply)
+            self._force_laws.append(YieldingObstacles(model, data, len(sim.yielding)).apply)
         self._force_laws.append(chain.apply)  # last, because it applies the forces that the other laws have collected
 
         self._contact_reader = ObstacleContactReader(sim, data, self.contacts)

@@ -19,7 +19,7 @@ import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.placement import PlacedObstacle
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_sim_backend.laws.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
 
 JOINT_TYPE_BY_AXIS = {
@@ -37,7 +37,7 @@ GRID_POINTS = 20  # along an edge of a foot, to average its radius
 MIN_FORCE_N = 1e-12  # keeps 0 / 0 out of the forces of an obstacle at rest
 
 
-def measure_foot(obstacle: Obstacle) -> tuple[float, float]:
+def measure_foot(obstacle: KnownObstacle) -> tuple[float, float]:
     """Return the area of an obstacle's foot in m², and the mean distance of its points from its middle in m."""
     if obstacle.shape != "box":
         return math.pi * obstacle.radius_m**2, 2.0 / 3.0 * obstacle.radius_m
@@ -123,7 +123,7 @@ def compute_spring(placed: PlacedObstacle, step_s: float, normal_gravity_m_s2: f
     return [stiffness, damping, max_force_n, mean_radius_m]
 
 
-class Yielding:
+class YieldingObstacles:
     """The springs of one simulation. Call `apply` between `mj_step1` and `mj_step2`.
 
     Equations of one obstacle, with its displacement q (x and y in m, rotation in rad), its anchor a, and the lengths

@@ -25,7 +25,7 @@ from snakesim_hal.wire.messages import Axis
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.actuators import add_motor
 from snakesim_sim_backend.laws.chain import FREE_DOFS
-from snakesim_sim_backend.laws.flat_ground import FOOT, Feet, find_feet
+from snakesim_sim_backend.laws.flat_ground import FOOT, GroundFeet, find_feet
 from snakesim_sim_backend.laws.version import LawsVersion, add_laws, choose_laws
 from snakesim_sim_backend.laws.yielding import validate_yielding_obstacles
 from snakesim_sim_backend.model.friction import set_friction
@@ -53,7 +53,7 @@ class SimModel:
     steps_per_tick: int
     first_link_body: int  # bodies of the links are consecutive
     obstacle_of_geom: list[str | None]  # (n_geoms,); None: link, ground or step
-    feet: Feet | None  # None: the ground is not flat, and MuJoCo finds the contacts with it
+    feet: GroundFeet | None  # None: the ground is not flat, and MuJoCo finds the contacts with it
     link_geoms: list[int]  # (n_links,), tail to head
     suspended: bool  # the tail link is clamped
     yielding: list[PlacedObstacle]  # obstacles that move when they are pushed; their bodies come after the robot's
@@ -61,7 +61,7 @@ class SimModel:
 
 
 @dataclass(frozen=True)
-class Blueprint:
+class ModelBlueprint:
     """The model of a run before it is compiled."""
 
     spec: mujoco.MjSpec
@@ -96,7 +96,7 @@ def build_sim_model(
         laws: Version of the laws that computes ground and friction. None for the C version if it can be loaded.
         stores_contacts_in_state: Whether the C version writes the forces between links and obstacles into
             MuJoCo's state, for programs that see only the state.
-        measures_force: Whether the simulation has a contact sensor, which `Physics` reads.
+        measures_force: Whether the simulation has a contact sensor, which `PhysicsStepper` reads.
 
     Returns:
         The model, with the indices by which other modules find links, feet and obstacles in it.
@@ -140,7 +140,7 @@ def assemble_model_blueprint(
     laws: LawsVersion,
     keeps_touches: bool = False,
     measures_force: bool = False,
-) -> Blueprint:
+) -> ModelBlueprint:
     """Assemble the model of a run before it is compiled: bodies, geoms, motors, and the friction of each geom.
 
     Args:
@@ -180,7 +180,7 @@ def assemble_model_blueprint(
     set_friction(spec, config, placed, rough_ground_geoms, settings.self_friction)
     yielding_bodies = [make_geom_name(item) for item in yielding]
     add_laws(spec, laws, links, yielding_bodies, keeps_touches=keeps_touches, measures_force=measures_force)
-    return Blueprint(spec, steps_per_tick, yielding, laws)
+    return ModelBlueprint(spec, steps_per_tick, yielding, laws)
 
 
 def _check_contact_time(settings: SimSettings, step_s: float) -> None:

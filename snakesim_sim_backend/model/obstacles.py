@@ -22,7 +22,7 @@ COLLIDES_WITH_OBSTACLES = 2
 UPRIGHT = [1.0, 0.0, 0.0, 0.0]  # quaternion wxyz
 
 
-class Shape(TypedDict):
+class GeomArguments(TypedDict):
     """Keyword arguments of MjsBody.add_geom; lengths in m."""
 
     type: int
@@ -97,7 +97,7 @@ def _add_yielding_body(spec: mujoco.MjSpec, name: str, foot_w: Floats) -> mujoco
     return body
 
 
-def _make_obstacle_shape(placed: PlacedObstacle, body_radius_m: float, ground_relief_m: float) -> Shape:
+def _make_obstacle_shape(placed: PlacedObstacle, body_radius_m: float, ground_relief_m: float) -> GeomArguments:
     """Return the shape, place and orientation of an obstacle's geom.
 
     Obstacles other than spheres reach below the ground, so that no gap is left in a hollow or below a leaning one.
@@ -111,7 +111,7 @@ def _make_obstacle_shape(placed: PlacedObstacle, body_radius_m: float, ground_re
     x, y, z = obstacle.position_w
     if obstacle.shape == "sphere":
         size = [obstacle.radius_m, 0.0, 0.0]
-        return Shape(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=[x, y, z], quat=UPRIGHT)
+        return GeomArguments(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=[x, y, z], quat=UPRIGHT)
 
     half_x, half_y, _ = obstacle.half_size_m
     top = z + obstacle.height_m / 2
@@ -137,7 +137,7 @@ def _make_obstacle_shape(placed: PlacedObstacle, body_radius_m: float, ground_re
     direction_rad = placed.lean_towards_rad
     middle = (top + bottom) / 2
     shift = middle * math.sin(lean_rad)
-    return Shape(
+    return GeomArguments(
         type=geom_type,
         size=[*size, (top - bottom) / 2, 0.0][:3],  # MuJoCo has three sizes of every geom
         pos=[x + shift * math.cos(direction_rad), y + shift * math.sin(direction_rad), middle * math.cos(lean_rad)],

@@ -9,7 +9,7 @@ import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.robot import RobotFile
-from snakesim_sim_backend.settings import Tether
+from snakesim_sim_backend.settings import TetherSettings
 
 ROPE_LENGTH_M = 50.0  # long enough for the accuracy above
 SLACK_LENGTH_M = 1e4  # longest rope of a tether that is not tightened yet
@@ -22,7 +22,7 @@ WINCH = "tether_winch"
 LIMIT_FORCE = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
 
 
-def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_time_s: float) -> None:
+def add_tether(spec: mujoco.MjSpec, tether: TetherSettings, robot: RobotFile, contact_time_s: float) -> None:
     """Add a slack tether between the world and a link to a model whose motors are complete.
 
     The tether is a tendon with a maximum length. If it is reeled in, a winch shortens it with a limited force.
@@ -72,7 +72,7 @@ def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_ti
 class TetherRope:
     """The tether of a compiled model."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, tether: Tether) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, tether: TetherSettings) -> None:
         self._model = model
         self._data = data
         self._tether = tether

@@ -9,7 +9,7 @@ from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.model.build import SimModel
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.sensors.frames import rotate_into_frame
 from snakesim_sim_backend.sensors.scope import Normal
 from snakesim_sim_backend.state.contacts import ObstacleContact, ObstacleContactReader
@@ -22,7 +22,7 @@ class ContactReader:
     """Measures the contacts with obstacles, in the frames of the links."""
 
     def __init__(
-        self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
+        self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: PhysicsStepper
     ) -> None:
         first = sim.first_link_body
         self._contact_reader = ObstacleContactReader(sim, data, physics.contacts)

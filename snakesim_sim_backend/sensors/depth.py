@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from snakesim_hal.model.sensor_model import NoSettings, SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
-from snakesim_sim_backend.sensors.mount import Mount
-from snakesim_sim_backend.sensors.rays import Rays
-from snakesim_sim_backend.sensors.scope import Floats, Scope
+from snakesim_sim_backend.sensors.mount import SensorMount
+from snakesim_sim_backend.sensors.rays import RayBundle
+from snakesim_sim_backend.sensors.scope import Floats, SensorScope
 
 SCALE_M = 0.001  # of one count
 MAX_COUNT = 2**16 - 1
@@ -19,18 +19,18 @@ class RayCamera(SensorModel):
 
     message = DepthImage
 
-    def __init__(self, camera: DepthCamera, scope: Scope, settings: NoSettings) -> None:
+    def __init__(self, camera: DepthCamera, scope: SensorScope, settings: NoSettings) -> None:
         del settings
         self._camera = camera
         self._noise = scope.noise
-        self._mount = Mount(camera, scope)
+        self._mount = SensorMount(camera, scope)
         # Rays in the camera's frame (x forward, y left, z up), of length 1 along the optical axis.
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         forward = np.full(u.shape, camera.focal_px)
         left = (camera.width - 1) / 2 - u
         up = (camera.height - 1) / 2 - v
         rays_c = np.stack([forward, left, up], -1).reshape(-1, 3) / camera.focal_px
-        self._rays = Rays(self._mount, scope, rays_c, camera.range_max_m)
+        self._rays = RayBundle(self._mount, scope, rays_c, camera.range_max_m)
 
     def read(self, tick: int, timestamp_ns: int) -> DepthImage:
         """Return an image from the present place of the link."""
@@ -38,7 +38,7 @@ class RayCamera(SensorModel):
 
 
 def make_depth_image(
-    camera: DepthCamera, mount: Mount, tick: int, timestamp_ns: int, depth_m: Floats, noise: np.random.Generator
+    camera: DepthCamera, mount: SensorMount, tick: int, timestamp_ns: int, depth_m: Floats, noise: np.random.Generator
 ) -> DepthImage:
     """Make the message of a depth image from exact distances, with the noise, dropouts and range of a camera.
 

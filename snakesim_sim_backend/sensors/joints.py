@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_hal.model.sensors import JointSensor
 from snakesim_hal.wire.messages import JointState
-from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import view_joint_states
 from snakesim_sim_backend.sensors.scope import Normal
 from snakesim_sim_backend.sensors.timing import round_to_ticks
@@ -20,7 +20,9 @@ class JointReader:
     reading of the start is used.
     """
 
-    def __init__(self, data: mujoco.MjData, sensor: JointSensor, motors: Motors, noise: Normal, period_ns: int) -> None:
+    def __init__(
+        self, data: mujoco.MjData, sensor: JointSensor, motors: ModelMotors, noise: Normal, period_ns: int
+    ) -> None:
         count = motors.count
         self._unmeasured_torque_indices = [2 * count + i for i in motors.joints_without_torque_sensor]
         self._count = count

@@ -4,15 +4,15 @@ import math
 from typing import Any
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.sensors import DepthCamera, Mounted
+from snakesim_hal.model.sensors import DepthCamera, MountedSensor
 from snakesim_hal.wire.quantities import Quaternion, Vector
-from snakesim_sim_backend.sensors.scope import Floats, Scope
+from snakesim_sim_backend.sensors.scope import Floats, SensorScope
 
 
-class Mount:
+class SensorMount:
     """The fixed place of a sensor on a link, and its place in the world as the link moves."""
 
-    def __init__(self, sensor: Mounted, scope: Scope) -> None:
+    def __init__(self, sensor: MountedSensor, scope: SensorScope) -> None:
         """Find the place of a sensor.
 
         Args:

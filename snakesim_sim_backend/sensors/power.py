@@ -6,16 +6,18 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.physics.thermal import Thermal
+from snakesim_hal.physics.thermal import ThermalModel
 from snakesim_hal.wire.messages import Power
-from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import view_joint_states
 
 
 class PowerReader:
     """Supply, current and temperatures of the joint modules, without noise and without a leak."""
 
-    def __init__(self, data: mujoco.MjData, motors: Motors, windings: Thermal, joints: Sequence[Joint]) -> None:
+    def __init__(
+        self, data: mujoco.MjData, motors: ModelMotors, windings: ThermalModel, joints: Sequence[Joint]
+    ) -> None:
         _, self._velocities = view_joint_states(data, motors.count)
         self._torques = motors.get_applied_torque_nm()
         self._windings = windings

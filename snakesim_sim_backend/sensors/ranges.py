@@ -4,29 +4,29 @@ import numpy as np
 
 from snakesim_hal.model.sensor_model import NoSettings, SensorModel
 from snakesim_hal.model.sensors import RangeSensor
-from snakesim_hal.wire.messages import Ranges
-from snakesim_sim_backend.sensors.mount import Mount
-from snakesim_sim_backend.sensors.rays import Rays
-from snakesim_sim_backend.sensors.scope import Scope
+from snakesim_hal.wire.messages import RangeScan
+from snakesim_sim_backend.sensors.mount import SensorMount
+from snakesim_sim_backend.sensors.rays import RayBundle
+from snakesim_sim_backend.sensors.scope import SensorScope
 
 
 class RayBeams(SensorModel):
     """Distances along beams without width, all measured at once."""
 
-    message = Ranges
+    message = RangeScan
 
-    def __init__(self, sensor: RangeSensor, scope: Scope, settings: NoSettings) -> None:
+    def __init__(self, sensor: RangeSensor, scope: SensorScope, settings: NoSettings) -> None:
         del settings
         self._sensor = sensor
         self._noise = scope.noise
-        self._mount = Mount(sensor, scope)
+        self._mount = SensorMount(sensor, scope)
         self._first_rad = -sensor.fov_rad / 2
         self._step_rad = sensor.fov_rad / max(sensor.beams - 1, 1)
         angles = self._first_rad + self._step_rad * np.arange(sensor.beams)
         rays_s = np.stack([np.cos(angles), np.sin(angles), np.zeros(sensor.beams)], -1)
-        self._rays = Rays(self._mount, scope, rays_s, sensor.range_max_m)
+        self._rays = RayBundle(self._mount, scope, rays_s, sensor.range_max_m)
 
-    def read(self, tick: int, timestamp_ns: int) -> Ranges:
+    def read(self, tick: int, timestamp_ns: int) -> RangeScan:
         """Measure the distances along all beams, from the current place of the sensor.
 
         Distances have noise. The distance of a beam is None if it hits nothing within the sensor's range, or drops out
@@ -47,7 +47,7 @@ class RayBeams(SensorModel):
             distance_m if is_valid else None
             for distance_m, is_valid in zip(distances_m.tolist(), is_measured.tolist(), strict=True)
         ]
-        return Ranges(
+        return RangeScan(
             tick=tick,
             timestamp_ns=timestamp_ns,
             link=self._mount.link,

@@ -8,8 +8,8 @@ import numpy as np
 
 from snakesim_sim_backend.model.build import FOOT_GROUP
 from snakesim_sim_backend.model.ground import GROUND, PLANE_GROUP
-from snakesim_sim_backend.sensors.mount import Mount
-from snakesim_sim_backend.sensors.scope import Floats, Scope
+from snakesim_sim_backend.sensors.mount import SensorMount
+from snakesim_sim_backend.sensors.scope import Floats, SensorScope
 
 VISIBLE_GROUPS = np.ones(mujoco.mjNGROUP, np.uint8)
 VISIBLE_GROUPS[FOOT_GROUP] = 0  # spheres inside of the links' capsules
@@ -18,13 +18,13 @@ VISIBLE_GROUPS[PLANE_GROUP] = (
 )
 
 
-class Rays:
+class RayBundle:
     """A bundle of rays from one place, cast together.
 
     They hit everything visible but the link that carries the sensor: the robot sees the rest of its own body.
     """
 
-    def __init__(self, mount: Mount, scope: Scope, rays_s: Floats, max_lengths: float) -> None:
+    def __init__(self, mount: SensorMount, scope: SensorScope, rays_s: Floats, max_lengths: float) -> None:
         """Prepare a bundle of rays.
 
         Args:

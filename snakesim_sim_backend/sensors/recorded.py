@@ -12,12 +12,12 @@ from snakesim_hal.model.files import FileStruct, expand_home
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
-from snakesim_sim_backend.sensors.scope import Scope
+from snakesim_sim_backend.sensors.scope import SensorScope
 
 MAX_BYTES = 500_000_000  # of a recording: it is kept in memory
 
 
-class Line(msgspec.Struct, frozen=True):
+class RecordedLine(msgspec.Struct, frozen=True):
     """A line of the file."""
 
     message: DepthImage
@@ -26,7 +26,7 @@ class Line(msgspec.Struct, frozen=True):
 class RecordedDepth(SensorModel):
     """Plays a recording by the robot's time, and begins again at its end."""
 
-    class Settings(FileStruct, frozen=True):
+    class RecordingSettings(FileStruct, frozen=True):
         """The recording."""
 
         file: Annotated[str, Meta(min_length=1)]
@@ -34,7 +34,7 @@ class RecordedDepth(SensorModel):
 
     message = DepthImage
 
-    def __init__(self, camera: DepthCamera, scope: Scope, settings: Settings) -> None:
+    def __init__(self, camera: DepthCamera, scope: SensorScope, settings: RecordingSettings) -> None:
         """Read the recording.
 
         Raises:
@@ -69,7 +69,7 @@ def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
         ConfigError: The file cannot be read, is too large, or has images that cannot be used.
     """
     path = expand_home(file)
-    decoder = msgspec.json.Decoder(Line)
+    decoder = msgspec.json.Decoder(RecordedLine)
     try:
         byte_count = path.stat().st_size
         if byte_count > MAX_BYTES:

@@ -32,7 +32,7 @@ from snakesim_sim_backend.sensors.power import PowerReader
 from snakesim_sim_backend.sensors.ranges import RayBeams
 from snakesim_sim_backend.sensors.recorded import RecordedDepth
 from snakesim_sim_backend.sensors.rendered import RenderedColor, RenderedDepth
-from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
+from snakesim_sim_backend.sensors.scope import BodyScope, SensorReader, SensorScope
 
 # Sensors that look around: the model's name in the robot file -> its classes, each with a message of its own.
 SENSOR_MODELS: dict[str, tuple[type[SensorModel], ...]] = {
@@ -42,7 +42,7 @@ SENSOR_MODELS: dict[str, tuple[type[SensorModel], ...]] = {
 }
 
 
-def make_body_reader(sensor: BodySensor, scope: BodyScope) -> Reader:
+def make_body_reader(sensor: BodySensor, scope: BodyScope) -> SensorReader:
     """Make the reader of a sensor that measures the body itself, such as contacts, IMUs or the pose.
 
     Args:
@@ -77,7 +77,7 @@ def check_sensor_models(robot: RobotFile) -> None:
         _find_model(key, sensor, load_plugin_unless_file)
 
 
-def make_mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
+def make_mounted_reader(key: str, sensor: AnyMounted, scope: SensorScope) -> SensorReader:
     """Make the reader of a sensor that is mounted on a link.
 
     Raises:

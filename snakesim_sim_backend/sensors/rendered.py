@@ -13,9 +13,9 @@ from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_sim_backend.model.ground import PLANE_GROUP
 from snakesim_sim_backend.sensors.depth import make_depth_image
-from snakesim_sim_backend.sensors.mount import Mount
+from snakesim_sim_backend.sensors.mount import SensorMount
 from snakesim_sim_backend.sensors.rays import VISIBLE_GROUPS
-from snakesim_sim_backend.sensors.scope import Scope
+from snakesim_sim_backend.sensors.scope import SensorScope
 
 DEBIAN_PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6"}
 NEAR_M = 0.01  # minimum and maximum distance of what is drawn
@@ -30,7 +30,7 @@ class RenderedDepth(SensorModel):
 
     message = DepthImage
 
-    def __init__(self, camera: DepthCamera, scope: Scope, settings: NoSettings) -> None:
+    def __init__(self, camera: DepthCamera, scope: SensorScope, settings: NoSettings) -> None:
         del settings
         self._camera = camera
         self._noise = scope.noise
@@ -48,7 +48,7 @@ class RenderedColor(SensorModel):
 
     message = ColorImage
 
-    def __init__(self, camera: DepthCamera, scope: Scope, settings: NoSettings) -> None:
+    def __init__(self, camera: DepthCamera, scope: SensorScope, settings: NoSettings) -> None:
         del settings
         self._camera = camera
         self._renderer = CameraRenderer(camera, scope, smooth=True)
@@ -63,7 +63,7 @@ class RenderedColor(SensorModel):
 class CameraRenderer:
     """Draws what a camera sees. It must be made and used in one thread."""
 
-    def __init__(self, camera: DepthCamera, scope: Scope, *, smooth: bool) -> None:
+    def __init__(self, camera: DepthCamera, scope: SensorScope, *, smooth: bool) -> None:
         """Prepare a renderer for one camera of the robot. It must be made and used in one thread.
 
         Args:
@@ -76,7 +76,7 @@ class CameraRenderer:
             ConfigError: OpenGL is not available.
         """
         model = scope.sim.model
-        self.mount = Mount(camera, scope)
+        self.mount = SensorMount(camera, scope)
         self._model = model
         self._data = scope.data
         self._focal_px = camera.focal_px

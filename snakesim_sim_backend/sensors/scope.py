@@ -9,17 +9,17 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.thermal import Thermal
+from snakesim_hal.physics.thermal import ThermalModel
 from snakesim_hal.wire.messages import Message
-from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import SimModel
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 
 Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers
 
 
 @dataclass(frozen=True)
-class Scope:
+class SensorScope:
     """The model and the state that a sensor that looks around may use."""
 
     config: RunConfig  # the run
@@ -29,15 +29,15 @@ class Scope:
 
 
 @dataclass(frozen=True)
-class BodyScope(Scope):
+class BodyScope(SensorScope):
     """The state itself, for a sensor of the body, and the noise generator that these sensors share."""
 
-    motors: Motors
-    physics: Physics
-    windings: Thermal
+    motors: ModelMotors
+    physics: PhysicsStepper
+    windings: ThermalModel
 
 
-class Reader(Protocol):
+class SensorReader(Protocol):
     """Makes the samples of one sensor."""
 
     def read(self, tick: int, timestamp_ns: int) -> Message:

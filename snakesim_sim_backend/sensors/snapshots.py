@@ -13,7 +13,7 @@ from snakesim_hal.wire.messages import Message
 ResultT = TypeVar("ResultT")
 
 
-class Snapshots:
+class SnapshotThread:
     """One thread, and the state that it works on."""
 
     def __init__(self, model: mujoco.MjModel) -> None:

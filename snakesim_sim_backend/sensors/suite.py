@@ -9,20 +9,20 @@ import numpy as np
 
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.sensors import AnyMounted, AnySensor, Mounted
-from snakesim_hal.physics.thermal import Thermal
+from snakesim_hal.model.sensors import AnyMounted, AnySensor, MountedSensor
+from snakesim_hal.physics.thermal import ThermalModel
 from snakesim_hal.wire.messages import Message
-from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import SimModel
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.sensors.joints import JointReader
 from snakesim_sim_backend.sensors.registry import make_body_reader, make_mounted_reader, make_sensor_rng
-from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
-from snakesim_sim_backend.sensors.snapshots import Snapshots
+from snakesim_sim_backend.sensors.scope import BodyScope, SensorReader, SensorScope
+from snakesim_sim_backend.sensors.snapshots import SnapshotThread
 from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, round_to_ticks
 
 
-class Sensors:
+class SensorSuite:
     """Every sensor has its rate, delay and noise: the same seed and commands give the same bytes.
 
     The sensors of the body share a noise generator. Each one that looks around has its own, so that it changes nothing
@@ -34,9 +34,9 @@ class Sensors:
         sim: SimModel,
         data: mujoco.MjData,
         config: RunConfig,
-        motors: Motors,
-        physics: Physics,
-        windings: Thermal,
+        motors: ModelMotors,
+        physics: PhysicsStepper,
+        windings: ThermalModel,
     ) -> None:
         """Create the readers of all sensors in the robot file.
 
@@ -63,11 +63,11 @@ class Sensors:
         self.dropped_counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
 
-        self._snapshots: Snapshots | None = None
+        self._snapshots: SnapshotThread | None = None
         if any(True for _ in sensors.iterate_mounted()):
-            self._snapshots = Snapshots(sim.model)
+            self._snapshots = SnapshotThread(sim.model)
         for key, sensor in sensors.iterate_published():
-            if isinstance(sensor, Mounted):
+            if isinstance(sensor, MountedSensor):
                 channel = self._make_threaded_sensor(key, sensor, scope)
             else:
                 channel = SynchronousSensor(make_body_reader(sensor, scope), sensor, config)
@@ -96,11 +96,11 @@ class Sensors:
         if self._snapshots is not None:
             self._snapshots.close()
 
-    def _make_threaded_sensor(self, key: str, sensor: AnyMounted, scope: Scope) -> "ThreadedSensor":
+    def _make_threaded_sensor(self, key: str, sensor: AnyMounted, scope: SensorScope) -> "ThreadedSensor":
         """Make a sensor whose samples another thread makes. Its reader is made in that thread, too, for OpenGL."""
         snapshots = self._snapshots
         assert snapshots is not None
-        own_scope = Scope(scope.config, scope.sim, snapshots.data, make_sensor_rng(key, scope.config.seed))
+        own_scope = SensorScope(scope.config, scope.sim, snapshots.data, make_sensor_rng(key, scope.config.seed))
         reader = snapshots.run(lambda: make_mounted_reader(key, sensor, own_scope))
         return ThreadedSensor(key, reader, sensor, scope, snapshots, self.dropped_counts)
 
@@ -108,7 +108,7 @@ class Sensors:
 class SynchronousSensor:
     """A sensor that is read within the tick."""
 
-    def __init__(self, reader: Reader, sensor: AnySensor, config: RunConfig) -> None:
+    def __init__(self, reader: SensorReader, sensor: AnySensor, config: RunConfig) -> None:
         self._read = reader.read
         self._schedule = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
         self._delay_line = DelayLine(round_to_ticks(sensor.delay_s, config.period_ns))
@@ -129,7 +129,13 @@ class ThreadedSensor:
     """
 
     def __init__(
-        self, key: str, reader: Reader, sensor: Mounted, scope: Scope, snapshots: Snapshots, late: Counter[str]
+        self,
+        key: str,
+        reader: SensorReader,
+        sensor: MountedSensor,
+        scope: SensorScope,
+        snapshots: SnapshotThread,
+        late: Counter[str],
     ) -> None:
         config = scope.config
         self._key = key

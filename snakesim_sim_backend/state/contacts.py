@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 
 from snakesim_hal.wire.quantities import Vector
-from snakesim_sim_backend.laws.laws import ContactForces
+from snakesim_sim_backend.laws.laws import StepContacts
 from snakesim_sim_backend.model.build import SimModel
 
 GeomPair = tuple[int, int]  # in MuJoCo's order
@@ -32,7 +32,7 @@ class ObstacleContact(NamedTuple):
 class ObstacleContactReader:
     """Finds the contacts with obstacles in a simulation's data."""
 
-    def __init__(self, sim: SimModel, data: mujoco.MjData, forces: ContactForces) -> None:
+    def __init__(self, sim: SimModel, data: mujoco.MjData, forces: StepContacts) -> None:
         self._contact = data.contact
         self._forces = forces
         self._obstacle_of_geom = sim.obstacle_of_geom

@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_hal.base.errors import BackendError
 from snakesim_sim_backend.model.build import FREE_DOFS
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 
 _log = logging.getLogger("snakesim.sim")
 
@@ -31,7 +31,7 @@ class DivergenceWatch:
     """Checks the state once a tick, or once per other counted unit."""
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, physics: Physics, steps: int, counted: str = "tick"
+        self, model: mujoco.MjModel, data: mujoco.MjData, physics: PhysicsStepper, steps: int, counted: str = "tick"
     ) -> None:
         """Store the current state as the last good one, to which a diverged simulation returns.
 

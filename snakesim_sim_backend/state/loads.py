@@ -7,7 +7,7 @@ import mujoco
 
 from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_sim_backend.model.build import SimModel
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.sensors.frames import rotate_into_frame
 from snakesim_sim_backend.state.contacts import ObstacleContact, ObstacleContactReader
 
@@ -40,7 +40,7 @@ class _WeightedSum:
 class LinkLoadReader:
     """Adds up the contacts in a simulation's data."""
 
-    def __init__(self, sim: SimModel, data: mujoco.MjData, physics: Physics) -> None:
+    def __init__(self, sim: SimModel, data: mujoco.MjData, physics: PhysicsStepper) -> None:
         first = sim.first_link_body
         self._contact_reader = ObstacleContactReader(sim, data, physics.contacts)
         self._origins = data.xpos[first:]  # of links, and of the bodies behind them

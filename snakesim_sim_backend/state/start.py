@@ -7,11 +7,11 @@ import numpy as np
 
 from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, StartPose, compute_start_pose
-from snakesim_hal.wire.messages import Mode
-from snakesim_sim_backend.actuators import Motors
+from snakesim_hal.wire.messages import JointMode
+from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import FREE_QPOS, SimModel, view_joint_states
 from snakesim_sim_backend.model.ground import GROUND_GROUP, PLANE_GROUP
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 
 MAX_REST_SPEED = 1e-3  # m/s and rad/s: slower is at rest
 REQUIRED_ROUNDS_AT_REST = 5  # in a row, until the snake has come to rest
@@ -24,7 +24,7 @@ HEAD_DOWN = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]  # quaternion wxyz: a qua
 
 
 def place_and_settle_robot(
-    sim: SimModel, data: mujoco.MjData, physics: Physics, config: RunConfig, motors: Motors, settle_s: float
+    sim: SimModel, data: mujoco.MjData, physics: PhysicsStepper, config: RunConfig, motors: ModelMotors, settle_s: float
 ) -> None:
     """Place the robot at its start pose, let it come to rest, and set the time to 0 with the motors off.
 
@@ -104,9 +104,9 @@ def find_highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: Ru
 def _settle_robot(
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    physics: Physics,
+    physics: PhysicsStepper,
     config: RunConfig,
-    motors: Motors,
+    motors: ModelMotors,
     pose: StartPose,
     settle_s: float,
 ) -> None:
@@ -124,7 +124,7 @@ def _settle_robot(
         pose: Position, heading and joint angles at the start.
         settle_s: Maximum duration.
     """
-    modes = [Mode.POSITION] * motors.count
+    modes = [JointMode.POSITION] * motors.count
     limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
     motors.set_inputs(modes, pose.angles_rad.tolist(), limits_nm)
     physics.set_min_friction(SETTLING_FRICTION)

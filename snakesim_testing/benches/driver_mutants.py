@@ -6,7 +6,7 @@ from typing import Any
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_type import DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.drives import BusCommand
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.template.minimal_driver import (
     NO_SETPOINT,
@@ -161,7 +161,7 @@ class EnablesRestartedDrives(AnswersForSilentDrives):
         for i in command.enabled_drives:
             self.emulator.handle_message(i, "enable")
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         return [finding for finding in super().findings() if finding.what != "drive_not_armed"]
 
 
@@ -169,7 +169,7 @@ class EnablesRestartedDrives(AnswersForSilentDrives):
 class TakesTheLastAnswer(MinimalDrives):
     """A second drive with one id goes unnoticed."""
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         return [finding for finding in super().findings() if finding.what != "duplicate_node"]
 
 
@@ -183,7 +183,7 @@ class ForgetsTheSecondDrive(MinimalDrives):
         super().reset_faults(joints)
         self.is_forgotten = True
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         findings = super().findings()
         return [finding for finding in findings if not (self.is_forgotten and finding.what == "duplicate_node")]
 

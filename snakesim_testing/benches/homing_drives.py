@@ -12,14 +12,14 @@ from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_settings import DriveSettings
 from snakesim_drivers.kit.drive_type import DriverTypeContext, make_bus_specs_by_port
 from snakesim_drivers.kit.drives import BusCommand
-from snakesim_drivers.kit.findings import Finding
+from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.holding_brakes import HoldingBrakes
 from snakesim_drivers.kit.limit_switches import LimitSwitches
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.kit.start_up import StartUp, StartUpStep, StepFailedError
 from snakesim_drivers.template.minimal_driver import MinimalBackend, MinimalDrives, MinimalEmulator, Report
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 HOMING_RAD_S = 0.05
 HOMING_MARGIN_S = 1.6  # until homing has failed
@@ -37,7 +37,7 @@ class HomingSettings(DriveSettings, frozen=True, kw_only=True):
     """Time that the emulated drives need to find their zeros."""
 
 
-class Inputs(NamedTuple):
+class HomingInputs(NamedTuple):
     """Inputs of a drive, which it reports besides its motion."""
 
     homed: bool
@@ -48,7 +48,7 @@ class Inputs(NamedTuple):
 
 
 @dataclass
-class Extras:
+class HomingState:
     """State of a drive that a minimal drive does not have: homing and holding brake."""
 
     homed: bool = False
@@ -61,7 +61,7 @@ class HomingEmulator(MinimalEmulator):
     """The emulated drives. `dropped` has the drives whose torque went off while their brake did not hold yet."""
 
     def __init__(self, *parts: Any) -> None:
-        self.extras: list[Extras] = []
+        self.extras: list[HomingState] = []
         self.dropped: list[int] = []
         self.homing_us = 0.0  # set by the driver type
         # Set by tests.
@@ -70,14 +70,14 @@ class HomingEmulator(MinimalEmulator):
         self.at_lower: set[int] = set()
         self.at_upper: set[int] = set()
         super().__init__(*parts)
-        self.extras = [Extras() for _ in self.drives]
+        self.extras = [HomingState() for _ in self.drives]
 
-    def request_inputs(self, i: int) -> Inputs | None:
+    def request_inputs(self, i: int) -> HomingInputs | None:
         """Return the inputs of a drive; None if it is silent."""
         if self.is_cut or self.body.is_silent(i):
             return None
         failed = i in self.without_index and self.extras[i].homing_until_us is None
-        return Inputs(self.extras[i].homed, failed, i in self.torque_off, i in self.at_lower, i in self.at_upper)
+        return HomingInputs(self.extras[i].homed, failed, i in self.torque_off, i in self.at_lower, i in self.at_upper)
 
     def request_reports(self, i: int) -> list[Report]:
         reports = super().request_reports(i)
@@ -122,7 +122,7 @@ class HomingEmulator(MinimalEmulator):
 
     def restart(self, i: int) -> None:
         super().restart(i)
-        self.extras[i] = Extras()
+        self.extras[i] = HomingState()
 
     def _drive_motor(self, i: int) -> None:
         if not self.drives[i].enabled:
@@ -131,7 +131,7 @@ class HomingEmulator(MinimalEmulator):
             joint = self.body.joints[i]
             damping = joint.motor.velocity_gain_nm_s_per_rad / joint.drive.gear**2
             limit_nm = joint.limits.torque_nm / joint.drive.gear
-            self.body.drive_motor(i, Mode.VELOCITY, HOMING_RAD_S, limit_nm, 0.0, damping, HOMING_RAD_S)
+            self.body.drive_motor(i, JointMode.VELOCITY, HOMING_RAD_S, limit_nm, 0.0, damping, HOMING_RAD_S)
             return
         super()._drive_motor(i)
 
@@ -160,7 +160,7 @@ class HomingDrives(MinimalDrives):
         settings: HomingSettings,
     ) -> None:
         super().__init__(emulator, joints, readings, clock_ns, period_ns)
-        self.inputs: list[Inputs | None] = [None] * len(joints)
+        self.inputs: list[HomingInputs | None] = [None] * len(joints)
         self.switches = LimitSwitches(self.labels)
         self.brakes = HoldingBrakes(len(joints), release_s=RELEASE_S, engage_s=ENGAGE_S, clock_ns=clock_ns)
         homing = StartUpStep(
@@ -203,7 +203,7 @@ class HomingDrives(MinimalDrives):
             self.emulator.handle_extra(i, "open_brake" if i in plan.released else "close_brake")
         super().send_setpoints(plan.command)
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FaultFinding]:
         return [*super().findings(), *self.switches.findings()]
 
     def reset_faults(self, joints: frozenset[int]) -> None:

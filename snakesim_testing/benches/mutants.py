@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
+from snakesim_hal.wire.messages import Fault, JointMode, JointState, RangeScan, RobotDescription, SensorDescription
 from snakesim_testing.benches.driver_mutants import DRIVER_MUTANTS
 from snakesim_testing.benches.mutant import Mutant, make_test_names
 from snakesim_testing.benches.workbench import DrivesWorkbench, Workbench, WorkbenchDrives, mute
@@ -43,7 +43,7 @@ class FaultyWorkbench(Workbench):
     def enact(self, setpoints: SafeSetpoints, lifecycle: Any) -> None:
         super().enact(self.alters(setpoints), lifecycle)
 
-    def describes(self, robot: Description) -> Description:
+    def describes(self, robot: RobotDescription) -> RobotDescription:
         return robot
 
     def reads(self, joints: JointState) -> JointState:
@@ -84,7 +84,7 @@ describes, reads, alters = (partial(register_mutant, lie=lie) for lie in ("descr
 # --- the description -------------------------------------------------------------------------------------------
 
 
-def listing(robot: Description, key: str, rate_hz: float = 50.0) -> Description:
+def listing(robot: RobotDescription, key: str, rate_hz: float = 50.0) -> RobotDescription:
     """Return a description that lists one more sensor."""
     return replace(robot, sensors=[*robot.sensors, SensorDescription(key=key, rate_hz=rate_hz, delay_s=0.0)])
 
@@ -199,7 +199,7 @@ class WithSonar(FaultyWorkbench):
         return listing(robot, keys.ranges_key("sonar"))
 
     def sample(self, tick, timestamp_ns):
-        sonar = Ranges(
+        sonar = RangeScan(
             tick=tick,
             timestamp_ns=timestamp_ns,
             link=self.link,
@@ -229,7 +229,7 @@ class SaysTheFurthestForNothing(WithSonar):
 
 def let_go(points: SafeSetpoints) -> SafeSetpoints:
     """Return the setpoints with all joints passive."""
-    return dataclasses.replace(points, mode=[Mode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
+    return dataclasses.replace(points, mode=[JointMode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
 
 
 @alters("position_mode_turns_only_the_requested_joint")
@@ -249,7 +249,7 @@ def wrong_way_round(points):
 
 @alters("velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once")
 def speed_in_turns(points):
-    scale = [0.16 if mode == Mode.VELOCITY else 1.0 for mode in points.mode]
+    scale = [0.16 if mode == JointMode.VELOCITY else 1.0 for mode in points.mode]
     return dataclasses.replace(points, target=np.multiply(points.target, scale).tolist())
 
 
@@ -260,7 +260,7 @@ def one_mode_for_all(points):
 
 @alters("an_isolated_joint_is_passive_while_others_continue")
 def holds_what_is_lost(points):
-    held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
+    held = [JointMode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
     target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
     return SafeSetpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
 
@@ -276,7 +276,7 @@ class TakesNothingBack(FaultyWorkbench):
 
     def alters(self, points):
         self.lost |= points.isolated
-        modes = [Mode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)]
+        modes = [JointMode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)]
         return dataclasses.replace(points, mode=modes)
 
 
@@ -298,16 +298,16 @@ def no_torque_sensor(joints):
 @register_mutant("a_passive_joint_has_no_torque_and_stays", "nothing_moves_while_disarmed_whatever_is_commanded")
 class PassiveGoesToZero(Workbench):
     def step(self):
-        passive = self.mode == Mode.PASSIVE
-        self.mode[passive], self.target[passive], self.limit[passive] = int(Mode.POSITION), 0.0, 4.0
+        passive = self.mode == JointMode.PASSIVE
+        self.mode[passive], self.target[passive], self.limit[passive] = int(JointMode.POSITION), 0.0, 4.0
         super().step()
 
 
 @register_mutant("disarmed_joints_have_no_torque", "a_passive_joint_has_no_torque_and_stays")
 class PassivePushes(Workbench):
     def step(self):
-        passive = self.mode == Mode.PASSIVE
-        self.mode[passive], self.target[passive], self.limit[passive] = int(Mode.TORQUE), 0.3, 4.0
+        passive = self.mode == JointMode.PASSIVE
+        self.mode[passive], self.target[passive], self.limit[passive] = int(JointMode.TORQUE), 0.3, 4.0
         super().step()
 
 
@@ -328,7 +328,7 @@ class ForgetsWhatIsRepeated(FaultyWorkbench):
 class ForgetsAfterAPeriod(Workbench):
     def advance(self):
         super().advance()
-        self.mode[:] = Mode.PASSIVE
+        self.mode[:] = JointMode.PASSIVE
 
 
 @register_mutant("a_mode_that_a_joint_lacks_is_refused")
@@ -336,7 +336,7 @@ class MovesAfterAll(FaultyWorkbench):
     """Has no torque mode, and moves without a setpoint."""
 
     def describes(self, robot):
-        first = replace(robot.joints[0], modes=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY])
+        first = replace(robot.joints[0], modes=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY])
         return replace(robot, joints=[first, *robot.joints[1:]])
 
     def enact(self, setpoints, lifecycle):
@@ -399,7 +399,7 @@ class RobotThatTrustsTheHost(Workbench):
 )
 class GoesOnAfterArmed(Workbench):
     def enact(self, setpoints, lifecycle):
-        if lifecycle == "armed" or (self.mode == Mode.PASSIVE).all():
+        if lifecycle == "armed" or (self.mode == JointMode.PASSIVE).all():
             super().enact(setpoints, lifecycle)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from snakesim_drivers.kit.braking import AT_REST_SPEED_RAD_S
 from snakesim_drivers.kit.drive_backend import LATCHED_STATES
 from snakesim_hal.backend import SafeSetpoints, Samples
-from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
+from snakesim_hal.wire.messages import Fault, JointMode, LifecycleState
 from snakesim_testing.contract.bench import TorqueSwitch
 
 # Resolution of what `BusWorkbench` sends and measures.
@@ -67,7 +67,7 @@ class DrivesWorkbench(Workbench):
                 self.enabled = self.still_brakes()
             case _:
                 self.enabled[:] = False
-        modes = [mode if on else Mode.PASSIVE for mode, on in zip(setpoints.mode, self.enabled, strict=True)]
+        modes = [mode if on else JointMode.PASSIVE for mode, on in zip(setpoints.mode, self.enabled, strict=True)]
         super().enact(dataclasses.replace(setpoints, mode=modes), lifecycle)
 
     def may_be_enabled(self) -> Any:
@@ -123,7 +123,7 @@ class WorkbenchDrives:
         if seconds > backend.WATCHDOG_S:
             backend.tripped |= backend.enabled
             backend.enabled &= False
-            backend.mode[:] = Mode.PASSIVE
+            backend.mode[:] = JointMode.PASSIVE
         for _ in range(round(seconds / example.STEP_S)):
             backend.step()
 
@@ -200,7 +200,7 @@ class BusWorkbench(DrivesWorkbench):
             self.armed_periods = 0
         wake_up_periods = self.WAKE_UP_PERIODS + np.arange(len(self.angle))  # periods, of every joint
         super().enact(self.setpoints_on_bus, self.lifecycle)
-        self.mode = np.where(self.armed_periods < wake_up_periods, int(Mode.PASSIVE), self.mode)
+        self.mode = np.where(self.armed_periods < wake_up_periods, int(JointMode.PASSIVE), self.mode)
         self.limit = np.round(self.limit, TORQUE_LIMIT_DECIMALS)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:

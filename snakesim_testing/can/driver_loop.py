@@ -16,7 +16,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.physics_model import PhysicsModel
-from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
+from snakesim_hal.wire.messages import Fault, JointMode, LifecycleState
 from snakesim_testing.hal.small_robots import make_run_config
 
 JOINTS = 4
@@ -28,7 +28,7 @@ def config(joints: int = JOINTS, **dotted: Any) -> RunConfig:
 
 
 @dataclass
-class Loop:
+class DriverLoop:
     """Ticks of one run."""
 
     backend: CanBackend
@@ -65,13 +65,13 @@ class Loop:
     def staying(self, samples: Samples) -> SafeSetpoints:
         """Every joint stays where it is."""
         angles = list(samples.joints.angle_rad)
-        return SafeSetpoints([Mode.POSITION] * len(angles), angles, [4.0] * len(angles))
+        return SafeSetpoints([JointMode.POSITION] * len(angles), angles, [4.0] * len(angles))
 
     def waving(self, tick: int) -> SafeSetpoints:
         """Every joint swings by 0.3 rad at 1 Hz."""
         swing = 0.3 * np.sin(2 * np.pi * tick / 100)
         count = len(self.samples[-1].joints.angle_rad)
-        return SafeSetpoints([Mode.POSITION] * count, [float(swing)] * count, [4.0] * count)
+        return SafeSetpoints([JointMode.POSITION] * count, [float(swing)] * count, [4.0] * count)
 
     def states(self) -> list[ModuleState]:
         """The states that the modules reported last."""
@@ -92,17 +92,17 @@ def chain_of(backend: CanBackend) -> ModuleChain:
 
 
 @contextmanager
-def loop(run: RunConfig | None = None, **settings: Any) -> Iterator[Loop]:
+def loop(run: RunConfig | None = None, **settings: Any) -> Iterator[DriverLoop]:
     """Open, and close at the end."""
     run = run or config()
     backend = CanBackend(run, CanSettings(physics_model=settings.pop("physics_model", "inertia"), **settings))
     try:
-        yield Loop(backend, run)
+        yield DriverLoop(backend, run)
     finally:
         backend.close()
 
 
-LoopT = TypeVar("LoopT", bound=Loop)
+LoopT = TypeVar("LoopT", bound=DriverLoop)
 
 
 def armed(run: LoopT) -> LoopT:
@@ -113,7 +113,7 @@ def armed(run: LoopT) -> LoopT:
     return run
 
 
-def cleared_and_armed_again(run: Loop) -> None:
+def cleared_and_armed_again(run: DriverLoop) -> None:
     """A person resets the fault and arms; nothing is left of it."""
     reported = len(run.faults)
     run.lifecycle = "disarmed"

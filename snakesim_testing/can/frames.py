@@ -5,43 +5,43 @@ from typing import Any
 
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
-from snakesim_can_backend.protocol.definitions import Frame, ModuleState, Opcode, parse_opcode
+from snakesim_can_backend.protocol.definitions import CanFrame, ModuleState, Opcode, parse_opcode
 
 
-def joint_state(node: int, count: int, angle: float = 0.1, **other: float) -> Frame:
+def joint_state(node: int, count: int, angle: float = 0.1, **other: float) -> CanFrame:
     values: dict[str, float] = {"state": ModuleState.DISARMED, **other}
     return load_layouts()[Opcode.JOINT_STATE].encode(node, angle=angle, count=count % 16, **values)
 
 
-def heartbeat(node: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float) -> Frame:
+def heartbeat(node: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float) -> CanFrame:
     return load_layouts()[Opcode.HEARTBEAT].encode(node, uptime=uptime_s, state=state, **other)
 
 
-def contact(node: int, count: int, *, tail: bool = False, touched: bool = True, **other: float) -> Frame:
+def contact(node: int, count: int, *, tail: bool = False, touched: bool = True, **other: float) -> CanFrame:
     layout = load_layouts()[Opcode.TAIL_CONTACT if tail else Opcode.CONTACT]
     return layout.encode(node, count=count % 16, touched=touched, **other)
 
 
-def gyro(node: int, count: int, rate_x: float) -> Frame:
+def gyro(node: int, count: int, rate_x: float) -> CanFrame:
     return load_layouts()[Opcode.GYRO].encode(node, rate_x=rate_x, count=count % 256)
 
 
-def accelerometer(node: int, count: int, acceleration_z: float) -> Frame:
+def accelerometer(node: int, count: int, acceleration_z: float) -> CanFrame:
     return load_layouts()[Opcode.ACCELEROMETER].encode(node, acceleration_z=acceleration_z, count=count % 256)
 
 
-def health(node: int, **values: float) -> Frame:
+def health(node: int, **values: float) -> CanFrame:
     return load_layouts()[Opcode.HEALTH].encode(node, **values)
 
 
-def read(frame: Frame) -> dict[str, float]:
+def read(frame: CanFrame) -> dict[str, float]:
     """The values of its signals."""
     return dict(load_layouts()[Opcode(parse_opcode(frame.id))].decode(frame.data))
 
 
-def corrupted(frame: Frame) -> Frame:
+def corrupted(frame: CanFrame) -> CanFrame:
     """With a wrong checksum."""
-    return Frame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 0x5A,)))
+    return CanFrame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 0x5A,)))
 
 
 def begin(reading: ModuleReports, *, contacts: bool = False, tail: bool = False) -> int:

@@ -14,14 +14,14 @@ import numpy as np
 
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleState,
     Opcode,
     parse_node,
     parse_opcode,
 )
-from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, write_config
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, write_config
 from snakesim_testing.can.interface import FRAME
 from snakesim_testing.hal.small_robots import write_scenario_files
 from snakesim_testing.harness.endpoint import find_free_endpoint
@@ -74,7 +74,7 @@ class ReceivedFrame:
     """A frame, and when it was on the bus by the kernel's clock."""
 
     at_ns: int
-    frame: Frame
+    frame: CanFrame
 
     @property
     def opcode(self) -> int:
@@ -84,7 +84,7 @@ class ReceivedFrame:
         return load_layouts()[Opcode(self.opcode)].decode(self.frame.data)
 
 
-class Listener:
+class BusListener:
     """Receives every frame on a bus; the kernel buffers them until `listen`."""
 
     def __init__(self, channel: str) -> None:
@@ -104,7 +104,7 @@ class Listener:
                 return self.received
             number, length, content = FRAME.unpack(data)
             seconds, nanoseconds = struct.unpack("=qq", extra[0][2])
-            self.received.append(ReceivedFrame(seconds * 10**9 + nanoseconds, Frame(number, content[:length])))
+            self.received.append(ReceivedFrame(seconds * 10**9 + nanoseconds, CanFrame(number, content[:length])))
 
     def forget(self) -> None:
         self.listen()
@@ -126,13 +126,13 @@ class Listener:
 
 
 @dataclass
-class Bench:
+class RobotOnBus:
     """The processes of one robot on a bus; `start` and kill any."""
 
     folder: Path
     config: RunConfig
     endpoint: str
-    listener: Listener
+    listener: BusListener
     running: ExitStack
 
     def start(self, name: str, *module_and_arguments: str) -> subprocess.Popen[bytes]:
@@ -200,12 +200,12 @@ class Bench:
 
 
 @contextmanager
-def bench(folder: Path, channel: str) -> Iterator[Bench]:
+def bench(folder: Path, channel: str) -> Iterator[RobotOnBus]:
     scenario = write_scenario_files(folder, scenario=SCENARIO.replace("CHANNEL", channel))
-    config = load_scenario(scenario, [Override("robot.chain.modules", JOINTS, "test")]).config
+    config = load_scenario(scenario, [KeyOverride("robot.chain.modules", JOINTS, "test")]).config
     write_config(config, folder / "config.json")
-    with ExitStack() as running, closing(Listener(channel)) as listener:
-        yield Bench(folder, config, find_free_endpoint(), listener, running)
+    with ExitStack() as running, closing(BusListener(channel)) as listener:
+        yield RobotOnBus(folder, config, find_free_endpoint(), listener, running)
 
 
 def stop_commands(received: Sequence[ReceivedFrame]) -> list[ReceivedFrame]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from snakesim_can_backend.emulator.bus_time import Traffic
+from snakesim_can_backend.emulator.bus_time import BusTraffic
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.firmware import ModuleFirmware
 from snakesim_can_backend.emulator.frames import ModuleReadings
@@ -11,8 +11,8 @@ from snakesim_can_backend.emulator.parameters import ParameterStore, make_factor
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command, make_sync
 from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleParameter,
     ModuleState,
     Opcode,
@@ -24,7 +24,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.thermal import HeatLimits
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.can.frames import read
 
@@ -37,18 +37,27 @@ HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 QUIET = ModuleReadings(0, 0, 0)
 
 
-def setpoint(count: int, mode: Mode = Mode.TORQUE, target: float = 1.0, limit: float = 3.0, node: int = NODE) -> Frame:
-    signal = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "torque", Mode.PASSIVE: "torque"}[mode]
+def setpoint(
+    count: int, mode: JointMode = JointMode.TORQUE, target: float = 1.0, limit: float = 3.0, node: int = NODE
+) -> CanFrame:
+    signal = {
+        JointMode.POSITION: "position",
+        JointMode.VELOCITY: "velocity",
+        JointMode.TORQUE: "torque",
+        JointMode.PASSIVE: "torque",
+    }[mode]
     values: dict[str, float] = {"mode": mode, "count": count % 16, signal: target, "torque_limit": limit}
     return load_layouts()[Opcode.SET_POINT].encode(node, **values)
 
 
-def parameter(index: int, value: float = 0.0, operation: int = ParameterOperation.WRITE, node: int = NODE) -> Frame:
+def parameter(index: int, value: float = 0.0, operation: int = ParameterOperation.WRITE, node: int = NODE) -> CanFrame:
     frame = load_layouts()[Opcode.PARAMETER_REQUEST].encode(node, index=index, value=value)
-    return Frame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])  # also operations that there are not
+    return CanFrame(
+        frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:]
+    )  # also operations that there are not
 
 
-def only(frames: Sequence[Frame], opcode: Opcode, node: int | None = None) -> list[dict[str, float]]:
+def only(frames: Sequence[CanFrame], opcode: Opcode, node: int | None = None) -> list[dict[str, float]]:
     return [read(f) for f in frames if parse_opcode(f.id) == opcode and node in (None, parse_node(f.id))]
 
 
@@ -89,7 +98,7 @@ def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -
     return made
 
 
-class Host:
+class RigHost:
     """Ticks of a stepped chain with one bus: Sync, answers, setpoints."""
 
     def __init__(self, made: ModuleChain) -> None:
@@ -100,7 +109,7 @@ class Host:
         self.tick()
         self.chain.receive(0, make_command(CommandAction.ARM))
 
-    def tick(self, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+    def tick(self, target: float | None = None, mode: JointMode = JointMode.POSITION) -> list[CanFrame]:
         self.count += 1
         self.chain.receive(0, make_sync(self.count, self.count * 10_000))
         frames = self.chain.pop_frames(0)
@@ -109,7 +118,7 @@ class Host:
                 self.chain.receive(0, setpoint(self.count, mode, target, 4.0, node))
         return frames
 
-    def ticks(self, count: int, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+    def ticks(self, count: int, target: float | None = None, mode: JointMode = JointMode.POSITION) -> list[CanFrame]:
         """So many; the frames of the last."""
         return [self.tick(target, mode) for _ in range(count)][-1]
 
@@ -119,7 +128,7 @@ class Host:
 
 def measure_bus_traffic(
     joint_count: int, rate_hz: int, duration_s: float = 2.0
-) -> tuple[list[int], Traffic, Traffic, int]:
+) -> tuple[list[int], BusTraffic, BusTraffic, int]:
     """Run a whole bus of armed modules for some time, and measure its traffic.
 
     Args:

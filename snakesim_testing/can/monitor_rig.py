@@ -3,9 +3,9 @@
 from collections.abc import Callable
 
 from snakesim_can_backend.bus.bus_errors import BusError
-from snakesim_can_backend.driver.module_monitor import Finding, ModuleMonitor
+from snakesim_can_backend.driver.module_monitor import FaultFinding, ModuleMonitor
 from snakesim_can_backend.driver.reports import ModuleReports
-from snakesim_can_backend.protocol.definitions import Frame, LastStop, ModuleState
+from snakesim_can_backend.protocol.definitions import CanFrame, LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
 from snakesim_testing.can.frames import answer, begin, heartbeat
 
@@ -20,7 +20,7 @@ def quiet(_reading: ModuleReports) -> None:
     """Nothing comes of node 2."""
 
 
-class Bench:
+class MonitorRig:
     """Ticks of a robot whose joint_2 does what a test wants; the others are well."""
 
     def __init__(self) -> None:
@@ -31,7 +31,9 @@ class Bench:
         self.isolated: set[int] = set()
         self.ticks(3)
 
-    def tick(self, speak: Speak | None = None, errors: list[BusError] | None = None, unsent: str = "") -> list[Finding]:
+    def tick(
+        self, speak: Speak | None = None, errors: list[BusError] | None = None, unsent: str = ""
+    ) -> list[FaultFinding]:
         """One Sync and its look. speak: what comes of node 2, instead of an answer."""
         begin(self.reading)
         answer(self.reading, EVERYBODY if speak is None else (1, 3), state=self.state)
@@ -40,14 +42,14 @@ class Bench:
         unsent_on = [unsent] if unsent else []
         return self.watch.find_faults(self.reading, self.lifecycle, errors or (), unsent_on, isolated=self.isolated)
 
-    def ticks(self, count: int, speak: Speak | None = None) -> list[Finding]:
+    def ticks(self, count: int, speak: Speak | None = None) -> list[FaultFinding]:
         return [found for _ in range(count) for found in self.tick(speak)]
 
     def reset(self) -> None:
         self.watch.reset(self.reading.sync)
 
 
-def answering(state: ModuleState = ModuleState.DISARMED, *frames: Frame) -> Speak:
+def answering(state: ModuleState = ModuleState.DISARMED, *frames: CanFrame) -> Speak:
     """Node 2 answers in this state, and these frames come, too."""
 
     def speak(reading: ModuleReports) -> None:
@@ -67,5 +69,5 @@ HOT = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1
 HOT_AND_WET = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1)
 
 
-def list_findings(findings: list[Finding]) -> list[tuple[str, int | None]]:
+def list_findings(findings: list[FaultFinding]) -> list[tuple[str, int | None]]:
     return [(finding.what, finding.joint) for finding in findings]

@@ -6,22 +6,22 @@ from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire
 from snakesim_can_backend.emulator.firmware import ModuleFirmware
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleState,
     Opcode,
     parse_node,
     parse_opcode,
 )
 from snakesim_hal.wire.messages import LifecycleState
-from snakesim_testing.can.driver_loop import Loop, chain_of
+from snakesim_testing.can.driver_loop import DriverLoop, chain_of
 from snakesim_testing.can.frames import read
 
 ARMED, DISARMED, EMERGENCY = ModuleState.ARMED, ModuleState.DISARMED, ModuleState.EMERGENCY
-Which = Callable[[Frame], bool]
+Which = Callable[[CanFrame], bool]
 
 
-def none(_frame: Frame) -> bool:
+def none(_frame: CanFrame) -> bool:
     return False
 
 
@@ -30,22 +30,22 @@ class RecordedWire(VirtualWire):
 
     def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
         super().__init__(channel, peer)
-        self.sent: list[Frame] = []
-        self.all: list[Frame] = []
+        self.sent: list[CanFrame] = []
+        self.all: list[CanFrame] = []
         self.refuses: Which = none
         self.loses: Which = none
         self.deaf_to: Which = none
         self.closed = 0
         WIRES.append(self)
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         if self.refuses(frame):
             return False
         self.sent.append(frame)
         self.all.append(frame)
         return self.loses(frame) or super().send(frame)
 
-    def receive(self) -> list[Frame]:
+    def receive(self) -> list[CanFrame]:
         frames = [frame for frame in super().receive() if not self.deaf_to(frame)]
         self.all += frames
         return frames
@@ -58,15 +58,15 @@ class RecordedWire(VirtualWire):
 WIRES: list[RecordedWire] = []
 
 
-def is_action(frame: Frame, *actions: CommandAction) -> bool:
+def is_action(frame: CanFrame, *actions: CommandAction) -> bool:
     return parse_opcode(frame.id) == Opcode.COMMAND and read(frame)["action"] in actions
 
 
-def is_setpoint(frame: Frame) -> bool:
+def is_setpoint(frame: CanFrame) -> bool:
     return parse_opcode(frame.id) == Opcode.SET_POINT
 
 
-def words(frames: list[Frame]) -> list[str]:
+def words(frames: list[CanFrame]) -> list[str]:
     """The frames of the host other than Syncs and setpoints, as text."""
     found = []
     for frame in frames:
@@ -79,11 +79,11 @@ def words(frames: list[Frame]) -> list[str]:
     return found
 
 
-def module_of(run: Loop, node: int) -> ModuleFirmware:
+def module_of(run: DriverLoop, node: int) -> ModuleFirmware:
     return chain_of(run.backend).slots[node - 1].module
 
 
-def go(run: Loop, lifecycle: LifecycleState, ticks: int = 1) -> list[Frame]:
+def go(run: DriverLoop, lifecycle: LifecycleState, ticks: int = 1) -> list[CanFrame]:
     """So many ticks in a state, whatever is found; what was sent meanwhile."""
     before = len(WIRES[0].sent)
     for _ in range(ticks):

@@ -16,12 +16,12 @@ from snakesim_can_backend.driver import modules as driver
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer
-from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
+from snakesim_can_backend.protocol.definitions import FROM_HOST, CanFrame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.physics.physics_model import PhysicsModel
-from snakesim_testing.can.driver_loop import Loop, armed, config
+from snakesim_testing.can.driver_loop import DriverLoop, armed, config
 
 ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait before
 
@@ -34,9 +34,9 @@ class SharedWire(SocketCanWire):
         self.server = server
         self.now_ns = 0
         self.until_ns = inf  # the modules' clock stops here
-        self.sent: list[Frame] = []
+        self.sent: list[CanFrame] = []
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         taken = super().send(frame)
         self.sent += [frame] * taken
         return taken
@@ -51,7 +51,7 @@ class SharedWire(SocketCanWire):
 
 
 @dataclass
-class SharedBus(Loop):
+class SharedBus(DriverLoop):
     """A loop whose modules have time until the end of each period."""
 
     true_state_at: dict[int, set[ModuleState]] = field(default_factory=dict[int, set[ModuleState]])  # at ends of ticks

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 
 from snakesim_hal.backend import Backend
-from snakesim_hal.model.scenario import Override, RunConfig, ServiceSchedule, load_scenario, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, ServiceSchedule, load_scenario, parse_set_option
 from snakesim_hal.programs.preflight import apply_backend_modes, decode_backend_settings, load_backend_class
 from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.contract.loopback import HostedBackend
-from snakesim_testing.contract.rig import LEASE_HOLDER, Rig
+from snakesim_testing.contract.rig import LEASE_HOLDER, BackendRig
 
 DEFAULT_SCENARIO = str(Path(__file__).parent / "scenario.toml")
 MuteJoint = Callable[[Any, int], None]
@@ -95,7 +95,7 @@ class Bench:
         self._scenario = scenario
         self._overrides = overrides
         # The open backend: in a rig without a network, or in a host; None if it is closed.
-        self._rig: Rig | None = None
+        self._rig: BackendRig | None = None
         self._open_backend_and_drives: tuple[Backend, EmulatedDrives] | None = None  # the pair that belongs together
         self.was_opened = False  # whether the backend was ever opened
         self._hosted_backend: HostedBackend | None = None
@@ -115,7 +115,7 @@ class Bench:
     def config(self) -> RunConfig:
         """The scenario with the backend, at the clock mode of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
-        overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set_option, self._overrides)]
+        overrides = [KeyOverride("backend", backend, "--snakesim-backend"), *map(parse_set_option, self._overrides)]
         config = apply_backend_modes(load_scenario(self._scenario, overrides).config, self.backend_type)
         # The tests' own controller is the only service.
         clock_modes = self.backend_type.check(config, decode_backend_settings(config, self.backend_type))
@@ -140,17 +140,17 @@ class Bench:
         self.was_opened = True
         return self.backend_type(self.config, decode_backend_settings(self.config, self.backend_type))
 
-    def open_rig(self) -> Rig:
+    def open_rig(self) -> BackendRig:
         """Open the backend, and return a rig that drives it without a network."""
         backend = self.open()
         try:
-            self._rig = Rig(backend, self.clock_mode, self.config.period_ns)
+            self._rig = BackendRig(backend, self.clock_mode, self.config.period_ns)
         except BaseException:
             backend.close()
             raise
         return self._rig
 
-    def get_shared_rig(self) -> Rig:
+    def get_shared_rig(self) -> BackendRig:
         """Return the rig that tests share, because opening may be slow. It is replaced if it is not usable any more."""
         if self._rig is None or self._rig.must_reopen:
             return self.open_rig()

@@ -4,10 +4,10 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import BackendRig
 
 
-def inject_or_skip(rig: Rig, text: str) -> None:
+def inject_or_skip(rig: BackendRig, text: str) -> None:
     """Begin a fault of the emulated drives; skip the clause if the backend cannot."""
     try:
         is_possible = rig.backend.inject(parse_injection(text), begins=True)

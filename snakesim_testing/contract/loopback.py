@@ -12,20 +12,20 @@ from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.client import Commander, HostClient
 from snakesim_hal.network.free_ports import find_free_port
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
-    Description,
     Fault,
     JointCommand,
+    JointMode,
     JointState,
     LifecycleRequest,
     LifecycleState,
-    Mode,
+    RobotDescription,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.contract.rig import LEASE_HOLDER, JointTargets
@@ -61,7 +61,7 @@ class RecordingBackend(Backend):
         # For each tick, a fault to report besides those of the backend.
         self.planted_fault: Callable[[int], Fault | None] | None = None
 
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         return self._backend.describe()
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
@@ -105,7 +105,7 @@ class PlannedController:
     arm_session: int = 0  # arm session of the newest command that was sent
     stop_event: threading.Event = field(default_factory=threading.Event)
 
-    def run(self, link: Link) -> None:
+    def run(self, link: ConnectionSettings) -> None:
         """Connect to the host, and command it until `stop_event` is set.
 
         In every tick the controller acquires or renews the lease, and sends setpoints. Before an arming, these are the
@@ -116,7 +116,7 @@ class PlannedController:
             link: How to reach the host.
         """
         with open_session(link) as session:
-            client = Client(session, LEASE_HOLDER)
+            client = HostClient(session, LEASE_HOLDER)
             robot = client.wait_for_description()
             joint_state_subscription = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
@@ -182,7 +182,7 @@ class HostedBackend:
             backend: The backend under test, whose joint states are recorded.
             config: Configuration of the run.
         """
-        link = Link(f"tcp/127.0.0.1:{find_free_port()}", f"contract/{config.robot.name}")
+        link = ConnectionSettings(f"tcp/127.0.0.1:{find_free_port()}", f"contract/{config.robot.name}")
         self.backend = RecordingBackend(backend)
         self.controller = PlannedController()
         self.config = config
@@ -275,7 +275,7 @@ class HostedBackend:
             "arm_session": self.controller.arm_session,
             "layout": self.robot.layout,
             "valid_for_ns": self.robot.lease_ns,
-            "mode": [Mode.POSITION] * count,
+            "mode": [JointMode.POSITION] * count,
             "target": [0.5] * count,
         }
         self._command_publisher.put(JointCommand(**(valid_fields | invalid_fields)))

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 
 if TYPE_CHECKING:  # nothing else of SnakeSIM is imported before it is used: every pytest run loads this module
-    from snakesim_hal.wire.messages import Mode
+    from snakesim_hal.wire.messages import JointMode
     from snakesim_testing.contract.bench import Bench, EmulatedDrives
     from snakesim_testing.contract.loopback import HostedBackend
     from snakesim_testing.contract.recordings import PushRecording
-    from snakesim_testing.contract.rig import Floats, Record, Rig
+    from snakesim_testing.contract.rig import BackendRig, Floats, RigRecord
 
 pytest.register_assert_rewrite("snakesim_testing.contract.loopback", "snakesim_testing.contract.rig")
 
@@ -45,7 +45,7 @@ SECTION_ORDER = (
 _failed = pytest.StashKey[bool]()
 
 
-class Hooks:
+class ContractHooks:
     """The hooks that a conftest.py may implement."""
 
     @staticmethod
@@ -55,7 +55,7 @@ class Hooks:
 
 def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
     """Register the hook."""
-    pluginmanager.add_hookspecs(Hooks)
+    pluginmanager.add_hookspecs(ContractHooks)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -196,7 +196,7 @@ def bench(request: pytest.FixtureRequest) -> "Iterator[Bench]":
 
 
 @pytest.fixture
-def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
+def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[BackendRig]":
     """Provide the open backend at its start pose, at rest and disarmed. After a failed test, it is reopened."""
     rig = bench.get_shared_rig()
     rig.return_home()
@@ -210,7 +210,7 @@ def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
 
 
 @pytest.fixture
-def drives(bench: "Bench", rig: "Rig") -> "EmulatedDrives":
+def drives(bench: "Bench", rig: "BackendRig") -> "EmulatedDrives":
     """Return the emulated drives of the open backend."""
     drives = bench.find_emulated_drives(rig.backend)
     if drives is None:
@@ -227,7 +227,7 @@ def hosted(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[HostedBa
 
 
 @pytest.fixture
-def healthy(bench: "Bench", request: pytest.FixtureRequest) -> "Record":
+def healthy(bench: "Bench", request: pytest.FixtureRequest) -> "RigRecord":
     """Return a second of normal operation, in which every joint sways; recorded once for all tests."""
     from snakesim_testing.contract.recordings import record_sway
 
@@ -243,7 +243,7 @@ def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "PushRecording":
 
 
 @pytest.fixture
-def switching(bench: "Bench", request: pytest.FixtureRequest) -> "dict[tuple[Mode, Mode], Floats]":
+def switching(bench: "Bench", request: pytest.FixtureRequest) -> "dict[tuple[JointMode, JointMode], Floats]":
     """Return one joint through every change of mode; recorded once for all tests."""
     from snakesim_testing.contract.recordings import record_mode_switches
 
@@ -303,13 +303,13 @@ class OutcomeTable:
             self._outcomes_by_clause, key=lambda module_and_clause: _compute_sort_position(module_and_clause[0])
         )
         bench_names = list(dict.fromkeys(name for by_bench in self._outcomes_by_clause.values() for name in by_bench))
-        rows: list[ResultRow] = []
+        rows: list[ClauseRow] = []
         skip_reasons: list[str] = []
         for module, clause in clauses:
             outcomes_by_bench = self._outcomes_by_clause[module, clause]
             clause_text = _describe_clause(clause)
             worst_outcomes = [_find_worst_outcome(outcomes_by_bench.get(name, [])) for name in bench_names]
-            rows.append(ResultRow(module, clause_text, worst_outcomes))
+            rows.append(ClauseRow(module, clause_text, worst_outcomes))
             for bench_name, outcomes in outcomes_by_bench.items():
                 skip_reasons += [f"{clause_text}, on {bench_name}: {reason}" for _, reason in outcomes if reason]
         skip_reasons = _merge_skip_reasons(skip_reasons)
@@ -326,7 +326,7 @@ class OutcomeTable:
             terminalreporter.write_line(f"written to {path}")
 
 
-class ResultRow(NamedTuple):
+class ClauseRow(NamedTuple):
     """One row of the table of results: a clause, which is one contract test, with its outcomes."""
 
     module: str  # test module of the clause, such as `test_modes`
@@ -334,7 +334,7 @@ class ResultRow(NamedTuple):
     outcomes: list[str]  # worst outcome on each bench, in the order of the benches
 
 
-def format_plain_table(bench_names: list[str], rows: list[ResultRow]) -> list[str]:
+def format_plain_table(bench_names: list[str], rows: list[ClauseRow]) -> list[str]:
     """Format the table of results for a terminal: one row for each contract test, grouped by test module.
 
     Args:
@@ -358,7 +358,7 @@ def format_plain_table(bench_names: list[str], rows: list[ResultRow]) -> list[st
     return lines
 
 
-def format_markdown_table(bench_names: list[str], rows: list[ResultRow], skip_reasons: list[str]) -> str:
+def format_markdown_table(bench_names: list[str], rows: list[ClauseRow], skip_reasons: list[str]) -> str:
     """Format the table of results as Markdown, with the reasons of skipped clauses below.
 
     Args:

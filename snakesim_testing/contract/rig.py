@@ -12,23 +12,23 @@ import pytest
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.host.control_cycle import ControlCycle
-from snakesim_hal.safety.authority import Authority
+from snakesim_hal.safety.authority import CommandAuthority
 from snakesim_hal.wire.messages import (
     ClockMode,
     EstopRequest,
     Fault,
     JointCommand,
+    JointMode,
     JointState,
     LeaseRequest,
     LifecycleRequest,
     LifecycleState,
-    Mode,
     make_arm_request,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.contract import tolerances
 
-JointTargets = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
+JointTargets = Mapping[int, tuple[JointMode, float]]  # joint index -> mode and target
 LEASE_HOLDER = "control"
 MAX_LATE_PERIODS = 10
 
@@ -43,7 +43,7 @@ def skip_limiter(requested: RequestedSetpoints) -> SafeSetpoints:
 
 
 @dataclass
-class Record:
+class RigRecord:
     """Joint states and setpoints of some ticks. All arrays are (ticks, n_joints)."""
 
     samples: list[Samples]
@@ -72,7 +72,7 @@ class Record:
 
 
 @dataclass
-class Rig:
+class BackendRig:
     """An open backend under test that is driven by the real safety core, without a network."""
 
     backend: Backend
@@ -91,7 +91,7 @@ class Rig:
         self.robot = self.backend.describe()
         self.joint_count = len(self.robot.joints)
         self.full_torque_nm = [joint.torque_limit_nm for joint in self.robot.joints]
-        self._control_cycle = ControlCycle(self.backend, Authority(self.robot))
+        self._control_cycle = ControlCycle(self.backend, CommandAuthority(self.robot))
         self._sequence = 0
         self._real_time_origin_ns = time.monotonic_ns()
         self._sample_history: list[Samples] = []
@@ -106,13 +106,13 @@ class Rig:
         self.faults_at_opening = self.faults
 
     @property
-    def authority(self) -> Authority:
+    def authority(self) -> CommandAuthority:
         """The safety core that drives the robot."""
         return self._control_cycle.safety
 
     # --- capabilities --------------------------------------------------------------------------------------
 
-    def supports_mode(self, joint: int, mode: Mode) -> bool:
+    def supports_mode(self, joint: int, mode: JointMode) -> bool:
         """Return whether the description of a joint has a mode."""
         return self.robot.joints[joint].supports_mode(mode)
 
@@ -125,7 +125,7 @@ class Rig:
         """The joints whose drives do not stop by themselves, by the description."""
         return [joint.name for joint in self.robot.joints if not joint.watchdog]
 
-    def skip_without(self, *modes: Mode, torque: bool = False) -> None:
+    def skip_without(self, *modes: JointMode, torque: bool = False) -> None:
         """Skip the clause if joint 0 or 1 does not have these modes, or does not measure its torque.
 
         Args:
@@ -159,11 +159,11 @@ class Rig:
         """The newest joint state."""
         return self._sample_history[-1].joints
 
-    def record_since(self, tick: int) -> Record:
+    def record_since(self, tick: int) -> RigRecord:
         """Return the record of all joint states, setpoints and faults since a tick."""
         first_index = len(self._sample_history) - (self.tick - tick)
         faults = [fault for fault_tick, fault in self._faults_by_tick if fault_tick >= tick]
-        return Record(self._sample_history[first_index:], self._setpoint_history[first_index - 1 :], faults)
+        return RigRecord(self._sample_history[first_index:], self._setpoint_history[first_index - 1 :], faults)
 
     def count_periods(self, seconds: float) -> int:
         """Return the number of periods in a time, rounded up."""
@@ -186,7 +186,7 @@ class Rig:
             self._wait_for_deadline()
         self._sample()
 
-    def wait_periods(self, periods: int = 1) -> Record:
+    def wait_periods(self, periods: int = 1) -> RigRecord:
         """Run some control periods without a new command. The last command stays active while its lease lasts.
 
         Returns:
@@ -201,7 +201,7 @@ class Rig:
 
     def command_joints(
         self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None
-    ) -> Record:
+    ) -> RigRecord:
         """Command some joints while the others hold the start pose, through lease, command limiter and lifecycle.
 
         Args:
@@ -218,7 +218,7 @@ class Rig:
             self.wait_periods()
         return self.record_since(first_tick)
 
-    def send_command(self, setpoints: RequestedSetpoints) -> Record:
+    def send_command(self, setpoints: RequestedSetpoints) -> RigRecord:
         """Send one command, and return the record of the period after it."""
         first_tick = self.tick
         self._send(setpoints)
@@ -227,7 +227,7 @@ class Rig:
 
     def command_without_limiter(
         self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None
-    ) -> Record:
+    ) -> RigRecord:
         """Command some joints without the command limiter, which would not drive a joint against its end stop.
 
         Args:
@@ -240,7 +240,7 @@ class Rig:
         """
         first_tick = self.tick
         for _ in range(periods):
-            self._send(self.make_setpoints(dict.fromkeys(targets, (Mode.PASSIVE, 0.0))))
+            self._send(self.make_setpoints(dict.fromkeys(targets, (JointMode.PASSIVE, 0.0))))
             self._control_cycle.compute_setpoints(self._now_ns, self.tick)
             self.enact_without_limiter(
                 skip_limiter(self.make_setpoints(targets, torque_limit_nm)), self.authority.state
@@ -252,13 +252,13 @@ class Rig:
 
         A joint without velocity mode gets a position instead, which moves on at the speed with each call.
         """
-        mode = [Mode.POSITION] * self.joint_count
+        mode = [JointMode.POSITION] * self.joint_count
         target = list(self.home_rad)
         for joint in self._position_targets_rad.keys() - targets.keys():
             del self._position_targets_rad[joint]
         for joint, (joint_mode, joint_target) in targets.items():
-            if joint_mode is Mode.VELOCITY and not self.supports_mode(joint, Mode.VELOCITY):
-                joint_mode = Mode.POSITION
+            if joint_mode is JointMode.VELOCITY and not self.supports_mode(joint, JointMode.VELOCITY):
+                joint_mode = JointMode.POSITION
                 joint_target = self._next_position_rad(joint, joint_target)
             mode[joint] = joint_mode
             target[joint] = joint_target
@@ -283,7 +283,7 @@ class Rig:
         if self.authority.state != "disarmed":
             self.disarm()
             self.wait_periods(tolerances.TRANSPORT_PERIODS)
-        measured_targets = {i: (Mode.POSITION, angle) for i, angle in enumerate(self.newest_joints.angle_rad)}
+        measured_targets = {i: (JointMode.POSITION, angle) for i, angle in enumerate(self.newest_joints.angle_rad)}
         self._send(self.make_setpoints(measured_targets))
         response = self.authority.handle_lifecycle_request(make_arm_request(self.robot, "conformance"), self._now_ns)
         assert response.ok, f"the robot cannot be armed: {response.reason}"
@@ -320,7 +320,7 @@ class Rig:
         The robot is disarmed at the begin and at the end of the context.
         """
         usual_cycle = self._control_cycle
-        tolerant_authority = Authority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
+        tolerant_authority = CommandAuthority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
         self._control_cycle = ControlCycle(self.backend, tolerant_authority)
         self.wait_periods()
         yield
@@ -335,7 +335,7 @@ class Rig:
         cause = f"the contract tests isolate {name}"
         self.authority.latch_fault(Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint"))
 
-    def arm_and_move_joint(self, joint: int = 0) -> Record:
+    def arm_and_move_joint(self, joint: int = 0) -> RigRecord:
         """Arm the robot, and move one joint at constant speed. Fails if the joint does not move.
 
         Args:
@@ -346,7 +346,8 @@ class Rig:
         """
         self.arm()
         record = self.command_joints(
-            {joint: (Mode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}, self.count_periods(tolerances.MOTION_DURATION_S)
+            {joint: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)},
+            self.count_periods(tolerances.MOTION_DURATION_S),
         )
         self.assert_armed()
         moved_rad = record.angle_rad[-1, joint] - record.angle_rad[0, joint]

@@ -8,14 +8,14 @@ import pytest
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import JointState, Mode
+from snakesim_hal.wire.messages import JointMode, JointState
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.contract.rig import Rig, skip_limiter
+from snakesim_testing.contract.rig import BackendRig, skip_limiter
 from snakesim_testing.contract.test_lifecycle import MOVE_JOINT_0
 
 
-def use_closed_backend(rig: Rig) -> list[JointState]:
+def use_closed_backend(rig: BackendRig) -> list[JointState]:
     """Call every method of a closed backend for some periods, and return the joint states that it still reports.
 
     A closed backend may raise BackendError, and nothing else.
@@ -33,7 +33,7 @@ def use_closed_backend(rig: Rig) -> list[JointState]:
     return joint_states
 
 
-def test_a_closed_backend_drives_nothing(bench: Bench, rig: Rig) -> None:
+def test_a_closed_backend_drives_nothing(bench: Bench, rig: BackendRig) -> None:
     """A backend that is closed while a joint moves drives no joint any more, even if it gets setpoints."""
     rig.arm_and_move_joint()
     start_angle_rad = rig.newest_joints.angle_rad[0]
@@ -68,7 +68,7 @@ def test_in_lockstep_same_seed_and_commands_give_same_samples(bench: Bench) -> N
         rig = bench.open_rig()
         rig.arm_and_move_joint()
         rig.command_joints(
-            {0: (Mode.TORQUE, -0.1), 1: (Mode.POSITION, rig.home_rad[1] + tolerances.STEP_RAD)},
+            {0: (JointMode.TORQUE, -0.1), 1: (JointMode.POSITION, rig.home_rad[1] + tolerances.STEP_RAD)},
             rig.count_periods(tolerances.MOTION_DURATION_S),
         )
         rig.trigger_estop()

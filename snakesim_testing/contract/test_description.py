@@ -7,15 +7,15 @@ import msgspec
 from snakesim_hal.model.robot import compute_layout_hash
 from snakesim_hal.model.scenario import describe_run_robot
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.custom_sample import find_custom_messages
-from snakesim_hal.wire.messages import Description, Imu
+from snakesim_hal.wire.messages import Imu, RobotDescription
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.contract.rig import Record, Rig
+from snakesim_testing.contract.rig import BackendRig, RigRecord
 
 
-def test_the_description_matches_the_robot_file(bench: Bench, rig: Rig) -> None:
+def test_the_description_matches_the_robot_file(bench: Bench, rig: BackendRig) -> None:
     """The description has the joints, links, period, lease and safety settings of the robot file and the scenario."""
     robot = rig.robot
     expected_robot = describe_run_robot(bench.config)
@@ -29,24 +29,26 @@ def test_the_description_matches_the_robot_file(bench: Bench, rig: Rig) -> None:
         assert getattr(robot, name) == getattr(expected_robot, name), name
 
 
-def test_the_layout_is_the_hash_of_the_joints(rig: Rig) -> None:
+def test_the_layout_is_the_hash_of_the_joints(rig: BackendRig) -> None:
     """The layout is the hash of the joints, so that a command made for another order of joints is refused."""
     assert rig.robot.layout == compute_layout_hash(rig.robot.joints)
 
 
-def test_the_description_is_readable_at_once_and_stays(bench: Bench, rig: Rig, healthy: Record) -> None:
+def test_the_description_is_readable_at_once_and_stays(bench: Bench, rig: BackendRig, healthy: RigRecord) -> None:
     """The description is available before the first sample, when the rig reads it, and the same after a motion."""
     assert healthy.samples
     assert rig.backend.describe() == rig.robot
 
 
-def test_the_description_survives_the_wire(rig: Rig) -> None:
+def test_the_description_survives_the_wire(rig: BackendRig) -> None:
     """The description is unchanged by the HAL's encoder and decoder, which check the bounds of its fields."""
     description = rig.robot
-    assert Decoder(Description).decode(encode(description), format_encoding(Description)) == description
+    assert (
+        MessageDecoder(RobotDescription).decode(encode(description), format_encoding(RobotDescription)) == description
+    )
 
 
-def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: Rig) -> None:
+def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: BackendRig) -> None:
     """Every sensor is listed once, at a sensor key, with a rate up to the control rate; the joints are listed."""
     listed_keys = [sensor.key for sensor in rig.robot.sensors]
     assert len(set(listed_keys)) == len(listed_keys), f"listed twice: {listed_keys}"
@@ -57,7 +59,7 @@ def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: Rig) -> None:
         assert sensor.rate_hz <= 1.001e9 / rig.period_ns, f"{sensor.key}: faster than the control rate"
 
 
-def test_every_sensor_listed_delivers_at_about_its_rate(rig: Rig, healthy: Record) -> None:
+def test_every_sensor_listed_delivers_at_about_its_rate(rig: BackendRig, healthy: RigRecord) -> None:
     """Every listed sensor delivers samples at about its stated rate."""
     duration_s = len(healthy.samples) * rig.period_ns * 1e-9
     for sensor in rig.robot.sensors:
@@ -72,7 +74,7 @@ def test_every_sensor_listed_delivers_at_about_its_rate(rig: Rig, healthy: Recor
         )
 
 
-def count_readings(key: str, record: Record) -> int:
+def count_readings(key: str, record: RigRecord) -> int:
     """Return the number of samples of a sensor in a record.
 
     IMUs may report in turns, so their number is that of the link with the most samples.
@@ -82,7 +84,7 @@ def count_readings(key: str, record: Record) -> int:
     return max(links.values()) if links else len(messages)
 
 
-def test_nothing_comes_that_is_not_listed(rig: Rig, healthy: Record) -> None:
+def test_nothing_comes_that_is_not_listed(rig: BackendRig, healthy: RigRecord) -> None:
     """Every sample is at a key that the description lists, and has the message type of its key."""
     listed_keys = {sensor.key for sensor in rig.robot.sensors}
     for sample in healthy.samples:

@@ -5,21 +5,21 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import EmulatedDrives
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import BackendRig
 
 
-def do_nothing(_rig: Rig) -> None:
+def do_nothing(_rig: BackendRig) -> None:
     """Do nothing: the host detects by itself that it was frozen."""
 
 
 @pytest.mark.parametrize(
-    "act_after_freeze", [do_nothing, Rig.disarm, Rig.trigger_estop], ids=["goes_on", "disarm", "estop"]
+    "act_after_freeze", [do_nothing, BackendRig.disarm, BackendRig.trigger_estop], ids=["goes_on", "disarm", "estop"]
 )
 def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
-    rig: Rig, drives: EmulatedDrives, act_after_freeze: Callable[[Rig], None]
+    rig: BackendRig, drives: EmulatedDrives, act_after_freeze: Callable[[BackendRig], None]
 ) -> None:
     """A host that does nothing for 1 s while a joint moves: every drive switches off by its own watchdog.
 
@@ -52,7 +52,7 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     assert not rig.record_since(reset_tick).faults, rig.record_since(reset_tick).faults
 
 
-def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: Rig, drives: EmulatedDrives) -> None:
+def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: BackendRig, drives: EmulatedDrives) -> None:
     """Drives that are described without a watchdog hold while the host does nothing.
 
     Once it resumes, the backend switches each of them off at once, reports it as a fault of its joint, and enables none
@@ -77,20 +77,20 @@ def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: Rig, driv
     assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
 
 
-def assert_drives_stay_off(rig: Rig, drives: EmulatedDrives, periods: int) -> None:
+def assert_drives_stay_off(rig: BackendRig, drives: EmulatedDrives, periods: int) -> None:
     """Fail if a drive is enabled after any of some periods without a command."""
     for _ in range(periods):
         rig.wait_periods()
         assert not any(drives.list_enabled()), f"enabled again, in state {rig.authority.state}: {drives.list_enabled()}"
 
 
-def test_drives_brake_after_fault_and_are_off_after_watchdog(rig: Rig, drives: EmulatedDrives) -> None:
+def test_drives_brake_after_fault_and_are_off_after_watchdog(rig: BackendRig, drives: EmulatedDrives) -> None:
     """A fault while a joint moves: its drive brakes the joint, but no longer than the drive's watchdog lasts."""
     rig.arm_and_move_joint()
     rig.report_fault()
     rig.wait_periods()
     if rig.supports_mode(
-        0, Mode.VELOCITY
+        0, JointMode.VELOCITY
     ):  # otherwise the joint is led to rest by its position, which takes less than a period
         assert drives.list_enabled()[0], "the joint moves, and its drive does not brake"
     rig.wait_periods(rig.count_periods(tolerances.MAX_BRAKING_S) + tolerances.TRANSPORT_PERIODS)

@@ -5,31 +5,31 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.contract.rig import Record, Rig
+from snakesim_testing.contract.rig import BackendRig, RigRecord
 from snakesim_testing.contract.test_lifecycle import assert_at_rest
 
 MUTED_JOINT = 1
 ISOLATED_JOINT = 1
 
 
-def test_a_healthy_robot_reports_no_fault(rig: Rig, healthy: Record) -> None:
+def test_a_healthy_robot_reports_no_fault(rig: BackendRig, healthy: RigRecord) -> None:
     """A healthy backend reports no fault, neither after opening nor in operation."""
     assert not rig.faults_at_opening, rig.faults_at_opening
     assert healthy.samples and not healthy.faults, healthy.faults
 
 
-def test_an_isolated_joint_is_passive_while_others_continue(rig: Rig) -> None:
+def test_an_isolated_joint_is_passive_while_others_continue(rig: BackendRig) -> None:
     """An isolated joint has no torque, whatever is commanded, while the other joints continue; a reset ends that."""
     with rig.with_isolation_allowed():
         start_tick = rig.tick
         rig.arm_and_move_joint()
         rig.isolate_joint(ISOLATED_JOINT)
         targets = {
-            0: (Mode.VELOCITY, tolerances.MOTION_SPEED_RAD_S),
-            ISOLATED_JOINT: (Mode.POSITION, rig.home_rad[ISOLATED_JOINT] + tolerances.STEP_RAD),
+            0: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S),
+            ISOLATED_JOINT: (JointMode.POSITION, rig.home_rad[ISOLATED_JOINT] + tolerances.STEP_RAD),
         }
         record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
         rig.assert_armed()
@@ -56,7 +56,7 @@ def test_an_isolated_joint_is_passive_while_others_continue(rig: Rig) -> None:
         assert not rig.record_since(start_tick).faults, rig.record_since(start_tick).faults
 
 
-def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) -> None:
+def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: BackendRig) -> None:
     """A joint that falls silent is reported as invalid or as aging, until the robot is at fault.
 
     The readings of the other joints stay fresh. Faults that the backend itself reports have a kind and a cause, and
@@ -70,7 +70,7 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
     bench.mute_joint(rig.backend, MUTED_JOINT)
     lease_periods = math.ceil(rig.robot.lease_ns / rig.period_ns)
     record = rig.command_joints(
-        {0: (Mode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}, lease_periods + tolerances.TRANSPORT_PERIODS + 2
+        {0: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}, lease_periods + tolerances.TRANSPORT_PERIODS + 2
     )
     for joints in record.joints[tolerances.TRANSPORT_PERIODS :]:
         silent_ns = (joints.tick - mute_tick - tolerances.TRANSPORT_PERIODS) * rig.period_ns
@@ -89,7 +89,7 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
     rig.close()
 
 
-def assert_others_at_rest(rig: Rig) -> None:
+def assert_others_at_rest(rig: BackendRig) -> None:
     """Fail if a joint other than the silent one moves. The position of the silent joint is unknown, and ignored."""
     record = rig.wait_periods(rig.count_periods(tolerances.SETTLING_TIME_S))
     for sample in record.samples:

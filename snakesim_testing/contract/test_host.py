@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault, Mode, SimulatorRequest
+from snakesim_hal.wire.messages import Fault, JointMode, SimulatorRequest
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.loopback import HostedBackend, hold_all_joints, wait_until
@@ -28,7 +28,7 @@ def arm_and_move_by_controller(falls_silent: bool, hosted: HostedBackend) -> int
     wait_until(lambda: hosted.backend.joint_states, "a first sample")
     start_angle_rad = hosted.backend.joint_states[-1].angle_rad[0]
     speed_rad_s = -math.copysign(tolerances.MOTION_SPEED_RAD_S, start_angle_rad)  # away from the nearer stop
-    has_velocity_mode = hosted.robot.joints[0].supports_mode(Mode.VELOCITY)
+    has_velocity_mode = hosted.robot.joints[0].supports_mode(JointMode.VELOCITY)
     period_s = hosted.config.period_ns * 1e-9
     motion_ticks = tolerances.ARMING_PERIODS + math.ceil(tolerances.MOTION_DURATION_S * 1e9 / hosted.config.period_ns)
 
@@ -38,9 +38,9 @@ def arm_and_move_by_controller(falls_silent: bool, hosted: HostedBackend) -> int
         if falls_silent and ticks_since_arming >= motion_ticks:
             return None
         if has_velocity_mode:
-            return {0: (Mode.VELOCITY, speed_rad_s)}
+            return {0: (JointMode.VELOCITY, speed_rad_s)}
         position_rad = start_angle_rad + speed_rad_s * period_s * (ticks_since_arming - tolerances.ARMING_PERIODS)
-        return {0: (Mode.POSITION, position_rad)}
+        return {0: (JointMode.POSITION, position_rad)}
 
     hosted.arm(plan)
     return motion_ticks
@@ -83,7 +83,7 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: HostedBac
     invalid_fields_by_rejection: dict[str, dict[str, Any]] = {
         "wrong_epoch": {"lease_epoch": hosted.controller.last_lease_epoch + 7},
         "wrong_layout": {"layout": "f" * 16},
-        "wrong_length": {"mode": [Mode.POSITION] * (count + 1), "target": [0.5] * (count + 1)},
+        "wrong_length": {"mode": [JointMode.POSITION] * (count + 1), "target": [0.5] * (count + 1)},
         "malformed": {"target": [math.nan] * count},
         "stale": {"tick": 0},
         "from_the_future": {"tick": hosted.tick + 1_000_000},

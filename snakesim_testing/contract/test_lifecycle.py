@@ -5,15 +5,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import JointMode, LifecycleState
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import Bench
-from snakesim_testing.contract.rig import JointTargets, Record, Rig, skip_limiter
+from snakesim_testing.contract.rig import BackendRig, JointTargets, RigRecord, skip_limiter
 
-MOVE_JOINT_0: JointTargets = {0: (Mode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}
+MOVE_JOINT_0: JointTargets = {0: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}
 
 
-def assert_at_rest(record: Record, rig: Rig) -> None:
+def assert_at_rest(record: RigRecord, rig: BackendRig) -> None:
     """Fail if a joint moves at the end of a record."""
     last_velocities_rad_s = record.velocity_rad_s[-1]
     assert np.abs(last_velocities_rad_s).max() < tolerances.STANDSTILL_RAD_S, (
@@ -25,9 +25,9 @@ def assert_at_rest(record: Record, rig: Rig) -> None:
     )
 
 
-def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: Rig) -> None:
+def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: BackendRig) -> None:
     """A disarmed robot that receives commands: no joint moves or has torque."""
-    targets = {i: (Mode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD) for i in range(rig.joint_count)}
+    targets = {i: (JointMode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD) for i in range(rig.joint_count)}
     start_angles_rad = np.array(rig.newest_joints.angle_rad)
     record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
     moved_rad = np.abs(record.angle_rad - start_angles_rad).max()
@@ -36,12 +36,14 @@ def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("state", ["disarmed", "estop"])
-def test_a_robot_with_modules_stops_them_itself_when_not_armed(bench: Bench, rig: Rig, state: LifecycleState) -> None:
+def test_a_robot_with_modules_stops_them_itself_when_not_armed(
+    bench: Bench, rig: BackendRig, state: LifecycleState
+) -> None:
     """A robot that is not armed does not follow setpoints that move, even if the host hands it such by mistake.
 
     This is a second line of defense. A simulator need not do this (see `Backend.enact`): the host hands it none.
     """
-    targets = {i: (Mode.POSITION, rig.home_rad[i] + 0.5 * tolerances.STEP_RAD) for i in range(rig.joint_count)}
+    targets = {i: (JointMode.POSITION, rig.home_rad[i] + 0.5 * tolerances.STEP_RAD) for i in range(rig.joint_count)}
     start_angles_rad = np.array(rig.newest_joints.angle_rad)
     first_tick = rig.tick
     for _ in range(rig.count_periods(tolerances.MOTION_DURATION_S)):
@@ -53,19 +55,21 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(bench: Bench, rig
     assert moved_rad < tolerances.STANDSTILL_RAD, f"{state}, and it moved by {moved_rad:.3f} rad"
 
 
-@pytest.mark.parametrize("stop", [Rig.disarm, Rig.trigger_estop, Rig.report_fault], ids=["disarm", "estop", "fault"])
-def test_leaving_armed_brings_a_moving_joint_to_rest(rig: Rig, stop: Callable[[Rig], None]) -> None:
+@pytest.mark.parametrize(
+    "stop", [BackendRig.disarm, BackendRig.trigger_estop, BackendRig.report_fault], ids=["disarm", "estop", "fault"]
+)
+def test_leaving_armed_brings_a_moving_joint_to_rest(rig: BackendRig, stop: Callable[[BackendRig], None]) -> None:
     """A robot that is disarmed, stopped or at fault in motion: its joints come to rest, and commands move none."""
     rig.arm_and_move_joint()
     stop(rig)
     assert_at_rest(rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S)), rig)
 
 
-def test_disarmed_joints_have_no_torque(rig: Rig) -> None:
+def test_disarmed_joints_have_no_torque(rig: BackendRig) -> None:
     """The joints of a disarmed robot have no torque, also away from the start pose."""
     rig.arm()
     rig.command_joints(
-        {0: (Mode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)}, rig.count_periods(tolerances.SETTLING_TIME_S)
+        {0: (JointMode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)}, rig.count_periods(tolerances.SETTLING_TIME_S)
     )
     rig.disarm()
     record = rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S))
@@ -73,7 +77,7 @@ def test_disarmed_joints_have_no_torque(rig: Rig) -> None:
     assert_at_rest(record, rig)
 
 
-def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
+def test_arming_again_goes_on_from_where_the_robot_is(rig: BackendRig) -> None:
     """A robot that was stopped in motion, reset and armed again stays where it is: no joint resumes a setpoint."""
     rig.arm_and_move_joint()
     rig.trigger_estop()
@@ -90,7 +94,7 @@ def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
     assert np.abs(np.diff(record.torque_nm, axis=0)).max() < tolerances.MAX_TORQUE_STEP_FRACTION * rig.full_torque_nm[0]
 
 
-def test_after_reset_and_arm_it_moves_again(rig: Rig) -> None:
+def test_after_reset_and_arm_it_moves_again(rig: BackendRig) -> None:
     """A robot that was stopped by a fault, reset and armed again moves as before."""
     rig.arm_and_move_joint()
     rig.report_fault()

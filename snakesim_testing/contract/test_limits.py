@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.recordings import PushRecording
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import BackendRig
 
 
-def test_the_torque_limit_of_the_setpoints_is_kept(rig: Rig, pushing: PushRecording) -> None:
+def test_the_torque_limit_of_the_setpoints_is_kept(rig: BackendRig, pushing: PushRecording) -> None:
     """A joint that pushes against its end stop has the torque limit of its setpoints as torque, and no more."""
     rig.skip_without(torque=True)
     measured_nm = abs(pushing.torque_limited.torque_nm[-1, :2])
@@ -21,10 +21,10 @@ def test_the_torque_limit_of_the_setpoints_is_kept(rig: Rig, pushing: PushRecord
     )
 
 
-def test_a_torque_limit_of_zero_lets_nothing_move(rig: Rig) -> None:
+def test_a_torque_limit_of_zero_lets_nothing_move(rig: BackendRig) -> None:
     """With a torque limit of zero, no joint moves toward a position target that is far away."""
     rig.arm()
-    targets = {i: (Mode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD) for i in range(rig.joint_count)}
+    targets = {i: (JointMode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD) for i in range(rig.joint_count)}
     start_angles_rad = np.array(rig.newest_joints.angle_rad)
     record = rig.command_joints(
         targets, rig.count_periods(tolerances.MOTION_DURATION_S), torque_limit_nm=[0.0] * rig.joint_count
@@ -33,7 +33,7 @@ def test_a_torque_limit_of_zero_lets_nothing_move(rig: Rig) -> None:
     assert moved_rad < tolerances.STANDSTILL_RAD, f"it moved by {moved_rad:.3f} rad"
 
 
-def test_no_joint_goes_beyond_its_limits(rig: Rig, pushing: PushRecording) -> None:
+def test_no_joint_goes_beyond_its_limits(rig: BackendRig, pushing: PushRecording) -> None:
     """Joints that are driven against their end stops without the command limiter do not move beyond their limits."""
     for i, joint in enumerate(rig.robot.joints):
         angles = pushing.whole_record.angle_rad[:, i]

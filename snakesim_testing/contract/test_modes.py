@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.recordings import PushRecording
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import BackendRig
 
 
-def test_position_mode_turns_only_the_requested_joint(rig: Rig) -> None:
+def test_position_mode_turns_only_the_requested_joint(rig: BackendRig) -> None:
     """Each joint in turn moves STEP_RAD from the start pose, in rad, in the right direction, and stays there."""
     rig.arm()
     for joint in range(rig.joint_count):
         record = rig.command_joints(
-            {joint: (Mode.POSITION, rig.home_rad[joint] + tolerances.STEP_RAD)},
+            {joint: (JointMode.POSITION, rig.home_rad[joint] + tolerances.STEP_RAD)},
             rig.count_periods(tolerances.SETTLING_TIME_S),
         )
         moved_rad = record.angle_rad[-1] - rig.home_rad
@@ -27,24 +27,26 @@ def test_position_mode_turns_only_the_requested_joint(rig: Rig) -> None:
         )
 
 
-def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: Rig) -> None:
+def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: BackendRig) -> None:
     """A joint in velocity mode moves at the requested speed in rad/s, in both directions, less some for friction."""
-    rig.skip_without(Mode.VELOCITY)
+    rig.skip_without(JointMode.VELOCITY)
     rig.arm()
     for speed_rad_s in (tolerances.MOTION_SPEED_RAD_S, -tolerances.MOTION_SPEED_RAD_S):
-        record = rig.command_joints({0: (Mode.VELOCITY, speed_rad_s)}, rig.count_periods(tolerances.MOTION_DURATION_S))
+        record = rig.command_joints(
+            {0: (JointMode.VELOCITY, speed_rad_s)}, rig.count_periods(tolerances.MOTION_DURATION_S)
+        )
         mean_speed_rad_s = record.velocity_rad_s[-rig.count_periods(tolerances.MOTION_DURATION_S / 3) :, 0].mean()
         assert abs(mean_speed_rad_s - speed_rad_s) < tolerances.SPEED_TOLERANCE_FRACTION * abs(speed_rad_s), (
             f"asked for {speed_rad_s} rad/s: {mean_speed_rad_s:.3f} rad/s"
         )
 
 
-def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> None:
+def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: BackendRig) -> None:
     """The reported velocity, integrated over a motion, is the change of the reported angle, for every joint."""
     rig.arm()
     joint = rig.joint_count - 1
     record = rig.command_joints(
-        {joint: (Mode.VELOCITY, -tolerances.MOTION_SPEED_RAD_S)}, rig.count_periods(tolerances.MOTION_DURATION_S)
+        {joint: (JointMode.VELOCITY, -tolerances.MOTION_SPEED_RAD_S)}, rig.count_periods(tolerances.MOTION_DURATION_S)
     )
     velocity = record.velocity_rad_s
     angle = record.angle_rad
@@ -56,9 +58,9 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> 
     )
 
 
-def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: Rig, pushing: PushRecording) -> None:
+def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: BackendRig, pushing: PushRecording) -> None:
     """A joint in torque mode against its end stop reports the requested torque in N·m, with its sign."""
-    rig.skip_without(Mode.TORQUE, torque=True)
+    rig.skip_without(JointMode.TORQUE, torque=True)
     assert pushing.torque_mode is not None
     measured_nm = pushing.torque_mode.torque_nm[-1]
     requested_nm = pushing.requested_nm
@@ -71,27 +73,27 @@ def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: Rig, pushing: Pus
     )
 
 
-def test_a_passive_joint_has_no_torque_and_stays(rig: Rig) -> None:
+def test_a_passive_joint_has_no_torque_and_stays(rig: BackendRig) -> None:
     """An armed joint that becomes passive away from the start pose has no torque, and stays where it is."""
     rig.arm()
     rig.command_joints(
-        {0: (Mode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)}, rig.count_periods(tolerances.SETTLING_TIME_S)
+        {0: (JointMode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)}, rig.count_periods(tolerances.SETTLING_TIME_S)
     )
-    record = rig.command_joints({0: (Mode.PASSIVE, 0.0)}, rig.count_periods(tolerances.SETTLING_TIME_S))
+    record = rig.command_joints({0: (JointMode.PASSIVE, 0.0)}, rig.count_periods(tolerances.SETTLING_TIME_S))
     assert abs(record.torque_nm[-1, 0]) < tolerances.TORQUE_TOLERANCE_NM, f"{record.torque_nm[-1, 0]:.3f} N·m"
     settled = record.angle_rad[tolerances.TRANSPORT_PERIODS :, 0]
     assert np.ptp(settled) < tolerances.POSITION_TOLERANCE_RAD, f"it moved by {np.ptp(settled):.3f} rad"
 
 
-def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
+def test_joints_may_be_in_different_modes_at_once(rig: BackendRig) -> None:
     """Joints in position, velocity and passive mode at the same time each follow their own mode."""
     rig.arm()
     target_rad = rig.home_rad[0] - tolerances.STEP_RAD
     speed_rad_s = tolerances.MOTION_SPEED_RAD_S
     targets = {
-        0: (Mode.POSITION, target_rad),
-        1: (Mode.VELOCITY, speed_rad_s),
-        rig.joint_count - 1: (Mode.PASSIVE, 0.0),
+        0: (JointMode.POSITION, target_rad),
+        1: (JointMode.VELOCITY, speed_rad_s),
+        rig.joint_count - 1: (JointMode.PASSIVE, 0.0),
     }
     record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
     assert abs(record.angle_rad[-1, 0] - target_rad) < 2 * tolerances.POSITION_TOLERANCE_RAD  # still on its way
@@ -100,26 +102,26 @@ def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
     assert abs(moved_rad[-1]) < tolerances.POSITION_TOLERANCE_RAD, f"the passive joint moved by {moved_rad[-1]:.3f} rad"
 
 
-def test_setpoints_hold_until_the_next_ones(rig: Rig) -> None:
+def test_setpoints_hold_until_the_next_ones(rig: BackendRig) -> None:
     """A joint without new commands keeps its setpoint while the command lease lasts."""
-    rig.skip_without(Mode.VELOCITY)
+    rig.skip_without(JointMode.VELOCITY)
     rig.arm_and_move_joint()
     rig.wait_periods(tolerances.COMMAND_GAP_PERIODS)
     assert_joint_0_keeps_speed(rig)
 
 
-def test_setpoints_hold_without_being_handed_over_again(rig: Rig) -> None:
+def test_setpoints_hold_without_being_handed_over_again(rig: BackendRig) -> None:
     """The last setpoints stay active while the backend only advances, without a further call of `enact`."""
-    rig.skip_without(Mode.VELOCITY)
+    rig.skip_without(JointMode.VELOCITY)
     rig.arm_and_move_joint()
     for _ in range(tolerances.HOLD_PERIODS):
         rig.advance_period()
     assert_joint_0_keeps_speed(rig)
 
 
-def test_a_mode_that_a_joint_lacks_is_refused(rig: Rig) -> None:
+def test_a_mode_that_a_joint_lacks_is_refused(rig: BackendRig) -> None:
     """A command in a mode that a joint does not have is refused as a whole, and the backend gets no such setpoint."""
-    missing_modes = [mode for mode in Mode if not rig.supports_mode(0, mode)]
+    missing_modes = [mode for mode in JointMode if not rig.supports_mode(0, mode)]
     if not missing_modes:
         pytest.skip(f"{rig.robot.joints[0].name} is described with every mode")
     rig.arm()
@@ -135,7 +137,7 @@ def test_a_mode_that_a_joint_lacks_is_refused(rig: Rig) -> None:
         assert all(mode not in points.mode for points in record.setpoints)
 
 
-def assert_joint_0_keeps_speed(rig: Rig) -> None:
+def assert_joint_0_keeps_speed(rig: BackendRig) -> None:
     """Fail if joint 0 no longer moves at the commanded speed."""
     speed = rig.newest_joints.velocity_rad_s[0]
     assert speed > (1 - tolerances.SPEED_TOLERANCE_FRACTION) * tolerances.MOTION_SPEED_RAD_S, (

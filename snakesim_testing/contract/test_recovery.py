@@ -8,23 +8,23 @@ from collections.abc import Callable
 import pytest
 
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import EmulatedDrives
 from snakesim_testing.contract.faults import inject_or_skip
-from snakesim_testing.contract.rig import JointTargets, Rig
+from snakesim_testing.contract.rig import BackendRig, JointTargets
 from snakesim_testing.contract.test_drives import assert_drives_stay_off
 
-MOVE_JOINT_0: JointTargets = {0: (Mode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}
+MOVE_JOINT_0: JointTargets = {0: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}
 
 # Injected faults, as KIND:TARGET@BEGIN-END with times in s of robot time; the tests begin and end them by themselves.
 BUS_1_LOST = "cut:bus_1@0-9"
 JOINT_2_DUPLICATED = "duplicate:joint_2@0-9"
 
 
-@pytest.mark.parametrize("stop", [Rig.disarm, Rig.trigger_estop], ids=["disarm", "estop"])
+@pytest.mark.parametrize("stop", [BackendRig.disarm, BackendRig.trigger_estop], ids=["disarm", "estop"])
 def test_torque_is_off_in_time_by_the_drives_own_log(
-    rig: Rig, drives: EmulatedDrives, stop: Callable[[Rig], None]
+    rig: BackendRig, drives: EmulatedDrives, stop: Callable[[BackendRig], None]
 ) -> None:
     """A robot that is disarmed or stopped in motion: every drive has switched its torque off a few periods later."""
     rig.arm_and_move_joint()
@@ -34,7 +34,7 @@ def test_torque_is_off_in_time_by_the_drives_own_log(
     assert_switched_off(rig, drives, start_s, tolerances.TORQUE_OFF_PERIODS * rig.period_ns * 1e-9)
 
 
-def test_torque_is_off_after_watchdog_by_the_drives_own_log(rig: Rig, drives: EmulatedDrives) -> None:
+def test_torque_is_off_after_watchdog_by_the_drives_own_log(rig: BackendRig, drives: EmulatedDrives) -> None:
     """A host that does nothing while a joint moves: every drive switches its torque off by its watchdog, in time."""
     joints_without_watchdog = rig.joints_without_watchdog
     if joints_without_watchdog:
@@ -48,7 +48,7 @@ def test_torque_is_off_after_watchdog_by_the_drives_own_log(rig: Rig, drives: Em
     assert_switched_off(rig, drives, start_s, tolerances.MAX_WATCHDOG_OFF_S)
 
 
-def test_a_drive_restarted_in_motion_stays_off_until_reset(rig: Rig, drives: EmulatedDrives) -> None:
+def test_a_drive_restarted_in_motion_stays_off_until_reset(rig: BackendRig, drives: EmulatedDrives) -> None:
     """The drive of a moving joint restarts: a fault names the joint, and all drives are off until reset and arming."""
     rig.arm_and_move_joint()
     rig.must_reopen = True
@@ -59,7 +59,7 @@ def test_a_drive_restarted_in_motion_stays_off_until_reset(rig: Rig, drives: Emu
     assert_recovers_by_reset_alone(rig, drives)
 
 
-def test_two_drives_with_one_id_stop_the_robot(rig: Rig, drives: EmulatedDrives) -> None:
+def test_two_drives_with_one_id_stop_the_robot(rig: BackendRig, drives: EmulatedDrives) -> None:
     """A second drive with the id of a joint's drive is a fault, also after a reset, until the second drive is gone."""
     rig.arm_and_move_joint()
     rig.must_reopen = True
@@ -77,7 +77,7 @@ def test_two_drives_with_one_id_stop_the_robot(rig: Rig, drives: EmulatedDrives)
     assert_recovers_by_reset_alone(rig, drives)
 
 
-def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: Rig, drives: EmulatedDrives) -> None:
+def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: BackendRig, drives: EmulatedDrives) -> None:
     """A bus loses all frames in motion: the drives on it are disabled, and stay disabled once frames pass again.
 
     Drives with a watchdog switch their torque off by themselves while the bus is lost. Drives that are described
@@ -106,7 +106,7 @@ def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: Rig, drives: Emul
     assert_recovers_by_reset_alone(rig, drives)
 
 
-def assert_fault_names_joint(rig: Rig, since_tick: int, joint: int) -> None:
+def assert_fault_names_joint(rig: BackendRig, since_tick: int, joint: int) -> None:
     """Fail if the robot is not at fault, or if no fault since a tick names the joint."""
     assert rig.authority.state == "fault", f"the robot continues: {rig.authority.state}"
     faults = rig.record_since(since_tick).faults
@@ -114,7 +114,7 @@ def assert_fault_names_joint(rig: Rig, since_tick: int, joint: int) -> None:
     assert name in {fault.joint for fault in faults}, f"no fault of {name}: {faults}"
 
 
-def assert_recovers_by_reset_alone(rig: Rig, drives: EmulatedDrives) -> None:
+def assert_recovers_by_reset_alone(rig: BackendRig, drives: EmulatedDrives) -> None:
     """Fail if a drive is enabled before reset and arming, or if the robot cannot be moved after them."""
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
     rig.reset()
@@ -126,7 +126,7 @@ def assert_recovers_by_reset_alone(rig: Rig, drives: EmulatedDrives) -> None:
     assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
 
 
-def assert_switched_off(rig: Rig, drives: EmulatedDrives, start_s: float, max_duration_s: float) -> None:
+def assert_switched_off(rig: BackendRig, drives: EmulatedDrives, start_s: float, max_duration_s: float) -> None:
     """Fail unless every drive's own log shows that its torque was switched off in time, and has been off since then.
 
     Args:

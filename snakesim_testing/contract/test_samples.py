@@ -10,26 +10,26 @@ import pytest
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.custom_sample import find_custom_message
 from snakesim_hal.wire.messages import MountedSample, Power
 from snakesim_hal.wire.outgoing import describe_invalid_field
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.faults import inject_or_skip
-from snakesim_testing.contract.rig import Record, Rig
+from snakesim_testing.contract.rig import BackendRig, RigRecord
 
 JOINT_STATE_VECTORS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
 
 
-def test_joints_carry_the_tick_and_stamp_that_were_asked_for(rig: Rig, healthy: Record) -> None:
+def test_joints_carry_the_tick_and_stamp_that_were_asked_for(rig: BackendRig, healthy: RigRecord) -> None:
     """There is one joint state for each tick, and its timestamp is the robot time of the tick."""
     ticks = [joints.tick for joints in healthy.joints]
     assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
     assert all(joints.timestamp_ns == joints.tick * rig.period_ns for joints in healthy.joints)
 
 
-def test_other_sensors_are_stamped_when_they_were_read(rig: Rig, healthy: Record) -> None:
+def test_other_sensors_are_stamped_when_they_were_read(rig: BackendRig, healthy: RigRecord) -> None:
     """Sensor samples are never from the future, never older than delay, period and transport, and in order."""
     for sensor in rig.robot.sensors:
         if sensor.key == keys.JOINTS:
@@ -45,14 +45,14 @@ def test_other_sensors_are_stamped_when_they_were_read(rig: Rig, healthy: Record
         assert all(before < after for before, after in pairwise(timestamps_ns)), f"{sensor.key}: out of order"
 
 
-def test_every_vector_has_one_entry_a_joint(rig: Rig, healthy: Record) -> None:
+def test_every_vector_has_one_entry_a_joint(rig: BackendRig, healthy: RigRecord) -> None:
     """Angle, velocity, torque, validity and age in a joint state have one entry for each joint."""
     for joints in healthy.joints:
         lengths = {name: len(getattr(joints, name)) for name in JOINT_STATE_VECTORS}
         assert set(lengths.values()) == {rig.joint_count}, lengths
 
 
-def test_every_sample_survives_the_wire(rig: Rig, healthy: Record) -> None:
+def test_every_sample_survives_the_wire(rig: BackendRig, healthy: RigRecord) -> None:
     """Every sample is finite, within the bounds of its message, and unchanged by the HAL's encoder and decoder.
 
     A custom message is decoded by its schema in the description, which is all that clients know of it.
@@ -60,7 +60,7 @@ def test_every_sample_survives_the_wire(rig: Rig, healthy: Record) -> None:
     for sample in healthy.samples:
         for key, message in ((keys.JOINTS, sample.joints), *sample.by_key.items()):
             custom_message = find_custom_message(key, rig.robot)
-            decoder = Decoder(type(message) if custom_message is None else custom_message.message)
+            decoder = MessageDecoder(type(message) if custom_message is None else custom_message.message)
             try:
                 decoded = decoder.decode(encode(message), format_encoding(type(message)))
             except WireError as error:
@@ -69,14 +69,14 @@ def test_every_sample_survives_the_wire(rig: Rig, healthy: Record) -> None:
         assert all(math.isfinite(number) for name in JOINT_STATE_VECTORS[:3] for number in getattr(sample.joints, name))
 
 
-def test_every_sample_fits_the_robot(rig: Rig, healthy: Record) -> None:
+def test_every_sample_fits_the_robot(rig: BackendRig, healthy: RigRecord) -> None:
     """Every sample agrees with the description of the robot: links, joints, rotations, and the size of images."""
     for sample in healthy.samples:
         for key, message in sample.by_key.items():
             assert (mismatch := find_mismatch(message, rig.robot)) is None, f"{key}: {mismatch}"
 
 
-def test_no_sample_contradicts_itself(healthy: Record) -> None:
+def test_no_sample_contradicts_itself(healthy: RigRecord) -> None:
     """No sample contradicts itself, such as a camera or a lidar with a distance beyond its range."""
     for sample in healthy.samples:
         for key, message in sample.by_key.items():
@@ -84,7 +84,7 @@ def test_no_sample_contradicts_itself(healthy: Record) -> None:
                 assert not (contradiction := message.find_contradiction()), f"{key}: {contradiction}"
 
 
-def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record) -> None:
+def test_every_joint_is_valid_and_fresh_at_every_tick(rig: BackendRig, healthy: RigRecord) -> None:
     """In normal operation all joints are valid, and no reading is older than a period besides the stated delay."""
     delay_s = next(sensor.delay_s for sensor in rig.robot.sensors if sensor.key == keys.JOINTS)
     max_age_ns = tolerances.MAX_READING_AGE_PERIODS * rig.period_ns + delay_s * 1e9
@@ -93,7 +93,7 @@ def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record)
         assert max(joints.age_ns) <= max_age_ns, f"tick {joints.tick}: {joints.age_ns} ns"
 
 
-def test_what_is_not_known_yet_is_not_reported_as_valid(rig: Rig) -> None:
+def test_what_is_not_known_yet_is_not_reported_as_valid(rig: BackendRig) -> None:
     """In the very first sample, the angle of each joint is the same as afterwards, or it is not valid."""
     for i, valid in enumerate(rig.first_sample.joints.valid):
         deviation_rad = rig.first_sample.joints.angle_rad[i] - rig.home_rad[i]
@@ -102,7 +102,7 @@ def test_what_is_not_known_yet_is_not_reported_as_valid(rig: Rig) -> None:
         )
 
 
-def test_readings_follow_the_motion(healthy: Record) -> None:
+def test_readings_follow_the_motion(healthy: RigRecord) -> None:
     """While the robot moves, no joint reports one old reading for long as if it were new."""
     angles = np.round(healthy.angle_rad, 6)
     for i in range(angles.shape[1]):
@@ -112,7 +112,7 @@ def test_readings_follow_the_motion(healthy: Record) -> None:
         )
 
 
-def test_supply_and_temperatures_are_in_volts_and_degrees(bench: Bench, rig: Rig) -> None:
+def test_supply_and_temperatures_are_in_volts_and_degrees(bench: Bench, rig: BackendRig) -> None:
     """Reported voltages are near that of the robot file, and reported temperatures are those of a cool motor."""
     power = wait_for_power_sample(rig)
     for i, joint in enumerate(bench.config.robot.joint_table):
@@ -131,7 +131,7 @@ def test_supply_and_temperatures_are_in_volts_and_degrees(bench: Bench, rig: Rig
                 )
 
 
-def test_a_sagging_supply_is_reported_at_its_joint(rig: Rig) -> None:
+def test_a_sagging_supply_is_reported_at_its_joint(rig: BackendRig) -> None:
     """If the supply of one drive sags, its reported voltage drops, and the robot is stopped by a fault."""
     if "voltage" not in rig.robot.joints[1].measures:
         pytest.skip(f"{rig.robot.joints[1].name} does not measure its supply")
@@ -145,7 +145,7 @@ def test_a_sagging_supply_is_reported_at_its_joint(rig: Rig) -> None:
     assert rig.authority.state == "fault", "a supply below `min_voltage_v`, and the robot may be armed"
 
 
-def wait_for_power_sample(rig: Rig) -> Power:
+def wait_for_power_sample(rig: BackendRig) -> Power:
     """Wait until every drive had time for a report, and return the newest power sample.
 
     The test is skipped if the robot has no power sensor.

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.contract import tolerances
 from snakesim_testing.contract.recordings import MODE_SWITCHES
-from snakesim_testing.contract.rig import Floats, Rig
+from snakesim_testing.contract.rig import BackendRig, Floats
 
 SWITCH_NAMES = [f"{before.name}_to_{after.name}".lower() for before, after in MODE_SWITCHES]
 
 
 @pytest.mark.parametrize(("before", "after"), MODE_SWITCHES, ids=SWITCH_NAMES)
 def test_a_mode_switch_makes_no_jump(
-    rig: Rig, switching: dict[tuple[Mode, Mode], Floats], before: Mode, after: Mode
+    rig: BackendRig, switching: dict[tuple[JointMode, JointMode], Floats], before: JointMode, after: JointMode
 ) -> None:
     """When a joint changes its mode, with small targets, its torque jumps by less than a quarter of the maximum."""
     for mode in (before, after):

@@ -6,7 +6,7 @@ from snakesim_drivers.kit.drive_backend import DriveBackend
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
+from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleState
 
 
 def drives_of(backend: Any, bus: int = 0) -> Any:
@@ -20,7 +20,7 @@ class DriveRig:
     def __init__(self, config: RunConfig, backend: DriveBackend) -> None:
         self.config, self.backend = config, backend
         self.tick, self.isolated = 0, frozenset[int]()
-        self.mode, self.target, self.limit_nm = Mode.POSITION, 0.1, 1.0
+        self.mode, self.target, self.limit_nm = JointMode.POSITION, 0.1, 1.0
         self.damps = False  # in a fault
         self.joints: JointState | None = None
 
@@ -41,14 +41,14 @@ class DriveRig:
             self.tick += 1
         return found
 
-    def _setpoint(self, lifecycle: LifecycleState) -> tuple[Mode, float]:
+    def _setpoint(self, lifecycle: LifecycleState) -> tuple[JointMode, float]:
         match lifecycle:
             case "armed":
                 return self.mode, self.target
             case "fault" if self.damps:
-                return Mode.VELOCITY, 0.0
+                return JointMode.VELOCITY, 0.0
             case _:
-                return Mode.PASSIVE, self.target
+                return JointMode.PASSIVE, self.target
 
     def go_wrong(self, text: str, *, begins: bool = True) -> None:
         """Begin or end a fault, such as `mute:joint_2@0-9`."""

@@ -6,27 +6,31 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from snakesim_gnc.guidance.depth_scan import Intrinsics
-from snakesim_gnc.guidance.scan import RangeNoise, Scan, make_scan
+from snakesim_gnc.guidance.depth_scan import CameraIntrinsics
+from snakesim_gnc.guidance.scan import AzimuthScan, RangeNoise, make_scan
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
+from snakesim_hal.wire.messages import DepthImage, KnownObstacle, RangeScan
 from snakesim_operator.features.robots.urdf_tree import make_rotation_from_rpy
 
 Ground = Callable[[Floats, Floats], Floats]
-INTRINSICS = Intrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
+INTRINSICS = CameraIntrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
 DEPTH_RANGE_M = (0.05, 3.0)
 DEPTH_UNIT_M = 0.001
 
 
-def make_cylinder(name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2) -> Obstacle:
+def make_cylinder(name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2) -> KnownObstacle:
     """Return an upright cylinder."""
-    return Obstacle(name=name, shape="cylinder", position_w=(x, y, height_m / 2), radius_m=radius_m, height_m=height_m)
+    return KnownObstacle(
+        name=name, shape="cylinder", position_w=(x, y, height_m / 2), radius_m=radius_m, height_m=height_m
+    )
 
 
-def make_box(name: str, x: float, y: float, size_m: tuple[float, float], yaw_rad: float = 0.0) -> Obstacle:
+def make_box(name: str, x: float, y: float, size_m: tuple[float, float], yaw_rad: float = 0.0) -> KnownObstacle:
     """Return an upright box."""
     half = (size_m[0] / 2, size_m[1] / 2, 0.1)
-    return Obstacle(name=name, shape="box", position_w=(x, y, 0.1), yaw_rad=yaw_rad, half_size_m=half, height_m=0.2)
+    return KnownObstacle(
+        name=name, shape="box", position_w=(x, y, 0.1), yaw_rad=yaw_rad, half_size_m=half, height_m=0.2
+    )
 
 
 def flat_ground(x: Floats, _y: Floats) -> Floats:
@@ -58,7 +62,7 @@ class SensorErrors:
 
 
 def compute_ray_distances(
-    origin: Floats, rays: Floats, obstacles: Sequence[Obstacle], ground: Ground = flat_ground
+    origin: Floats, rays: Floats, obstacles: Sequence[KnownObstacle], ground: Ground = flat_ground
 ) -> Floats:
     """Return the multiple of each ray at which the ray meets an obstacle or the ground first; infinite if nowhere.
 
@@ -83,7 +87,7 @@ def compute_ray_distances(
     return nearest
 
 
-def _on_upright(origin: Floats, rays: Floats, o: Obstacle) -> Floats:
+def _on_upright(origin: Floats, rays: Floats, o: KnownObstacle) -> Floats:
     to = origin[:2] - np.array(o.position_w[:2])
     if o.shape == "cylinder":
         flat_rays = rays[:, :2]
@@ -103,7 +107,7 @@ def _on_upright(origin: Floats, rays: Floats, o: Obstacle) -> Floats:
 
 
 def render_depth_image(
-    obstacles: Sequence[Obstacle],
+    obstacles: Sequence[KnownObstacle],
     position_w: Floats,
     world_from_camera: Floats,
     *,
@@ -147,13 +151,13 @@ def render_depth_image(
 
 
 def render_lidar_scan(
-    obstacles: Sequence[Obstacle],
+    obstacles: Sequence[KnownObstacle],
     position_w: Floats,
     world_from_lidar: Floats,
     *,
     beam_count: int = 181,
     timestamp_ns: int = 0,
-) -> Ranges:
+) -> RangeScan:
     """Return the scan of an exact planar lidar that covers half a turn.
 
     Args:
@@ -168,7 +172,7 @@ def render_lidar_scan(
     rays = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(beam_count)], axis=1) @ world_from_lidar.T
     distances_m = compute_ray_distances(position_w, rays, obstacles)
     angle_step_rad = float(angles_rad[1] - angles_rad[0]) if beam_count > 1 else 0.01  # a message needs a step above 0
-    return Ranges(
+    return RangeScan(
         tick=0,
         timestamp_ns=timestamp_ns,
         link=0,
@@ -182,7 +186,9 @@ def render_lidar_scan(
     )
 
 
-def make_lidar_scan(*obstacles: Obstacle, at: tuple[float, float] = (0.0, 0.0), timestamp_ns: int = 0) -> Scan:
+def make_lidar_scan(
+    *obstacles: KnownObstacle, at: tuple[float, float] = (0.0, 0.0), timestamp_ns: int = 0
+) -> AzimuthScan:
     """Return the scan of a lidar near the ground that looks along x, with the given obstacles around it."""
     position, ahead = np.array([*at, 0.05]), make_rotation(0.0)
     ranges = render_lidar_scan(obstacles, position, ahead, beam_count=361, timestamp_ns=timestamp_ns)

@@ -6,13 +6,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.controller import ControllerCommand, Observation
 from snakesim_hal.model.plugins import CONTROLLERS, register_plugin_temporarily
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.session import ConnectionSettings, open_session
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.programs.preflight import load_service_class
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.wire import keys
@@ -25,7 +25,7 @@ SCHEDULE: dict[str, Any] = {"guidance": {"decimation": 2}, "navigation": {"decim
 POSE = {"robot__sensors__pose": {"rate_hz": 10.0}}  # as the host's backend of the tests gives it
 
 
-class ObservationRecorder(Hold):
+class ObservationRecorder(HoldPose):
     """A controller that records its observations, and holds the joints unless a test sets another response."""
 
     observations: list[Observation]
@@ -40,12 +40,12 @@ class ObservationRecorder(Hold):
 class ServiceThread:
     """A service that runs in a thread."""
 
-    def __init__(self, name: str, config: RunConfig, link: Link) -> None:
+    def __init__(self, name: str, config: RunConfig, link: ConnectionSettings) -> None:
         self.stopped, self.error = threading.Event(), None
         self.thread = threading.Thread(target=self._run_service, args=(name, config, link), name=name)
         self.thread.start()
 
-    def _run_service(self, name: str, config: RunConfig, link: Link) -> None:
+    def _run_service(self, name: str, config: RunConfig, link: ConnectionSettings) -> None:
         with open_session(link) as session:
             try:
                 service_loop = ServiceLoop(load_service_class(config, name), config, session)
@@ -67,7 +67,7 @@ class RunningServices:
 
     run: RunningHost
     services: dict[str, ServiceThread]
-    states: Reader[ControlState]
+    states: SampleReader[ControlState]
     observations: list[Observation]  # what the controller was given so far
     reported: list[ControlState] = field(default_factory=list[ControlState])
 

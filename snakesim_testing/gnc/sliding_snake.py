@@ -14,7 +14,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_hal.model.route import Route, compute_yaw_segments_m, place_chain_on_route, sample_sine_curve
-from snakesim_hal.wire.messages import DepthImage, Imu, JointState, Obstacle, Pose
+from snakesim_hal.wire.messages import DepthImage, Imu, JointState, KnownObstacle, Pose
 from snakesim_testing.gnc.rendered import Ground, SensorErrors, flat_ground, make_box, make_cylinder, render_depth_image
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot
 from snakesim_testing.hal.small_robots import make_joint_state, make_pose
@@ -38,7 +38,7 @@ ROUTE = Route(sample_sine_curve(0.045, 0.6, 12.0))
 
 
 @dataclass(frozen=True)
-class BodyPose:
+class SnakePose:
     """Pose of the snake at one time: base, joint angles and links, without errors."""
 
     base_w: tuple[float, float, float]  # x, y, heading
@@ -53,7 +53,7 @@ class BodyPose:
 class SlidingSnake:
     """A snake that slides along the path at constant speed, and a guidance that gets its simulated measurements."""
 
-    obstacles: Sequence[Obstacle]
+    obstacles: Sequence[KnownObstacle]
     speed_m_s: float = 0.2
     ground: Ground = flat_ground
     eye: SensorErrors = field(default_factory=lambda: SensorErrors(NOISE.floor_m, NOISE.per_m2, 0.01))
@@ -70,7 +70,7 @@ class SlidingSnake:
         self.world = PerceivedWorld(self.robot, start, POSE_NOISE)
         self.delayed_images: list[tuple[int, DepthImage]] = []
 
-    def compute_pose(self, turn: int) -> BodyPose:
+    def compute_pose(self, turn: int) -> SnakePose:
         """Return the true pose of the snake in a guidance cycle."""
         lay = place_chain_on_route(
             ROUTE, 0.02 + self.speed_m_s * turn * STEP_NS * 1e-9, compute_yaw_segments_m(self.axes, self.lengths)
@@ -80,9 +80,11 @@ class SlidingSnake:
         origins, rotations = compute_link_frames(tail, rotation, lay.angles_rad, self.axes, self.lengths)
         headings = lay.heading_rad + np.concatenate([[0.0], np.cumsum(lay.angles_rad)])
         head = origins[-1] + self.lengths[-1] * rotations[-1][:, 0]
-        return BodyPose((*lay.tail_w, lay.heading_rad), lay.angles_rad, origins, rotations, headings, head)
+        return SnakePose((*lay.tail_w, lay.heading_rad), lay.angles_rad, origins, rotations, headings, head)
 
-    def run_cycles(self, count: int, *, pose: bool = True, images: bool = True, imu: bool = True) -> Iterator[BodyPose]:
+    def run_cycles(
+        self, count: int, *, pose: bool = True, images: bool = True, imu: bool = True
+    ) -> Iterator[SnakePose]:
         """Move the snake cycle by cycle, pass the measurements to guidance, and yield the true pose after each cycle.
 
         Calling this again continues from the last cycle.
@@ -110,7 +112,7 @@ class SlidingSnake:
             yield here
         self.turn += 1
 
-    def make_joint_state(self, here: BodyPose, before: BodyPose) -> JointState:
+    def make_joint_state(self, here: SnakePose, before: SnakePose) -> JointState:
         """Return the joint state with the noise of encoders."""
         angles = here.angles_rad + 0.0005 * self.random.standard_normal(len(here.angles_rad))
         speeds = (here.angles_rad - before.angles_rad) / (STEP_NS * 1e-9)
@@ -118,7 +120,7 @@ class SlidingSnake:
             self.robot, angles.tolist(), speeds.tolist(), tick=self.turn, timestamp_ns=self.turn * STEP_NS
         )
 
-    def make_imu(self, here: BodyPose, before: BodyPose) -> Imu:
+    def make_imu(self, here: SnakePose, before: SnakePose) -> Imu:
         """Return an IMU sample of every link, with noise."""
         rates = (here.headings_rad - before.headings_rad) / (STEP_NS * 1e-9)
         rates = rates + 0.005 * self.random.standard_normal(len(rates))
@@ -130,7 +132,7 @@ class SlidingSnake:
             acceleration_m_s2=[(0.0, 0.0, 9.81)] * len(rates),
         )
 
-    def make_pose(self, here: BodyPose, off_m: float = 0.0) -> Pose:
+    def make_pose(self, here: SnakePose, off_m: float = 0.0) -> Pose:
         """Return the pose with the noise of motion capture.
 
         Args:
@@ -145,7 +147,7 @@ class SlidingSnake:
             orientation_wxyz=quaternion_from_yaw(here.base_w[2] + float(turn)),
         )
 
-    def make_depth_image(self, here: BodyPose, timestamp_ns: int) -> DepthImage:
+    def make_depth_image(self, here: SnakePose, timestamp_ns: int) -> DepthImage:
         """Return the image of a depth camera at the front end of the head."""
         mount, link = (self.lengths[-1], 0.0, 0.0), len(self.lengths) - 1
         ahead = here.rotations[-1][:2, 0]
@@ -162,7 +164,7 @@ class SlidingSnake:
         )
 
 
-def make_random_obstacles(seed: int, count: int = 60) -> list[Obstacle]:
+def make_random_obstacles(seed: int, count: int = 60) -> list[KnownObstacle]:
     """Return random obstacles on both sides of the snake's path, which is a wave along x.
 
     About two thirds of them are cylinders, one third boxes. A strip around the path stays free of obstacles.
@@ -172,7 +174,7 @@ def make_random_obstacles(seed: int, count: int = 60) -> list[Obstacle]:
         count: Number of obstacles; fewer if there are no free places left.
     """
     rng = np.random.default_rng(seed)
-    obstacles: list[Obstacle] = []
+    obstacles: list[KnownObstacle] = []
     for _ in range(MAX_TRIES_PER_OBSTACLE * count):
         if len(obstacles) == count:
             break

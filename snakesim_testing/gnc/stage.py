@@ -15,7 +15,7 @@ from snakesim_hal.model.route import (
     place_chain_on_route,
     sample_sine_curve,
 )
-from snakesim_hal.wire.messages import Axis, Description, Obstacle, Trajectory, World, WorldContact
+from snakesim_hal.wire.messages import Axis, KnownObstacle, RobotDescription, Trajectory, WorldContact, WorldModel
 from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
 T = TypeVar("T")
@@ -36,7 +36,7 @@ def require_value(value: T | None) -> T:
     return value
 
 
-def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> Description:
+def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> RobotDescription:
     """A chain of modules of 0.11 m."""
     limits = {"speed_rad_s": 7.5, "acceleration_rad_s2": 400, "torque_nm": torque_nm, "torque_rate_nm_s": 200}
     gains = {"stiffness_nm_per_rad": 60, "damping_nm_s_per_rad": 1.5, "velocity_gain_nm_s_per_rad": 1.5}
@@ -48,7 +48,7 @@ def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: 
     )
 
 
-def make_world(**changes: Any) -> World:
+def make_world(**changes: Any) -> WorldModel:
     """A world model with a body at the origin and nothing around it, with whatever is to be different."""
     values: dict[str, Any] = {
         "tick": 0,
@@ -59,7 +59,7 @@ def make_world(**changes: Any) -> World:
         "contacts": [],
         "obstacles": [],
     }
-    return World(**(values | changes))
+    return WorldModel(**(values | changes))
 
 
 def make_contact(
@@ -82,27 +82,29 @@ def make_route(amplitude_m: float = AMPLITUDE_M, wavelength_m: float = WAVELENGT
     return Route(sample_sine_curve(amplitude_m, wavelength_m, LENGTH_M))
 
 
-def make_pegs(route: Route) -> list[Obstacle]:
+def make_pegs(route: Route) -> list[KnownObstacle]:
     """Pegs at the inflections, on the side from which they push forward."""
-    pegs: list[Obstacle] = []
+    pegs: list[KnownObstacle] = []
     for k, s in enumerate(route.find_inflections_s_m()):
         tangent = route.tangent_w(s)
         left = np.array([-tangent[1], tangent[0]])
         push = left if left[0] > 0 else -left
         x, y = (route.compute_positions_w(s) - push * (BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M)).tolist()
         pegs.append(
-            Obstacle(name=f"peg_{k}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_RADIUS_M, height_m=0.2)
+            KnownObstacle(
+                name=f"peg_{k}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_RADIUS_M, height_m=0.2
+            )
         )
     return pegs
 
 
 @dataclass
-class Stage:
+class ObservationStage:
     """Makes observations of a body that lies on the route, with whatever is to be different."""
 
-    robot: Description
+    robot: RobotDescription
     route: Route
-    pegs: list[Obstacle]
+    pegs: list[KnownObstacle]
     speed_m_s: float = 0.2
     path_id: int = 0
     assumed_obstacle_friction: float = 0.0  # that the path was planned with
@@ -161,13 +163,13 @@ class Stage:
         )
 
 
-def make_stage(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> Stage:
+def make_stage(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> ObservationStage:
     """A robot among pegs."""
     route = make_route()
-    return Stage(make_robot(modules, axes, torque_nm), route, make_pegs(route))
+    return ObservationStage(make_robot(modules, axes, torque_nm), route, make_pegs(route))
 
 
-def compute_body_points(stage: Stage, tail_s_m: float) -> np.ndarray:
+def compute_body_points(stage: ObservationStage, tail_s_m: float) -> np.ndarray:
     """Nodes (2, n_nodes) of the body on the route."""
     axes = [joint.axis for joint in stage.robot.joints]
     segments = compute_yaw_segments_m(axes, [link.length_m for link in stage.robot.links])

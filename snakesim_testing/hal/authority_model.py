@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from hypothesis.stateful import RuleBasedStateMachine
 
-from snakesim_hal.safety.authority import Authority, TickOutput
+from snakesim_hal.safety.authority import CommandAuthority, TickOutput
 from snakesim_hal.safety.fault_log import MAX_FAULTS
-from snakesim_hal.wire.messages import Answer, JointCommand, LifecycleState, Mode
+from snakesim_hal.wire.messages import Answer, JointCommand, JointMode, LifecycleState
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS
 
 JOINTS = 3
@@ -110,7 +110,7 @@ def compute_holding_velocity_rad_s(velocity_rad_s: float, torque_nm: float) -> f
     return velocity_rad_s + torque_nm / VELOCITY_GAIN_NM_S_PER_RAD
 
 
-class Health:
+class ModeledHealth:
     """The newest health report of one joint module, and the faults and the derating that follow from it."""
 
     def __init__(self) -> None:
@@ -135,7 +135,7 @@ class Health:
 class AuthorityModel(RuleBasedStateMachine):
     """A model that predicts every decision of an authority, for comparison with the real one."""
 
-    authority: Authority
+    authority: CommandAuthority
     action: str
     max_isolated: int
 
@@ -175,7 +175,7 @@ class AuthorityModel(RuleBasedStateMachine):
         self.last_plausible_angles: list[tuple[float, float] | None] = [None] * JOINTS  # angle and when it was taken
         self.implausible_angles: list[list[tuple[float, float]]] = [[] for _ in range(JOINTS)]
         self.unchanged_states: list[list[tuple[Any, float, float]]] = [[] for _ in range(JOINTS)]  # state, time, target
-        self.healths = [Health() for _ in range(JOINTS)]
+        self.healths = [ModeledHealth() for _ in range(JOINTS)]
         self.health_faults: set[tuple[str, int]] = set()  # at the last tick
         self.silent: set[int] = set()
         self.torque_fractions = [1.0] * JOINTS
@@ -197,8 +197,8 @@ class AuthorityModel(RuleBasedStateMachine):
             self.newest_command = None
         self.state = following
 
-    def mode_before(self, i: int) -> Mode:
-        return Mode.PASSIVE if self.last_output is None else self.last_output.setpoints.mode[i]
+    def mode_before(self, i: int) -> JointMode:
+        return JointMode.PASSIVE if self.last_output is None else self.last_output.setpoints.mode[i]
 
     def target_before(self, i: int) -> float:
         return 0.0 if self.last_output is None else self.last_output.setpoints.target[i]
@@ -207,7 +207,7 @@ class AuthorityModel(RuleBasedStateMachine):
         """Return angle, velocity and position target from which joint i brakes when the robot stops being armed."""
         angle, velocity, torque = (column[i] for column in self.measured)
         target = compute_holding_position_rad(angle, velocity, torque)
-        if self.mode_before(i) is Mode.POSITION:
+        if self.mode_before(i) is JointMode.POSITION:
             target = self.target_before(i)
         near_angle = clamp(target, angle - MAX_STEP_RAD, angle + MAX_STEP_RAD)
         target = clamp(near_angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
@@ -256,7 +256,7 @@ class AuthorityModel(RuleBasedStateMachine):
         return len(strays) >= 5 and self.state != "armed"
 
     def is_frozen(self, i: int, state_: Any, taken_s: float) -> bool:
-        if self.state != "armed" or self.mode_before(i) is not Mode.POSITION:
+        if self.state != "armed" or self.mode_before(i) is not JointMode.POSITION:
             self.unchanged_states[i] = []
             return False
         if self.unchanged_states[i] and self.unchanged_states[i][-1][0] != state_:
@@ -315,7 +315,7 @@ class AuthorityModel(RuleBasedStateMachine):
         assert len(self.isolated) <= self.max_isolated
         assert self.authority.isolated_joints == [f"joint_{i + 1}" for i in sorted(self.isolated)]
         for i in self.isolated:
-            assert points.mode[i] == Mode.PASSIVE
+            assert points.mode[i] == JointMode.PASSIVE
             assert points.target[i] == 0.0
             assert points.torque_limit_nm[i] == 0.0
 
@@ -332,17 +332,17 @@ class AuthorityModel(RuleBasedStateMachine):
         action = self.action if self.state == "fault" and self.braking_states is not None else "passive"
         assert self.select_connected(decision.setpoints.torque_limit_nm) == self.torques()
         if action == "hold":
-            assert set(self.select_connected(decision.setpoints.mode)) <= {Mode.POSITION}
+            assert set(self.select_connected(decision.setpoints.mode)) <= {JointMode.POSITION}
             held = [self.brake_for_a_period(i) for i in range(JOINTS)]
             assert self.select_connected(decision.setpoints.target) == pytest.approx(self.select_connected(held))
             assert all(abs(target) <= ANGLE_LIMIT_RAD for target in decision.setpoints.target)
             return
-        mode = Mode.VELOCITY if action == "damp" else Mode.PASSIVE
+        mode = JointMode.VELOCITY if action == "damp" else JointMode.PASSIVE
         assert set(self.select_connected(decision.setpoints.mode)) <= {mode}
         assert decision.setpoints.target == [0.0] * JOINTS
 
     def check_held(self, decision: TickOutput, angle_rad: list[float]) -> None:
-        assert set(self.select_connected(decision.setpoints.mode)) <= {Mode.POSITION}
+        assert set(self.select_connected(decision.setpoints.mode)) <= {JointMode.POSITION}
         assert not decision.limit_by_joint
         held = [clamp(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in angle_rad]
         assert self.select_connected(decision.setpoints.target) == self.select_connected(held)
@@ -359,7 +359,7 @@ class AuthorityModel(RuleBasedStateMachine):
             sent: The active command.
         """
         for i in self.isolated:
-            assert decision.limit_by_joint.get(i) == (None if sent.mode[i] is Mode.PASSIVE else "isolated")
+            assert decision.limit_by_joint.get(i) == (None if sent.mode[i] is JointMode.PASSIVE else "isolated")
         assert self.select_connected(decision.setpoints.mode) == self.select_connected(sent.mode)
         for i in self.select_connected(ALL):
             applied_nm = decision.setpoints.torque_limit_nm[i]
@@ -368,14 +368,14 @@ class AuthorityModel(RuleBasedStateMachine):
             derated_nm = TORQUE_LIMIT_NM * self.torque_fractions[i] + TINY
             assert 0.0 <= applied_nm <= min(derated_nm, commanded_nm)
             assert applied_nm <= previous_nm + TORQUE_RATE_LIMIT_NM_S * PERIOD_S + TINY
-            if sent.mode[i] is not Mode.PASSIVE:
+            if sent.mode[i] is not JointMode.PASSIVE:
                 is_derated = min(TORQUE_LIMIT_NM, commanded_nm) > derated_nm
                 self.check_target(i, decision, sent.mode[i], sent.target[i], is_derated=is_derated)
             else:
                 assert decision.setpoints.target[i] == 0.0
                 assert i not in decision.limit_by_joint
 
-    def check_target(self, i: int, decision: TickOutput, mode: Mode, wanted: float, *, is_derated: bool) -> None:
+    def check_target(self, i: int, decision: TickOutput, mode: JointMode, wanted: float, *, is_derated: bool) -> None:
         """Check the target that the authority applied to one joint.
 
         It must be inside the limits, change no faster than allowed, and be as near to the command as both permit. A
@@ -392,12 +392,12 @@ class AuthorityModel(RuleBasedStateMachine):
         target = decision.setpoints.target[i]
         # `previous` is the target before: in a new mode it is the one with which the torque does not jump.
         match mode:
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 low = clamp(angle - MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
                 high = clamp(angle + MAX_STEP_RAD, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
                 max_change = SPEED_LIMIT_RAD_S * PERIOD_S
                 previous = compute_holding_position_rad(angle, velocity, torque)
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 low = max(-SPEED_LIMIT_RAD_S, -compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle))
                 high = min(SPEED_LIMIT_RAD_S, compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle))
                 max_change = ACCELERATION_LIMIT_RAD_S2 * PERIOD_S

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from snakesim_hal.safety.authority import Authority, TickOutput
+from snakesim_hal.safety.authority import CommandAuthority, TickOutput
 from snakesim_hal.safety.cables import CableTracker
-from snakesim_hal.wire.messages import Answer, EstopRequest, LeaseRequest, LifecycleRequest, Mode
+from snakesim_hal.wire.messages import Answer, EstopRequest, JointMode, LeaseRequest, LifecycleRequest
 from snakesim_testing.hal.small_robots import (
     PERIOD_NS,
     make_description,
@@ -25,7 +25,7 @@ class AuthorityRig:
 
     def __init__(self, *, unchecked: str = "", cables: CableTracker | None = None, **robot: Any) -> None:
         self.robot = make_description(**robot)
-        self.authority = Authority(self.robot, unchecked_reason=unchecked, cables=cables)
+        self.authority = CommandAuthority(self.robot, unchecked_reason=unchecked, cables=cables)
         self.now_ns = 0
         self.tick = 0
         self.sequence = 0
@@ -41,7 +41,7 @@ class AuthorityRig:
             LeaseRequest(action="acquire", holder=holder, priority=priority), self.now_ns
         )
 
-    def send(self, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> str | None:
+    def send(self, target: Any = 0.0, mode: Any = JointMode.POSITION, **other: Any) -> str | None:
         self.sequence += 1
         authority = self.authority
         values = {
@@ -69,7 +69,7 @@ class AuthorityRig:
         return self.pass_tick()
 
 
-def make_commanded_rig(target: Any = 0.1, mode: Any = Mode.POSITION, **robot: Any) -> AuthorityRig:
+def make_commanded_rig(target: Any = 0.1, mode: Any = JointMode.POSITION, **robot: Any) -> AuthorityRig:
     """Not armed yet: its joints are at 0.1 rad, and a holder of the lease commands it."""
     rig = AuthorityRig(**robot)
     rig.observe(0.1)
@@ -84,7 +84,7 @@ def make_armed_rig(**robot: Any) -> AuthorityRig:
     return rig
 
 
-def list_modes(decision: TickOutput) -> set[Mode]:
+def list_modes(decision: TickOutput) -> set[JointMode]:
     return set(decision.setpoints.mode)
 
 

@@ -8,7 +8,7 @@ from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.messages import CustomSample
 
 
-class Skin(CustomSample, frozen=True, kw_only=True):
+class SkinSample(CustomSample, frozen=True, kw_only=True):
     """One of each kind of field."""
 
     pressed_n: Annotated[list[q.Force | None], Meta(max_length=3)]

@@ -17,23 +17,23 @@ from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
-from snakesim_hal.network.client import Client, Commander
-from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.client import Commander, HostClient
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import (
     Answer,
     Clock,
-    Description,
     Fault,
+    JointMode,
     JointState,
     LifecycleRequest,
     LifecycleState,
     Message,
-    Mode,
+    RobotDescription,
+    RobotStatus,
     SensorDescription,
-    Status,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.hal.small_robots import make_pose
@@ -54,7 +54,7 @@ def fast_thread_switching(every_s: float = 0.0005) -> Iterator[None]:
         sys.setswitchinterval(before_s)
 
 
-def wait_for_messages(reader: Reader[MessageT], what: str, count: int = 1) -> list[MessageT]:
+def wait_for_messages(reader: SampleReader[MessageT], what: str, count: int = 1) -> list[MessageT]:
     """What a reader has got, as soon as it is so many."""
     found: list[MessageT] = []
     wait_until(lambda: found.extend(reader.drain()) or len(found) >= count, what)
@@ -66,14 +66,14 @@ def connected_sessions(*namespaces: str | None) -> Iterator[list[Session]]:
     """Sessions on a network of their own; the first one listens."""
     with ExitStack() as stack:
         endpoint = find_free_endpoint()
-        links = [Link(endpoint, name, listen=not i) for i, name in enumerate(namespaces)]
+        links = [ConnectionSettings(endpoint, name, listen=not i) for i, name in enumerate(namespaces)]
         yield [stack.enter_context(open_session(each)) for each in links]
 
 
 class LagBackend(Backend):
     """Joints that follow their setpoints with a first-order lag. Neither mass nor contacts."""
 
-    class Settings(msgspec.Struct):
+    class FollowerSettings(msgspec.Struct):
         """None."""
 
     def __init__(self, config: RunConfig, settings: Any = None) -> None:
@@ -81,7 +81,7 @@ class LagBackend(Backend):
         count = config.robot.chain.modules
         self._period_s = config.period_ns * 1e-9
         self.angles = [0.0] * count
-        self._points = SafeSetpoints([Mode.PASSIVE] * count, [0.0] * count, [0.0] * count)
+        self._points = SafeSetpoints([JointMode.PASSIVE] * count, [0.0] * count, [0.0] * count)
         self.enacted: list[SafeSetpoints] = []
         self.advanced = 0
         self.fails_in: str | None = None  # sample, enact, advance or faults
@@ -89,7 +89,7 @@ class LagBackend(Backend):
         self.read_s = 0.0  # what a sample takes
         self.next_faults: list[Fault] = []
 
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         """From the robot file, and the pose."""
         described = msgspec.structs.replace(describe_run_robot(self._config, "lag"), simulated_time=True)
         if any(sensor.key == keys.POSE for sensor in described.sensors):
@@ -126,9 +126,9 @@ class LagBackend(Backend):
         self._fail("advance")
         self.advanced += 1
         for i, (mode, target) in enumerate(zip(self._points.mode, self._points.target, strict=True)):
-            if mode == Mode.POSITION:
+            if mode == JointMode.POSITION:
                 self.angles[i] += 0.5 * (target - self.angles[i])
-            elif mode == Mode.VELOCITY:
+            elif mode == JointMode.VELOCITY:
                 self.angles[i] += target * self._period_s
 
     def faults(self) -> list[Fault]:
@@ -146,7 +146,7 @@ class LagBackend(Backend):
 
 
 @dataclass
-class Follower:
+class SineFollower:
     """A control service: holds the lease and has every joint follow a sine of the robot's time."""
 
     amplitude_rad: float = 0.2
@@ -156,10 +156,10 @@ class Follower:
     stopped: threading.Event = field(default_factory=threading.Event)
     silent: threading.Event = field(default_factory=threading.Event)  # receives everything, sends nothing
 
-    def run(self, link: Link) -> None:
+    def run(self, link: ConnectionSettings) -> None:
         """Until stopped."""
         with open_session(link) as session:
-            client = Client(session, self.name)
+            client = HostClient(session, self.name)
             robot = client.wait_for_description()
             joints = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
@@ -172,7 +172,7 @@ class Follower:
                 self._act(clock, client, commander, client.read(joints), robot)
 
     def _act(
-        self, clock: Clock, client: Client, commander: Commander, joints: JointState | None, robot: Description
+        self, clock: Clock, client: HostClient, commander: Commander, joints: JointState | None, robot: RobotDescription
     ) -> None:
         self.ticks_seen.append(clock.tick)
         if joints is not None and commander.ensure_lease(clock):
@@ -191,20 +191,20 @@ class RunningHost:
 
     host: Host
     backend: LagBackend
-    link: Link  # for clients
+    link: ConnectionSettings  # for clients
     session: Session  # of a client that watches
     thread: threading.Thread
-    _statuses: Reader[Status]
-    _status: Status | None = None
+    _statuses: SampleReader[RobotStatus]
+    _status: RobotStatus | None = None
 
     @property
-    def status(self) -> Status:
+    def status(self) -> RobotStatus:
         """The newest that was published."""
         wait_until(lambda: self._refresh() is not None, "a status")
         assert self._status is not None
         return self._status
 
-    def _refresh(self) -> Status | None:
+    def _refresh(self) -> RobotStatus | None:
         found = self._statuses.drain()
         self._status = found[-1] if found else self._status
         return self._status
@@ -236,12 +236,12 @@ class RunningHost:
 def running_host(config: RunConfig, **host: Any) -> Iterator[RunningHost]:
     """A host of a `LagBackend`, and a client that watches it. The host is stopped at the end."""
     endpoint, backend = find_free_endpoint(), LagBackend(config)
-    link = Link(endpoint, "lab/worm")
-    with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
+    link = ConnectionSettings(endpoint, "lab/worm")
+    with open_session(ConnectionSettings(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
         faulty, faults = create_host_faults(config, GuardedBackend(backend), own)
         made = Host(config, faulty, own, HostOptions(faults=faults, **host))
         thread = threading.Thread(target=made.run, name="host")
-        statuses = watcher.declare_latched_reader(keys.STATUS, Status)
+        statuses = watcher.declare_latched_reader(keys.STATUS, RobotStatus)
         thread.start()
         try:
             yield RunningHost(made, backend, link, watcher, thread, statuses)
@@ -252,16 +252,18 @@ def running_host(config: RunConfig, **host: Any) -> Iterator[RunningHost]:
 
 
 @contextmanager
-def running_commanded_host(config: RunConfig, ticks: int = 5, **host: Any) -> Iterator[tuple[RunningHost, Follower]]:
+def running_commanded_host(
+    config: RunConfig, ticks: int = 5, **host: Any
+) -> Iterator[tuple[RunningHost, SineFollower]]:
     """A host that is armed, and a follower that has commanded it for more ticks than that."""
-    with running_host(config, **host) as run, running_follower(run.link, Follower()) as control:
+    with running_host(config, **host) as run, running_follower(run.link, SineFollower()) as control:
         run.arm()
         wait_until(lambda: len(control.armed_ticks) > ticks, "commands")
         yield run, control
 
 
 @contextmanager
-def running_follower(link: Link, follower: Follower) -> Iterator[Follower]:
+def running_follower(link: ConnectionSettings, follower: SineFollower) -> Iterator[SineFollower]:
     """A follower in a thread of its own."""
     thread = threading.Thread(target=follower.run, args=(link,), name=follower.name)
     thread.start()

@@ -9,7 +9,17 @@ import msgspec
 
 from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Clock, Contact, Description, JointCommand, JointState, Mode, Pose, Power, Status
+from snakesim_hal.wire.messages import (
+    Clock,
+    Contact,
+    JointCommand,
+    JointMode,
+    JointState,
+    Pose,
+    Power,
+    RobotDescription,
+    RobotStatus,
+)
 
 PERIOD_NS = 10_000_000
 LEASE_NS = 50_000_000
@@ -105,14 +115,14 @@ def make_run_config(**dotted: Any) -> RunConfig:
     return msgspec.convert(with_changes(RUN, **dotted), RunConfig)
 
 
-def make_description(*, simulated_time: bool = False, **dotted: Any) -> Description:
+def make_description(*, simulated_time: bool = False, **dotted: Any) -> RobotDescription:
     """Return the description of the test robot, as a host publishes it, with changes."""
     reported = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
     return describe_robot(make_robot_file(**dotted), simulated_time=simulated_time, **reported)
 
 
 def make_joint_state(
-    robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any
+    robot: RobotDescription, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any
 ) -> JointState:
     """Return a joint state of a robot. A single number is the value of every joint."""
     count = len(robot.joints)
@@ -124,7 +134,9 @@ def make_joint_state(
     return JointState(angle_rad=column(angle), velocity_rad_s=column(velocity), torque_nm=column(torque), **values)
 
 
-def make_joint_command(robot: Description, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> JointCommand:
+def make_joint_command(
+    robot: RobotDescription, target: Any = 0.0, mode: Any = JointMode.POSITION, **other: Any
+) -> JointCommand:
     """Return a joint command, valid unless changed. A single target or mode is that of every joint."""
     count = len(robot.joints)
     values: dict[str, Any] = {
@@ -192,7 +204,7 @@ def write_scenario_files(
     return str(folder / "crawl.toml")
 
 
-def make_status(**reported: Any) -> Status:
+def make_status(**reported: Any) -> RobotStatus:
     """Return a status as the host of the robot `worm` publishes it, armed and without faults.
 
     Args:
@@ -219,4 +231,4 @@ def make_status(**reported: Any) -> Status:
         "waiting_for": [],
         "ready_to_arm": False,
     }
-    return Status(**{**values, **reported})
+    return RobotStatus(**{**values, **reported})

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 from snakesim_sim_backend.backend import SimBackend
 
 DEEDS = {
@@ -24,7 +24,7 @@ DEEDS = {
 }
 
 
-class Controller(Hold):
+class Controller(HoldPose):
     calls = 0
 
     def update(self, observation):

@@ -97,7 +97,7 @@ def run_to_end(
 
 
 @dataclass(frozen=True)
-class Running:
+class RunningCommand:
     """A `snakesim run` in the background."""
 
     process: subprocess.Popen[bytes]
@@ -172,7 +172,7 @@ def running_snakesim(
     endpoint: str | None = "free",
     extra_env: Mapping[str, str] | None = None,
     command_prefix: Sequence[str] = (),
-) -> Iterator[Running]:
+) -> Iterator[RunningCommand]:
     """Run `snakesim run` in the background, and kill all of its processes that are left at the end.
 
     Args:
@@ -194,7 +194,7 @@ def running_snakesim(
             stderr=subprocess.STDOUT,
         )
     try:
-        yield Running(process, output_path, asked, extra_env, command_prefix)
+        yield RunningCommand(process, output_path, asked, extra_env, command_prefix)
     finally:
         for pid, _ in find_processes_of_run(output_path):
             with contextlib.suppress(ProcessLookupError):

@@ -31,7 +31,7 @@ CAMERA = {
 STOP = "EMERGENCY STOP  (Esc)"
 
 
-class Page:
+class ViewerPage:
     """One viewer. A context manager."""
 
     def __init__(self, address: str, origin: str | None = None, *, draws: bool = True) -> None:
@@ -55,7 +55,7 @@ class Page:
         if draws:
             self.say(CAMERA)
 
-    def __enter__(self) -> "Page":
+    def __enter__(self) -> "ViewerPage":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -128,7 +128,7 @@ def ask(address: str, method: str, path: str = "/stop", **headers: str) -> tuple
 def flood(address: str, message: Any, seconds: float) -> int:
     """Send one message over and over; how often it went."""
     sent, end_s = 0, time.monotonic() + seconds
-    with Page(address) as page:
+    with ViewerPage(address) as page:
         while time.monotonic() < end_s:
             page.say(message)
             sent += 1

@@ -19,7 +19,7 @@ NET = "10.78.0"
 HURRIED = ("chrt", "--fifo", str(SERVICE_PRIORITY))
 
 
-class Machine:
+class NamespaceMachine:
     """One network namespace."""
 
     def __init__(self, stack: ExitStack, name: str = "a machine") -> None:
@@ -118,7 +118,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait(10)
 
 
-def connect_machines(names: Sequence[str], stack: ExitStack) -> dict[str, Machine]:
+def connect_machines(names: Sequence[str], stack: ExitStack) -> dict[str, NamespaceMachine]:
     """Create machines, and connect each by a cable to the first one, which is the only one that they reach.
 
     Args:
@@ -128,7 +128,7 @@ def connect_machines(names: Sequence[str], stack: ExitStack) -> dict[str, Machin
     Returns:
         The machines by name.
     """
-    machines = {name: Machine(stack, name) for name in names}
+    machines = {name: NamespaceMachine(stack, name) for name in names}
     middle = machines[names[0]]
     middle.set_address("lo", f"{NET}.1/32")
     for number, name in enumerate(names[1:], 2):
@@ -141,7 +141,7 @@ def connect_machines(names: Sequence[str], stack: ExitStack) -> dict[str, Machin
     return machines
 
 
-def connect_by_cable(a: Machine, b: Machine, name: str, net: str) -> None:
+def connect_by_cable(a: NamespaceMachine, b: NamespaceMachine, name: str, net: str) -> None:
     """Connect two machines by a cable, with the addresses `net`.1 and `net`.2."""
     a.run("ip", "link", "add", name, "type", "veth", "peer", "name", name, "netns", b.pid)
     a.set_address(name, f"{net}.1/24")
@@ -163,7 +163,7 @@ class RadioLink:
 
 
 @contextmanager
-def connect_by_radio(a: Machine, b: Machine, name: str, net: str) -> Iterator[RadioLink]:
+def connect_by_radio(a: NamespaceMachine, b: NamespaceMachine, name: str, net: str) -> Iterator[RadioLink]:
     """Connect two machines by a radio link, with the addresses `net`.1 and `net`.2, within the context."""
     command = [sys.executable, "-m", "verification.links.relay", a.pid, b.pid, name]
     relay = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -21,8 +21,8 @@ from snakesim_hal.base.process import set_parent_death_signal
 from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.wire.roles import Role
 from snakesim_operator.features.lab.certificates import write_certificates
-from snakesim_operator.features.lab.identities import Identity, iterate_identities
-from snakesim_operator.features.lab.lab_file import Lab, load_lab
+from snakesim_operator.features.lab.identities import CertificateIdentity, iterate_identities
+from snakesim_operator.features.lab.lab_file import LabPlan, load_lab
 from snakesim_operator.features.lab.render import write_lab_files
 from snakesim_operator.features.lab.zenoh_files import make_session_settings
 from snakesim_testing.harness.wait import wait_until
@@ -75,19 +75,19 @@ def _format_role_section(role: str, machine: str, robot: str) -> str:
 class RunningLab:
     """A lab whose router is running, with the paths of its files."""
 
-    lab: Lab  # content of the lab file
+    lab: LabPlan  # content of the lab file
     folder: Path  # has a folder for each machine, with its certificates
     log: Path  # output of the router
 
-    def find_identity_by_name(self, common_name: str) -> Identity:
+    def find_identity_by_name(self, common_name: str) -> CertificateIdentity:
         """Return the identity whose certificate has this common name."""
         return next(identity for identity in iterate_identities(self.lab) if identity.common_name == common_name)
 
-    def find_identity_by_role(self, role: Role, robot: str) -> Identity:
+    def find_identity_by_role(self, role: Role, robot: str) -> CertificateIdentity:
         """Return the first identity that has a role for a robot."""
         return next(found for found in iterate_identities(self.lab) if found.role == role and found.subject == robot)
 
-    def make_session_settings(self, identity: Identity, **more: Any) -> dict[str, Any]:
+    def make_session_settings(self, identity: CertificateIdentity, **more: Any) -> dict[str, Any]:
         """Return the Zenoh configuration of a session with the certificate of an identity.
 
         The session has no namespace, so that a test can use the full key of any robot.
@@ -103,7 +103,7 @@ class RunningLab:
         settings["connect"]["timeout_ms"] = CONNECT_TIMEOUT_MS
         return {**settings, **more}
 
-    def open_session(self, identity: Identity, **more: Any) -> zenoh.Session:
+    def open_session(self, identity: CertificateIdentity, **more: Any) -> zenoh.Session:
         """Open a plain Zenoh session with the certificate of an identity. Raises ZError if no router accepts it."""
         return open_zenoh_session(self.make_session_settings(identity, **more))
 

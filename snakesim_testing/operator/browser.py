@@ -36,7 +36,7 @@ WINDOW = {"url": "about:blank", "newWindow": True}
 START_S, ANSWER_S = 60.0, 60.0
 
 
-class Tab:
+class BrowserTab:
     """One page."""
 
     def __init__(self, socket: ClientConnection) -> None:
@@ -134,14 +134,14 @@ class Tab:
         return base64.b64decode(self.send("Page.captureScreenshot", format="png", **more)["data"])
 
 
-class Browser:
+class ChromiumBrowser:
     """A running Chromium."""
 
     def __init__(self, port: int) -> None:
         self._port = port
         self._sockets: list[ClientConnection] = []
 
-    def open(self, address: str, width: int = 1440, height: int = 900, scale: float = 1.0) -> Tab:
+    def open(self, address: str, width: int = 1440, height: int = 900, scale: float = 1.0) -> BrowserTab:
         """A new page; each is a viewer of its own."""
         root = f"127.0.0.1:{self._port}/"
         with urllib.request.urlopen(f"http://{root}json/version", timeout=ANSWER_S) as answer:
@@ -149,7 +149,7 @@ class Browser:
         whole.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": WINDOW}))
         made = json.loads(whole.recv(timeout=ANSWER_S))["result"]["targetId"]
         socket = self._connect(f"ws://{root}devtools/page/{made}")
-        tab = Tab(socket)
+        tab = BrowserTab(socket)
         tab.size(width, height, scale=scale)
         tab.send("Page.navigate", url=address)
         return tab
@@ -166,7 +166,7 @@ class Browser:
 
 
 @contextmanager
-def open_chromium(*, with_webgl: bool = True) -> Iterator[Browser]:
+def open_chromium(*, with_webgl: bool = True) -> Iterator[ChromiumBrowser]:
     """Start a Chromium browser with a profile of its own, and end it with the context.
 
     Args:
@@ -185,7 +185,7 @@ def open_chromium(*, with_webgl: bool = True) -> Iterator[Browser]:
             while not port_file.is_file() or not port_file.read_text().strip():
                 assert process.poll() is None and time.monotonic() < deadline, "chromium did not start"
                 time.sleep(0.05)
-            browser = Browser(int(port_file.read_text().split()[0]))
+            browser = ChromiumBrowser(int(port_file.read_text().split()[0]))
             try:
                 yield browser
             finally:

@@ -17,7 +17,7 @@ from snakesim_operator.run.in_process import simulate
 
 
 @dataclass(frozen=True)
-class Span:
+class RecordSpan:
     """A record of the file."""
 
     opcode: int
@@ -25,17 +25,17 @@ class Span:
     end: int
 
 
-def spans(content: bytes | bytearray, magic: int = 8) -> list[Span]:
+def spans(content: bytes | bytearray, magic: int = 8) -> list[RecordSpan]:
     """All records of a whole file; or of a chunk, which has no magic bytes around them."""
-    found, at = list[Span](), magic
+    found, at = list[RecordSpan](), magic
     while at < len(content) - magic:
         opcode, length = RECORD_HEADER.unpack_from(content, at)
-        found.append(Span(opcode, at, at + RECORD_HEADER.size + length))
+        found.append(RecordSpan(opcode, at, at + RECORD_HEADER.size + length))
         at = found[-1].end
     return found
 
 
-def chunks(content: bytes) -> list[Span]:
+def chunks(content: bytes) -> list[RecordSpan]:
     """The chunks of a whole file, without their indices."""
     return [span for span in spans(content) if span.opcode == Opcode.CHUNK]
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from snakesim_hal.wire.messages import ControlState, JointState, Obstacle, World, WorldContact
+from snakesim_hal.wire.messages import ControlState, JointState, KnownObstacle, WorldContact, WorldModel
 from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
 ROBOT = make_description()
@@ -31,8 +31,8 @@ def pushing(points: list[WorldContact], desired_force_n: list[float], **more: An
     )  # fmt: skip
 
 
-def world(contacts: list[WorldContact], obstacles: list[Obstacle]) -> World:
-    return World(
+def world(contacts: list[WorldContact], obstacles: list[KnownObstacle]) -> WorldModel:
+    return WorldModel(
         tick=1, timestamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
         base_confidence=1.0, contacts=contacts, obstacles=obstacles,
     )  # fmt: skip

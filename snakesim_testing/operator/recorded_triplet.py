@@ -72,7 +72,7 @@ def finished(ticks: int) -> HostRecord:
     )
 
 
-class Reader(HTMLParser):
+class ReportReader(HTMLParser):
     """Collects what the tests ask for, and refuses tags that do not match."""
 
     def __init__(self, page: str) -> None:
@@ -123,9 +123,9 @@ class Reader(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
-def read(record: RunRecord, ended: str = "complete") -> Reader:
+def read(record: RunRecord, ended: str = "complete") -> ReportReader:
     page = report_page(record, summarize_run(record, ended))
-    reader = Reader(page)
+    reader = ReportReader(page)
     assert [i for i in reader.ids if i in SECTIONS] == SECTIONS
     assert len(page.encode()) < 3_000_000
     assert not [a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])]

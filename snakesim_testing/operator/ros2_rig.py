@@ -4,7 +4,7 @@ import msgspec
 
 from snakesim_hal.model.files import read_table_with_base
 from snakesim_hal.model.robot import RobotFile, describe_robot
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 
 SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, else as other programs for ROS 2 have them
     "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
@@ -17,7 +17,7 @@ SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, els
 }
 
 
-def of_robot(name: str) -> Description:
+def of_robot(name: str) -> RobotDescription:
     """Description of a shipped robot."""
     file = msgspec.convert(read_table_with_base(name, "robots").values, RobotFile)
     return describe_robot(file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16)

@@ -32,7 +32,7 @@ ASKED = "LocalStorageGetItemRequestMessage"
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 
-class Viewer:
+class ConsoleViewer:
     """One page."""
 
     def __init__(self, socket: ClientConnection) -> None:
@@ -126,7 +126,7 @@ def viewing(address: str) -> connect:
 async def watch(address: str) -> None:
     """Look on until the console ends."""
     async with viewing(address) as socket:
-        viewer = Viewer(socket)
+        viewer = ConsoleViewer(socket)
         await viewer.come()
         await viewer.watch()
 

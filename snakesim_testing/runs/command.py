@@ -13,7 +13,7 @@ from snakesim_testing.harness.command import (
     SNAKESIM_COMMAND,
     TIMEOUT_S,
     CompletedRun,
-    Running,
+    RunningCommand,
     make_environment,
     run_to_end,
     running_snakesim,
@@ -28,7 +28,7 @@ __all__ = [
     "TIMEOUT_S",
     "TOO_SLOW",
     "CompletedRun",
-    "Running",
+    "RunningCommand",
     "make_environment",
     "read_summary",
     "run_in_background",
@@ -62,7 +62,7 @@ def run_in_background(
 
 
 @contextmanager
-def running_armed_snakesim(out: Path, *arguments: str) -> Iterator[Running]:
+def running_armed_snakesim(out: Path, *arguments: str) -> Iterator[RunningCommand]:
     """Run `snakesim run` in the background, and yield it once it is armed. Fails if it leaves a process behind."""
     with running_snakesim(out, *arguments) as run:
         run.wait_for(" s  ")

@@ -53,7 +53,7 @@ def leave_out(folder: str, names: list[str]) -> set[str]:
 
 
 @dataclass
-class Section:
+class DocumentSection:
     """A heading, and what is to be typed below it."""
 
     title: str
@@ -66,13 +66,13 @@ class Section:
         return any(info.startswith("sh") for info, _ in self.blocks)
 
 
-def parse_sections(path: Path) -> list[Section]:
+def parse_sections(path: Path) -> list[DocumentSection]:
     """Return the sections of a Markdown document that have code blocks.
 
     A block whose info line names a file, such as "python my.py", is also one of the section's files. Each section has
     the files of the sections before it, too.
     """
-    sections = [Section("")]
+    sections = [DocumentSection("")]
     block_lines: list[str] | None = None  # of the open code block; None: outside of blocks
     info = ""
     for line in path.read_text(encoding="utf-8").splitlines():
@@ -80,7 +80,7 @@ def parse_sections(path: Path) -> list[Section]:
         if block_lines is None:
             heading = re.match(r"#+ (.*)", line)
             if heading:
-                sections.append(Section(heading[1], files=dict(sections[-1].files)))
+                sections.append(DocumentSection(heading[1], files=dict(sections[-1].files)))
             elif is_fence:
                 block_lines = []
                 info = line.removeprefix("```").strip()
@@ -96,7 +96,7 @@ def parse_sections(path: Path) -> list[Section]:
     return [section for section in sections if section.blocks]
 
 
-def make_bash_script(section: Section) -> str:
+def make_bash_script(section: DocumentSection) -> str:
     """All commands of a section, for bash."""
     parts = [PROLOGUE]
     for number, (info, content) in enumerate(section.blocks):

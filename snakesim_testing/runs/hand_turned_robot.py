@@ -21,7 +21,7 @@ HELD = '''
 import json
 from pathlib import Path
 
-from snakesim_drivers.mounting import Mounting
+from snakesim_drivers.mounting import DriveMounting
 
 
 class Held(Workbench):
@@ -29,7 +29,7 @@ class Held(Workbench):
 
     def sample(self, tick, timestamp_ns):
         drives = np.array(json.loads(Path("drives.json").read_text()))
-        self.angle = Mounting(self.robot.joint_table).to_joint_angle_rad(drives)
+        self.angle = DriveMounting(self.robot.joint_table).to_joint_angle_rad(drives)
         return super().sample(tick, timestamp_ns)
 '''
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from snakesim_operator.cli import main
 from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from snakesim_operator.results.summary import RunSummary
-from snakesim_testing.runs.command import CompletedRun, Running, read_summary
+from snakesim_testing.runs.command import CompletedRun, RunningCommand, read_summary
 
 
 def snakesim(*arguments: str, cwd: Path) -> CompletedRun:
@@ -21,7 +21,7 @@ def snakesim(*arguments: str, cwd: Path) -> CompletedRun:
     return CompletedRun(code, out.getvalue(), err.getvalue())
 
 
-def tell(run: Running, *arguments: str) -> CompletedRun:
+def tell(run: RunningCommand, *arguments: str) -> CompletedRun:
     """The same, with the endpoint of a run."""
     return snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.home)
 

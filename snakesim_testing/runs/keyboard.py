@@ -10,15 +10,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import SNAKESIM_COMMAND, Running, make_environment
+from snakesim_testing.runs.command import SNAKESIM_COMMAND, RunningCommand, make_environment
 
 UP, LEFT = b"\x1b[A", b"\x1b[D"
 
 
-class Terminal:
+class TeleopTerminal:
     """A pseudo-terminal with teleop in it."""
 
-    def __init__(self, run: Running, cwd: Path) -> None:
+    def __init__(self, run: RunningCommand, cwd: Path) -> None:
         self.ours, self._theirs = pty.openpty()
         self.before = termios.tcgetattr(self._theirs)
         self._printed = b""
@@ -55,8 +55,8 @@ class Terminal:
 
 
 @contextlib.contextmanager
-def at_the_keyboard(run: Running, cwd: Path) -> Iterator[Terminal]:
-    terminal = Terminal(run, cwd)
+def at_the_keyboard(run: RunningCommand, cwd: Path) -> Iterator[TeleopTerminal]:
+    terminal = TeleopTerminal(run, cwd)
     try:
         terminal.shows("SPACE: EMERGENCY STOP")
         yield terminal

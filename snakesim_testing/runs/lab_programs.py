@@ -13,7 +13,7 @@ from snakesim_testing.runs.command import SNAKESIM_COMMAND, CompletedRun, make_e
 SCENARIO = ("triplet", "--duration", "1")
 
 
-class Lab:
+class LabPrograms:
     """Programs that share a router, and a session file each."""
 
     def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:

@@ -18,7 +18,7 @@ from snakesim_operator.run.in_process import simulate
 
 
 @dataclass
-class Run:
+class RecordedTicks:
     """What happened, one row a tick."""
 
     record: RunRecord
@@ -111,7 +111,7 @@ def run_controller(
     duration_s: float | None = None,
     ticks_without_world: Collection[int] = (),
     ticks_without_trajectory: Collection[int] = (),
-) -> Run:
+) -> RecordedTicks:
     """Run a configuration to its end, and return its record with telemetry and run times of the controller.
 
     Args:
@@ -130,4 +130,4 @@ def run_controller(
         result = simulate(config)
     assert result.summary.ended == "complete", result.summary.ended
     assert len(telemetry) == len(result.record.time_s)
-    return Run(result.record, telemetry, update_us)
+    return RecordedTicks(result.record, telemetry, update_us)

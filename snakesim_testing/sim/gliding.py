@@ -32,7 +32,7 @@ SURFACES: dict[str, dict[str, Any]] = {
 }
 
 
-class Glider:
+class GlidingSnake:
     """A straight snake of 8 modules at rest on one of `SURFACES`, which does not bend, roll or turn."""
 
     def __init__(self, surface: str, robot: dict[str, Any], step_s: float = 0.002) -> None:

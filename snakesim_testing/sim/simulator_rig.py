@@ -8,10 +8,10 @@ from mujoco import MjData
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.model.files import read_table_with_base
 from snakesim_hal.model.scenario import RunConfig, validate_start_pose
-from snakesim_hal.wire.messages import Message, Mode
+from snakesim_hal.wire.messages import JointMode, Message
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.model.build import SimModel, build_sim_model, view_joint_states
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -73,7 +73,9 @@ class SimulatorRig:
         self.count = config.robot.chain.modules
         self.tick = 0
 
-    def command(self, mode: Mode | list[Mode], target: float | list[float] = 0.0, limit: float | None = None) -> None:
+    def command(
+        self, mode: JointMode | list[JointMode], target: float | list[float] = 0.0, limit: float | None = None
+    ) -> None:
         """The same for all joints, or one each."""
         modes = mode if isinstance(mode, list) else [mode] * self.count
         targets = target if isinstance(target, list) else [float(target)] * self.count
@@ -98,12 +100,12 @@ class SimulatorRig:
 
 def make_resting_body(
     config: RunConfig, settings: SimSettings, angle_rad: float = 0.0
-) -> tuple[SimModel, MjData, Physics]:
+) -> tuple[SimModel, MjData, PhysicsStepper]:
     """A body without motors on the ground, every joint at this angle."""
     sim = build_sim_model(config, settings, motors=False)
     data = MjData(sim.model)
     data.qpos[2] = config.robot.module.radius_m
     view_joint_states(data, config.robot.chain.modules)[0][:] = angle_rad
-    physics = Physics(sim, data)
+    physics = PhysicsStepper(sim, data)
     physics.reset()
     return sim, data, physics

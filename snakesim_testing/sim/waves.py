@@ -12,7 +12,7 @@ from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_operator.features.reproduce.gait_motion import GroundFriction, find_friction_per_load
 from snakesim_operator.features.reproduce.planar_chain import PlanarChain
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build_sim_model
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
 
@@ -25,7 +25,7 @@ BALANCE_STEP_S = 0.0005
 
 
 @dataclass(frozen=True)
-class Wave:
+class JointWave:
     """Joint angles amplitude * sin(rate t + phase i) + bend, with i counted from the middle of the body."""
 
     amplitude: float = 0.5  # rad
@@ -44,9 +44,9 @@ class Wave:
         return self.amplitude * self.rate * np.cos(self.rate * time_s + self.phase * places)
 
     @property
-    def reversed(self) -> "Wave":
+    def reversed(self) -> "JointWave":
         """Return the wave of a body whose head and tail are exchanged."""
-        return Wave(self.amplitude, -self.phase, self.rate, self.bend)
+        return JointWave(self.amplitude, -self.phase, self.rate, self.bend)
 
     @property
     def period_s(self) -> float:
@@ -76,7 +76,7 @@ class BodyTrack:
 
 
 def simulate_wave(
-    wave: Wave,
+    wave: JointWave,
     ground: dict[str, Any],
     robot: dict[str, Any] | None = None,
     *,
@@ -104,7 +104,7 @@ def simulate_wave(
     data.qpos[2] = config.robot.module.radius_m
     data.qpos[3], data.qpos[6] = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
     data.qpos[FREE_QPOS:] = wave.at(0.0, joint_count)
-    physics = Physics(sim, data)
+    physics = PhysicsStepper(sim, data)
     physics.reset()
     step_s = model.opt.timestep
     tail, head = sim.feet.geoms[[0, -1]]
@@ -123,7 +123,7 @@ def simulate_wave(
 
 
 def integrate_momentum_balance(
-    wave: Wave,
+    wave: JointWave,
     coefficients: DirectionalFriction,
     viscous_s_per_m: complex = 0.0,
     step_s: float = BALANCE_STEP_S,

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.protocol.definitions import Frame, parse_node
+from snakesim_can_backend.protocol.definitions import CanFrame, parse_node
 from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
@@ -113,7 +113,7 @@ def cut_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's module."""
     process_frame = backend.modules.module_reports.process_frame
 
-    def receive(frame: Frame) -> None:
+    def receive(frame: CanFrame) -> None:
         if parse_node(frame.id) != joint + 1:
             process_frame(frame)
 

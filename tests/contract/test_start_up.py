@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import pytest
 
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.benches.homing_drives import HomingBackend, HomingEmulator
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.kit_drives import KitDrives
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import BackendRig
 from snakesim_testing.drivers.drive_rig import drives_of
 
 SECOND = 50  # periods
@@ -20,21 +20,21 @@ def open_bench(*sets: str) -> Bench:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
+def rig() -> Iterator[BackendRig]:
     bench = open_bench()
     yield bench.open_rig()
     bench.close()
 
 
-def emulator_of(rig: Rig) -> HomingEmulator:
+def emulator_of(rig: BackendRig) -> HomingEmulator:
     return drives_of(rig.backend).emulator
 
 
-def unmet(rig: Rig) -> str:
+def unmet(rig: BackendRig) -> str:
     return "; ".join(rig.authority.list_unmet_conditions(rig.tick * rig.period_ns))
 
 
-def test_drives_home_at_the_start_and_are_armed_then(rig: Rig) -> None:
+def test_drives_home_at_the_start_and_are_armed_then(rig: BackendRig) -> None:
     assert all(extras.homed for extras in emulator_of(rig).extras)
     assert rig.faults == []
     rig.arm_and_move_joint()
@@ -50,7 +50,7 @@ def test_drive_that_may_not_move_at_the_start_blocks_arming() -> None:
     bench.close()
 
 
-def test_restarted_drive_does_not_know_its_position_and_homes_after_reset(rig: Rig) -> None:
+def test_restarted_drive_does_not_know_its_position_and_homes_after_reset(rig: BackendRig) -> None:
     rig.arm_and_move_joint()
     rig.backend.inject(parse_injection("reboot:joint_1@0"), begins=True)
     rig.wait_periods(SECOND)
@@ -66,7 +66,7 @@ def test_restarted_drive_does_not_know_its_position_and_homes_after_reset(rig: R
     rig.arm_and_move_joint()
 
 
-def test_homing_that_fails_names_step_and_reason(rig: Rig) -> None:
+def test_homing_that_fails_names_step_and_reason(rig: BackendRig) -> None:
     emulator = emulator_of(rig)
     emulator.without_index.add(1)
     rig.backend.inject(parse_injection("reboot:joint_2@0"), begins=True)
@@ -78,7 +78,7 @@ def test_homing_that_fails_names_step_and_reason(rig: Rig) -> None:
     assert "drive_not_ready" in {fault.what for fault in rig.faults}
 
 
-def test_emergency_stop_ends_homing(rig: Rig) -> None:
+def test_emergency_stop_ends_homing(rig: BackendRig) -> None:
     rig.backend.inject(parse_injection("reboot:joint_1@0"), begins=True)
     rig.wait_periods(SECOND)
     rig.reset()
@@ -93,7 +93,7 @@ def test_emergency_stop_ends_homing(rig: Rig) -> None:
     rig.arm_and_move_joint()
 
 
-def test_brakes_close_before_torque_is_off(rig: Rig) -> None:
+def test_brakes_close_before_torque_is_off(rig: BackendRig) -> None:
     emulator = emulator_of(rig)
     rig.arm_and_move_joint()
     assert all(extras.brake_open for extras in emulator.extras)
@@ -105,7 +105,7 @@ def test_brakes_close_before_torque_is_off(rig: Rig) -> None:
     assert emulator.dropped == []
 
 
-def test_safe_torque_off_needs_its_release_and_a_reset(rig: Rig) -> None:
+def test_safe_torque_off_needs_its_release_and_a_reset(rig: BackendRig) -> None:
     emulator = emulator_of(rig)
     rig.arm_and_move_joint()
     emulator.torque_off.add(2)
@@ -123,7 +123,7 @@ def test_safe_torque_off_needs_its_release_and_a_reset(rig: Rig) -> None:
     rig.arm_and_move_joint()
 
 
-def test_limit_switch_stops_and_allows_motion_away_alone(rig: Rig) -> None:
+def test_limit_switch_stops_and_allows_motion_away_alone(rig: BackendRig) -> None:
     emulator = emulator_of(rig)
     rig.arm_and_move_joint()
     emulator.at_upper.add(0)
@@ -133,7 +133,7 @@ def test_limit_switch_stops_and_allows_motion_away_alone(rig: Rig) -> None:
     rig.reset()
     rig.wait_periods(SECOND // 2)
     rig.arm()
-    into = rig.command_joints({0: (Mode.VELOCITY, 0.3)}, SECOND // 2)
+    into = rig.command_joints({0: (JointMode.VELOCITY, 0.3)}, SECOND // 2)
     assert into.angle_rad[-1, 0] - into.angle_rad[0, 0] < 0.02
-    away = rig.command_joints({0: (Mode.VELOCITY, -0.3)}, SECOND // 2)
+    away = rig.command_joints({0: (JointMode.VELOCITY, -0.3)}, SECOND // 2)
     assert away.angle_rad[-1, 0] - away.angle_rad[0, 0] < -0.05

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_testing.messages import FILE, Messages, raises_error
+from snakesim_testing.messages import FILE, StoredMessages, raises_error
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -23,14 +23,14 @@ def test_every_stored_message_is_of_a_test() -> None:
 
 
 def test_a_changed_or_additional_message_is_an_error(request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    messages = Messages(request.node, ["TMP/a.toml: one"], updating=False)
+    messages = StoredMessages(request.node, ["TMP/a.toml: one"], updating=False)
     messages.check(f"{tmp_path}/a.toml: one")
     with pytest.raises(AssertionError, match="--update-messages"):
         messages.check("two")
     with pytest.raises(AssertionError, match="--update-messages"):
-        Messages(request.node, ["one"], updating=False).check("another one")
+        StoredMessages(request.node, ["one"], updating=False).check("another one")
     with pytest.raises(AssertionError, match="--update-messages"):
-        Messages(request.node, ["one"], updating=False).check_count()
+        StoredMessages(request.node, ["one"], updating=False).check_count()
 
 
 def test_an_error_has_its_code_and_names_its_field() -> None:

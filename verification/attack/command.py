@@ -6,7 +6,7 @@ from pathlib import Path
 
 from snakesim_testing.harness import command
 from snakesim_testing.harness.command import CompletedRun
-from snakesim_testing.harness.command import Running as Run
+from snakesim_testing.harness.command import RunningCommand as Run
 
 LIMIT_S = 60.0
 # 50 Hz has the longest lease, 100 ms: a busy machine may well forget a process for 50 ms.

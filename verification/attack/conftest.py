@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from verification.attack.robot import Robot, Victim
+from verification.attack.robot import AttackedRobot, Victim
 
 
 @pytest.fixture(scope="package")
@@ -23,13 +23,13 @@ def victim_behind_a_router(tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 
 @pytest.fixture
-def routed(victim_behind_a_router: Victim) -> Robot:
+def routed(victim_behind_a_router: Victim) -> AttackedRobot:
     """A robot whose network outlives its host."""
     return victim_behind_a_router.armed()
 
 
 @pytest.fixture
-def robot(victim: Victim) -> Robot:
+def robot(victim: Victim) -> AttackedRobot:
     return victim.armed()
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from verification.attack.stranger import Stranger
+from verification.attack.stranger import NetworkStranger
 
 REPOSITORY = Path(__file__).parents[2]
 LOOK_S = 0.6  # a status comes a few times a second
@@ -51,7 +51,7 @@ def machine_of_its_own() -> Iterator[Sequence[str]]:
 def main() -> None:
     """Look once; an empty list where nobody shows a status."""
     try:
-        with Stranger(sys.argv[1], timeout_s=1.0) as looking:
+        with NetworkStranger(sys.argv[1], timeout_s=1.0) as looking:
             looking.receive("hal/status")
             time.sleep(LOOK_S)
             newest = looking.heard("hal/status")[-1:]

@@ -11,13 +11,13 @@ import zenoh
 
 from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import STANDING, Run, running
-from verification.attack.stranger import Stranger
+from verification.attack.stranger import NetworkStranger
 
 BACK_S = 20.0  # until a robot that was attacked is replaced
 
 
 @dataclass(frozen=True)
-class Health:
+class RunHealth:
     """Of a run's processes at one moment."""
 
     parts: dict[str, int]
@@ -25,22 +25,22 @@ class Health:
 
 
 @dataclass(frozen=True)
-class Robot:
+class AttackedRobot:
     """A run, and somebody who may reset and arm it."""
 
     run: Run
-    operator: Stranger
+    operator: NetworkStranger
 
     @property
     def endpoint(self) -> str:
         """Where its network meets."""
         return self.run.endpoint
 
-    def health(self) -> Health:
+    def health(self) -> RunHealth:
         """Its processes, and how much they have written down."""
-        return Health(self.run.parts(), {path: path.stat().st_size for path in self.run.out.glob("*.log")})
+        return RunHealth(self.run.parts(), {path: path.stat().st_size for path in self.run.out.glob("*.log")})
 
-    def unharmed(self, before: Health, what: str = "") -> None:
+    def unharmed(self, before: RunHealth, what: str = "") -> None:
         """Fail unless all its processes are those of before, and none has complained since."""
         complaints = [
             f"{path.stem}: {news[-300:]}"
@@ -63,26 +63,26 @@ class Robot:
         assert seen == {lifecycle}, f"{seen}: {self.operator.status()['reason']}"
 
 
-def joined(run: Run) -> Stranger:
+def joined(run: Run) -> NetworkStranger:
     """Somebody on a run's network, as soon as there is one."""
 
-    def join() -> Stranger | bool:
+    def join() -> NetworkStranger | bool:
         with contextlib.suppress(zenoh.ZError):
-            return Stranger(run.endpoint, timeout_s=0.5)
+            return NetworkStranger(run.endpoint, timeout_s=0.5)
         return run.process.poll() is not None
 
     found = wait_until(join, f"a network at {run.endpoint}")
-    assert isinstance(found, Stranger), run.describe_ending()
+    assert isinstance(found, NetworkStranger), run.describe_ending()
     found.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
     return found
 
 
 @contextmanager
-def standing(home: Path, *arguments: str, name: str = "run", inside: Sequence[str] = ()) -> Iterator[Robot]:
+def standing(home: Path, *arguments: str, name: str = "run", inside: Sequence[str] = ()) -> Iterator[AttackedRobot]:
     """A robot of its own, armed. inside: a prefix that runs it somewhere else."""
     with running(home, *(arguments or STANDING), name=name, inside=inside) as run, joined(run) as operator:
         operator.recover()
-        yield Robot(run, operator)
+        yield AttackedRobot(run, operator)
 
 
 class Victim:
@@ -92,10 +92,10 @@ class Victim:
         """more: arguments of the run, beside those of a robot that stands still; inside: a prefix of its command."""
         self._home, self._arguments, self._stack = home, (*STANDING, *more), ExitStack()
         self._inside = inside
-        self._robot: Robot | None = None
+        self._robot: AttackedRobot | None = None
         self._number = 0
 
-    def armed(self) -> Robot:
+    def armed(self) -> AttackedRobot:
         """It, armed and following its controller."""
         if self._robot is not None:
             with contextlib.suppress(AssertionError):

@@ -20,7 +20,7 @@ NUDGE_RAD = 0.02
 
 
 @dataclass(frozen=True)
-class Heard:
+class StampedSample:
     """A sample, and when it came by the monotonic clock."""
 
     at_s: float
@@ -55,7 +55,7 @@ def settings(
     )
 
 
-class Stranger:
+class NetworkStranger:
     """On one robot's network. Nothing here knows more than schemas/ tells."""
 
     def __init__(self, endpoint: str, namespace: str = NAMESPACE, **more: Any) -> None:
@@ -63,9 +63,9 @@ class Stranger:
         self.endpoint, self.namespace = endpoint, namespace
         self.session = zenoh.open(settings(endpoint, **more))
         self._declared: list[Any] = []
-        self._heard: dict[str, deque[Heard]] = {}
+        self._heard: dict[str, deque[StampedSample]] = {}
 
-    def __enter__(self) -> "Stranger":
+    def __enter__(self) -> "NetworkStranger":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -93,12 +93,12 @@ class Stranger:
             kept = self._heard[key] = deque(maxlen=KEPT)
             latched, must_have = wire.ROWS[key].kind == "latched", wire.required(wire.message_of(key))
 
-            def take(sample: zenoh.Sample, kept: deque[Heard] = kept, must_have: set[str] = must_have) -> None:
+            def take(sample: zenoh.Sample, kept: deque[StampedSample] = kept, must_have: set[str] = must_have) -> None:
                 at_s = time.monotonic()
                 with contextlib.suppress(Exception):  # others may send noise there
                     message = wire.decode(sample.payload.to_bytes())
                     if isinstance(message, dict) and must_have <= message.keys():
-                        kept.append(Heard(at_s, message))
+                        kept.append(StampedSample(at_s, message))
 
             if latched:
                 history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
@@ -108,7 +108,7 @@ class Stranger:
             else:
                 self._declared.append(self.session.declare_subscriber(self.key(key), take))
 
-    def heard(self, key: str) -> list[Heard]:
+    def heard(self, key: str) -> list[StampedSample]:
         """Everything kept of a key, oldest first."""
         self.receive(key)
         return list(self._heard[key])
@@ -284,7 +284,7 @@ class Stranger:
 class HostTime:
     """When a tick of the host was, by our clock; told by ticks, because samples may be held up on the way."""
 
-    def __init__(self, operator: Stranger) -> None:
+    def __init__(self, operator: NetworkStranger) -> None:
         operator.next("hal/clock")
         self._period_s = operator.newest("hal/clock")["period_ns"] * 1e-9
         self._began_s = self._offset(operator)
@@ -293,11 +293,11 @@ class HostTime:
         """By the monotonic clock."""
         return self._began_s + tick * self._period_s
 
-    def lost_s(self, operator: Stranger) -> float:
+    def lost_s(self, operator: NetworkStranger) -> float:
         """How much later the host's ticks come by now: time in which it stood still."""
         operator.forget()
         operator.until(lambda: len(operator.heard("hal/clock")) >= 10, "ten ticks")
         return self._offset(operator) - self._began_s
 
-    def _offset(self, operator: Stranger) -> float:
+    def _offset(self, operator: NetworkStranger) -> float:
         return min(heard.at_s - heard.message["tick"] * self._period_s for heard in operator.heard("hal/clock"))

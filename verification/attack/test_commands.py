@@ -8,20 +8,20 @@ import pytest
 from verification.attack.effort import effort
 from verification.attack.limits import beyond_limits
 from verification.attack.means.wire import POSITION
-from verification.attack.robot import Robot
-from verification.attack.stranger import FIRST, Stranger
+from verification.attack.robot import AttackedRobot
+from verification.attack.stranger import FIRST, NetworkStranger
 
 TIMES = range(effort(1, 20))
 
 
-def applied_of_strangers(operator: Stranger) -> list[int]:
+def applied_of_strangers(operator: NetworkStranger) -> list[int]:
     rows = [heard.message["sequence"] for heard in operator.heard("hal/applied")]
     return [sequence for sequence in rows if sequence is not None and sequence >= FIRST]
 
 
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("kind", ["left_out", "none", "before", "after"])
-def test_a6_command_of_no_or_another_arming_is_never_applied(robot: Robot, kind: str, _time: int) -> None:
+def test_a6_command_of_no_or_another_arming_is_never_applied(robot: AttackedRobot, kind: str, _time: int) -> None:
     operator = robot.operator
     operator.receive("sensor/joints")
     operator.stand_by()
@@ -44,7 +44,7 @@ def test_a6_command_of_no_or_another_arming_is_never_applied(robot: Robot, kind:
     lives_on(robot)
 
 
-def lives_on(robot: Robot) -> None:
+def lives_on(robot: AttackedRobot) -> None:
     """The right controller is not blocked as a replayer: what it sends goes on being applied."""
     operator = robot.operator
     rejected = operator.next("hal/status")["commands_rejected"].get("replayed", 0)
@@ -66,7 +66,7 @@ WRONG: tuple[dict[str, Any], ...] = (
 )
 
 
-def test_a6_wrong_command_with_high_sequence_blocks_no_right_one(robot: Robot) -> None:
+def test_a6_wrong_command_with_high_sequence_blocks_no_right_one(robot: AttackedRobot) -> None:
     operator = robot.operator
     operator.receive("sensor/joints")
     for changes in WRONG:
@@ -78,7 +78,7 @@ def test_a6_wrong_command_with_high_sequence_blocks_no_right_one(robot: Robot) -
         assert applied_of_strangers(operator) == [], changes
 
 
-def test_a6_perfect_forgery_stays_within_limits_and_ends_with_sender(robot: Robot) -> None:
+def test_a6_perfect_forgery_stays_within_limits_and_ends_with_sender(robot: AttackedRobot) -> None:
     """What remains: epoch, arming and sequence are there to read, and who forges all three commands the robot."""
     operator = robot.operator
     operator.receive("sensor/joints")

@@ -15,13 +15,13 @@ import psutil
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from snakesim_testing.harness.page import CAMERA, STOP, Page, ask, flood, origin_of
+from snakesim_testing.harness.page import CAMERA, STOP, ViewerPage, ask, flood, origin_of
 from snakesim_testing.harness.processes import find_processes_of_run, find_processes_with
 from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import address
 from verification.attack.effort import Record, effort
 from verification.attack.means.floods import half_sent
-from verification.attack.robot import Robot, Victim
+from verification.attack.robot import AttackedRobot, Victim
 
 STOP_S = 60.0  # from a click to the stop; far above what it takes
 FLOOD_S = float(effort(2, 20))
@@ -39,17 +39,17 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Victim]:
 
 
 @pytest.fixture
-def robot(shown: Victim) -> Robot:
+def robot(shown: Victim) -> AttackedRobot:
     return shown.armed()
 
 
 @pytest.fixture
-def at(robot: Robot) -> str:
+def at(robot: AttackedRobot) -> str:
     """The console's address."""
     return robot.run.console()
 
 
-def stops(robot: Robot, act: Callable[[], object]) -> float:
+def stops(robot: AttackedRobot, act: Callable[[], object]) -> float:
     """Seconds from an act until the robot is stopped."""
     asked_s = time.monotonic()
     act()
@@ -70,23 +70,23 @@ UPDATES: tuple[Any, ...] = (
 )
 
 
-def test_c1_no_viewer_switches_the_stop_off(robot: Robot, at: str) -> None:
+def test_c1_no_viewer_switches_the_stop_off(robot: AttackedRobot, at: str) -> None:
     health = robot.health()
-    with Page(at) as viewer, Page(at) as other:
+    with ViewerPage(at) as viewer, ViewerPage(at) as other:
         for one in UPDATES * 2:
             viewer.change(viewer.find(STOP), one)
         viewer.say(CAMERA)
         robot.stays("armed", 0.5)
         stops(robot, lambda: other.click(STOP))
     robot.operator.recover()
-    with Page(at) as late:
+    with ViewerPage(at) as late:
         stops(robot, lambda: late.click(STOP))
     robot.unharmed(health)
 
 
-def test_c2_user_without_control_cannot_command_by_any_button(robot: Robot, at: str) -> None:
+def test_c2_user_without_control_cannot_command_by_any_button(robot: AttackedRobot, at: str) -> None:
     health = robot.health()
-    with Page(at) as driver, Page(at) as intruder:
+    with ViewerPage(at) as driver, ViewerPage(at) as intruder:
         driver.click("Take control")
         driver.find("Release control")
         for page in (driver, intruder):
@@ -135,9 +135,9 @@ NONSENSE: dict[str, Any] = {
 }
 
 
-def test_c3_unexpected_page_message_ends_nothing_and_is_reported_once(robot: Robot, at: str) -> None:
+def test_c3_unexpected_page_message_ends_nothing_and_is_reported_once(robot: AttackedRobot, at: str) -> None:
     health = robot.health()
-    with Page(at) as viewer:
+    with ViewerPage(at) as viewer:
         viewer.find(STOP)
         for said in [*NONSENSE.values()] * 3:
             viewer.say(said)
@@ -146,9 +146,9 @@ def test_c3_unexpected_page_message_ends_nothing_and_is_reported_once(robot: Rob
     assert (robot.run.out / "console.log").read_text().count(": unknown:") == 1
 
 
-def test_c4_a_client_that_sends_too_much_is_disconnected(robot: Robot, at: str) -> None:
+def test_c4_a_client_that_sends_too_much_is_disconnected(robot: AttackedRobot, at: str) -> None:
     health = robot.health()
-    with Page(at) as viewer, Page(at) as other:
+    with ViewerPage(at) as viewer, ViewerPage(at) as other:
         viewer.change(viewer.find(STOP), {"value": "x" * 1_000_000})
         assert viewer.ended() == 1009
         stops(robot, lambda: other.click(STOP))
@@ -157,9 +157,9 @@ def test_c4_a_client_that_sends_too_much_is_disconnected(robot: Robot, at: str) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["camera", "unknown", "stop"])
-def test_c5_a_flood_costs_nobody_the_stop(robot: Robot, at: str, kind: str, record_property: Record) -> None:
+def test_c5_a_flood_costs_nobody_the_stop(robot: AttackedRobot, at: str, kind: str, record_property: Record) -> None:
     health = robot.health()
-    with Page(at) as other, ExitStack() as stack:
+    with ViewerPage(at) as other, ExitStack() as stack:
         button = other.find(STOP)
         said = {
             "camera": CAMERA,
@@ -183,34 +183,34 @@ def test_c5_a_flood_costs_nobody_the_stop(robot: Robot, at: str, kind: str, reco
     robot.unharmed(health, kind)
 
 
-def console_mb(robot: Robot) -> float:
+def console_mb(robot: AttackedRobot) -> float:
     """Resident memory of the console."""
     return psutil.Process(pages_pid(robot)).memory_info().rss / 1e6
 
 
-def pages_pid(robot: Robot) -> int:
+def pages_pid(robot: AttackedRobot) -> int:
     """Process id of the console's page server, where viser is."""
     return next(
         pid for pid, line in find_processes_of_run(robot.run.out) if "snakesim_operator.features.console\0" in line
     )
 
 
-def test_c6_pages_of_other_origins_are_refused(robot: Robot, at: str) -> None:
+def test_c6_pages_of_other_origins_are_refused(robot: AttackedRobot, at: str) -> None:
     for origin in (*REFUSED, origin_of(at).replace("127.0.0.1", "localhost")):  # another name: another origin
         with pytest.raises(InvalidStatus) as refused:
-            Page(at, origin)
+            ViewerPage(at, origin)
         assert refused.value.response.status_code == 403
         for method in ("GET", "POST"):
             status, why = ask(at, method, Origin=origin)
             assert status == 403 and "may connect" in why
     assert ask(at, "GET", "/", Host="evil.example")[0] == 403  # a name of theirs that points here
     assert ask(at, "POST", Host="evil.example", Origin="http://evil.example")[0] == 403
-    with Page(at, origin_of(at)) as own:
+    with ViewerPage(at, origin_of(at)) as own:
         own.find(STOP)
     robot.stays("armed", 0.3)
 
 
-def test_c7_the_second_stop_needs_nothing_of_the_page(robot: Robot, at: str, record_property: Record) -> None:
+def test_c7_the_second_stop_needs_nothing_of_the_page(robot: AttackedRobot, at: str, record_property: Record) -> None:
     health = robot.health()
     with ExitStack() as stack:
         for said in (b"", b"POST /stop HTTP/1.1\r\nHost: ", b"GET / HTTP/1.1\r\n") * effort(40, 100):
@@ -224,10 +224,10 @@ def test_c7_the_second_stop_needs_nothing_of_the_page(robot: Robot, at: str, rec
     robot.unharmed(health)
 
 
-def test_c8_half_sent_requests_do_not_block_the_stop(robot: Robot, at: str, record_property: Record) -> None:
+def test_c8_half_sent_requests_do_not_block_the_stop(robot: AttackedRobot, at: str, record_property: Record) -> None:
     """With more of them than the console may open files, by all of its stops, during the flood and after it."""
     health = robot.health()
-    with Page(at) as page, Page(at, draws=False) as without_scene:
+    with ViewerPage(at) as page, ViewerPage(at, draws=False) as without_scene:
         ways: dict[str, Callable[[], object]] = {
             "the page's button": lambda: page.click(STOP),
             "the button of a page without WebGL": lambda: without_scene.click(STOP),
@@ -245,7 +245,7 @@ def test_c8_half_sent_requests_do_not_block_the_stop(robot: Robot, at: str, reco
         for name, act in ways.items():
             assert stops(robot, act) < FLOODED_STOP_S, name
             robot.operator.recover()
-        with Page(at) as late:
+        with ViewerPage(at) as late:
             late.find(STOP)
     robot.unharmed(health)
 
@@ -253,7 +253,7 @@ def test_c8_half_sent_requests_do_not_block_the_stop(robot: Robot, at: str, reco
 WRONG_TOKENS = ("", "wrong", "stop", "..", "%2e%2e", "index.html")
 
 
-def test_c9_without_the_token_nothing_is_answered(robot: Robot, at: str) -> None:
+def test_c9_without_the_token_nothing_is_answered(robot: AttackedRobot, at: str) -> None:
     """Neither by the address without it, nor with a wrong one, nor at the port of viser itself."""
     health = robot.health()
     token = at.rstrip("/").rpartition("/")[2]
@@ -263,11 +263,11 @@ def test_c9_without_the_token_nothing_is_answered(robot: Robot, at: str) -> None
             status, why = ask(address_without, method, path, Origin=origin_of(at))
             assert status == 403 and "the address that the console printed" in why
         with pytest.raises(InvalidStatus):
-            Page(address_without, origin_of(at))
-    with Page(at) as viewer:
+            ViewerPage(address_without, origin_of(at))
+    with ViewerPage(at) as viewer:
         button = viewer.find(STOP)
         for port in listening_ports(pages_pid(robot)):
-            with Page(f"http://127.0.0.1:{port}") as intruder:
+            with ViewerPage(f"http://127.0.0.1:{port}") as intruder:
                 intruder.change(button, {"value": True})
                 intruder.change(button, {"visible": False})
                 assert intruder.ended() is None and not intruder.controls, "closed without a word"
@@ -302,7 +302,7 @@ def kept_connection(at: str) -> Iterator[Callable[[str], tuple[int, str]]]:
 
 
 def test_c10_the_second_stop_works_while_the_process_of_the_pages_is_stopped(
-    robot: Robot, at: str, record_property: Record
+    robot: AttackedRobot, at: str, record_property: Record
 ) -> None:
     health = robot.health()
     pid = pages_pid(robot)

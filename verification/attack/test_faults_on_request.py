@@ -12,8 +12,8 @@ import pytest
 from verification.attack.command import STANDING, running
 from verification.attack.means import wire
 from verification.attack.means.repeating import repeating
-from verification.attack.robot import Robot, joined
-from verification.attack.stranger import Stranger
+from verification.attack.robot import AttackedRobot, joined
+from verification.attack.stranger import NetworkStranger
 
 BENCH = Path(__file__).parent / "data" / "bench.py"
 EVERY_S = 0.05
@@ -29,23 +29,23 @@ ASKED = (
 
 
 @pytest.fixture(scope="module")
-def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Robot, Stranger]]:
+def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[AttackedRobot, NetworkStranger]]:
     """A robot that really moves, and a stranger who says from its first moment on that it does not."""
     home = tmp_path_factory.mktemp("real")
     with running(home, *STANDING, "--backend", f"{BENCH}:Bench", "--unchecked") as run, joined(run) as operator:
         about = operator.newest("hal/description")
         assert about["emulated"] is False
-        with Stranger(run.endpoint) as stranger, forging(stranger, {**about, "emulated": True}):
+        with NetworkStranger(run.endpoint) as stranger, forging(stranger, {**about, "emulated": True}):
             operator.recover()
             # A service that is started again learns what robot it has from what the stranger says.
             os.kill(run.part("control"), signal.SIGKILL)
             operator.until(lambda: "control" not in run.parts(), "control gone")
             operator.until(lambda: "control" in run.parts(), "control again")
             operator.recover(40.0)
-            yield Robot(run, operator), stranger
+            yield AttackedRobot(run, operator), stranger
 
 
-def forging(stranger: Stranger, about: dict[str, Any]) -> AbstractContextManager[None]:
+def forging(stranger: NetworkStranger, about: dict[str, Any]) -> AbstractContextManager[None]:
     publisher = stranger.latch("hal/description", about)
 
     def forge() -> None:
@@ -55,7 +55,7 @@ def forging(stranger: Stranger, about: dict[str, Any]) -> AbstractContextManager
     return repeating(forge, EVERY_S)
 
 
-def test_a3_forged_description_causes_no_fault_on_real_robot(real: tuple[Robot, Stranger]) -> None:
+def test_a3_forged_description_causes_no_fault_on_real_robot(real: tuple[AttackedRobot, NetworkStranger]) -> None:
     robot, stranger = real
     before = robot.health()
     for key, request in ASKED:
@@ -67,9 +67,9 @@ def test_a3_forged_description_causes_no_fault_on_real_robot(real: tuple[Robot, 
     assert not robot.operator.status()["injected"]
 
 
-def test_a3_faults_are_only_for_simulators_and_permitted_users(robot: Robot) -> None:
+def test_a3_faults_are_only_for_simulators_and_permitted_users(robot: AttackedRobot) -> None:
     """What remains: on a simulator anybody may let anything go wrong, which ends in a stop, or a restart."""
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         assert stranger.ask("fault/run", {"kind": "kill", "target": "guidance"})[0]["ok"]
         assert not stranger.ask("fault/run", {"kind": "kill", "target": "no such process"})[0]["ok"]
     robot.run.wait_for("guidance was ended by SIGKILL")

@@ -11,8 +11,8 @@ import pytest
 from verification.attack.effort import FULL, effort
 from verification.attack.limits import beyond_limits
 from verification.attack.means.repeating import repeating
-from verification.attack.robot import Robot, standing
-from verification.attack.stranger import Stranger
+from verification.attack.robot import AttackedRobot, standing
+from verification.attack.stranger import NetworkStranger
 
 FORGED_S = effort(3, 100) / 10
 EVERY_S = 0.005  # faster than who should say it
@@ -22,7 +22,7 @@ SERVICES = ("control", "guidance", "navigation")
 
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AttackedRobot]:
     """A robot that goes where navigation says."""
     home = tmp_path_factory.mktemp("moving")
     arguments = ("triplet", "--clock-mode", "realtime", "--set", "rate_hz=50", "--duration", "3600", "--stay")
@@ -31,7 +31,7 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
         yield robot
 
 
-def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: float = FORGED_S) -> None:
+def holds(robot: AttackedRobot, key: str, variants: dict[str, dict[str, Any]], each_s: float = FORGED_S) -> None:
     """Under each forgery nothing leaves its limits and nobody dies; afterwards the robot can be used as before.
 
     What is forged is the newest honest message with these changes, and the clock's tick and time unless they change.
@@ -39,7 +39,7 @@ def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: f
     operator = robot.operator
     operator.recover()
     before, about, honest = robot.health(), operator.newest("hal/description"), operator.next(key)
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         for name, changes in variants.items():
             operator.forget()
 
@@ -64,7 +64,7 @@ def intent(timestamp_ns: int, speed_m_s: float, valid_s: float | None = None) ->
     return said if valid_s is None else {**said, "valid_for_ns": round(valid_s * NS)}
 
 
-def speeds(operator: Stranger, from_ns: int, to_ns: int) -> set[float]:
+def speeds(operator: NetworkStranger, from_ns: int, to_ns: int) -> set[float]:
     """Of trajectories in a stretch of the robot's time, however long that takes."""
 
     def told() -> list[dict[str, Any]]:
@@ -76,7 +76,7 @@ def speeds(operator: Stranger, from_ns: int, to_ns: int) -> set[float]:
 
 
 @pytest.mark.parametrize("age_s", [60.0, -60.0], ids=["old", "future"])
-def test_a9_an_intent_of_another_time_is_not_followed(moving: Robot, age_s: float) -> None:
+def test_a9_an_intent_of_another_time_is_not_followed(moving: AttackedRobot, age_s: float) -> None:
     operator = moving.operator
     operator.recover()
     while (now_ns := operator.next("hal/clock")["timestamp_ns"]) < 3 * NS:  # what is as old as the robot must be old
@@ -85,7 +85,7 @@ def test_a9_an_intent_of_another_time_is_not_followed(moving: Robot, age_s: floa
     assert 0.0123 not in speeds(operator, now_ns, now_ns + NS), f"an intent that is {age_s:g} s old is followed"
 
 
-def test_a9_an_intent_ends_after_its_validity(moving: Robot) -> None:
+def test_a9_an_intent_ends_after_its_validity(moving: AttackedRobot) -> None:
     operator, said_ns = moving.operator, [0]
     operator.recover()
 
@@ -107,7 +107,7 @@ def test_a9_an_intent_ends_after_its_validity(moving: Robot) -> None:
 CIRCLE = [[10.0 * math.cos(i / 10), 10.0 * math.sin(i / 10)] for i in range(200)]
 
 
-def test_a8_a_forged_trajectory_is_followed_within_the_limits(moving: Robot) -> None:
+def test_a8_a_forged_trajectory_is_followed_within_the_limits(moving: AttackedRobot) -> None:
     variants = {
         "elsewhere": {"path_id": 7, "path_w": CIRCLE, "speed_m_s": ABSURD_M_S},
         "far": {"path_id": 8, "path_w": [[1e6, -1e6], [-1e6, 1e6]], "speed_m_s": 1e5},
@@ -122,7 +122,7 @@ def test_a8_a_forged_trajectory_is_followed_within_the_limits(moving: Robot) -> 
     holds(moving, "navigation/trajectory", variants)
 
 
-def test_a8_a_forged_world_ends_nobody_and_breaks_no_limit(moving: Robot) -> None:
+def test_a8_a_forged_world_ends_nobody_and_breaks_no_limit(moving: AttackedRobot) -> None:
     variants = {
         "elsewhere": {"base_position_w": [1e6, 1e6, 0.0]},
         "no rotation": {"base_orientation_wxyz": [0.0, 0.0, 0.0, 0.0]},
@@ -133,11 +133,11 @@ def test_a8_a_forged_world_ends_nobody_and_breaks_no_limit(moving: Robot) -> Non
     holds(moving, "guidance/world", variants)
 
 
-def test_a8_a_world_of_the_future_ends_nobody(moving: Robot) -> None:
+def test_a8_a_world_of_the_future_ends_nobody(moving: AttackedRobot) -> None:
     holds(moving, "guidance/world", {"future": {"tick": 2**62, "timestamp_ns": 2**62}})
 
 
-def test_a8_forged_joints_break_no_limit(moving: Robot) -> None:
+def test_a8_forged_joints_break_no_limit(moving: AttackedRobot) -> None:
     variants = {
         "elsewhere": {"angle_rad": [1e4] * 13},
         "fast": {"angle_rad": [0.0] * 13, "velocity_rad_s": [1e5] * 13},
@@ -150,7 +150,7 @@ def test_a8_forged_joints_break_no_limit(moving: Robot) -> None:
     holds(moving, "sensor/joints", variants)
 
 
-def test_a8_a_forged_clock_stops_the_robot_at_most(moving: Robot) -> None:
+def test_a8_a_forged_clock_stops_the_robot_at_most(moving: AttackedRobot) -> None:
     variants = {
         "future": {"tick": 2**62, "timestamp_ns": 2**62},
         "past": {"tick": 0, "timestamp_ns": 0},
@@ -164,19 +164,19 @@ def test_a8_a_forged_clock_stops_the_robot_at_most(moving: Robot) -> None:
     holds(moving, "hal/clock", variants)
 
 
-def test_a8_a_clock_of_another_pace_ends_nobody(moving: Robot) -> None:
+def test_a8_a_clock_of_another_pace_ends_nobody(moving: AttackedRobot) -> None:
     """Services know from their own configuration whether they run in lockstep."""
     # A service waits two seconds for what it was promised.
     holds(moving, "hal/clock", {"lockstep": {"clock_mode": "lockstep"}}, each_s=max(FORGED_S, 3.0))
 
 
 @pytest.mark.parametrize("lifecycle", ["armed", "fault", "estop", "disarmed"] if FULL else ["estop"])
-def test_a8_a_forged_status_moves_nothing(robot: Robot, lifecycle: str) -> None:
+def test_a8_a_forged_status_moves_nothing(robot: AttackedRobot, lifecycle: str) -> None:
     operator = robot.operator
     operator.stand_by()
     armings = operator.next("hal/clock")["arm_session"]
     forged = {**operator.status(), "lifecycle": lifecycle, "ready_to_arm": True, "reason": "forged"}
-    with Stranger(robot.endpoint) as stranger, repeating(lambda: stranger.put("hal/status", forged), EVERY_S):
+    with NetworkStranger(robot.endpoint) as stranger, repeating(lambda: stranger.put("hal/status", forged), EVERY_S):
         time.sleep(FORGED_S)
         assert operator.next("hal/clock")["arm_session"] == armings
         stopped = robot.run.run_tool("estop")
@@ -189,7 +189,7 @@ def test_a8_forged_service_answers_at_most_stop_lockstep_run(tmp_path: Path) -> 
     with standing(tmp_path, *arguments) as robot:
         before, operator = robot.health(), robot.operator
 
-        with Stranger(robot.endpoint) as stranger:
+        with NetworkStranger(robot.endpoint) as stranger:
             for name in (*SERVICES, "nobody"):
                 stranger.put(f"hal/done/{name}", {"tick": 2**62})
 

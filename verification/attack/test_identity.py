@@ -15,8 +15,8 @@ from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.attack.command import STANDING, running, snakesim
 from verification.attack.effort import FULL, effort
 from verification.attack.means import datagrams
-from verification.attack.robot import Robot, joined
-from verification.attack.stranger import Stranger, settings
+from verification.attack.robot import AttackedRobot, joined
+from verification.attack.stranger import NetworkStranger, settings
 
 TIMES = range(effort(1, 5))
 
@@ -26,14 +26,14 @@ def lie(lifecycle: str, reason: str) -> dict[str, Any]:
 
 
 @contextmanager
-def impostor(robot: Robot, key: str, answer: dict[str, Any]) -> Iterator[Stranger]:
-    with Stranger(robot.endpoint) as stranger:
+def impostor(robot: AttackedRobot, key: str, answer: dict[str, Any]) -> Iterator[NetworkStranger]:
+    with NetworkStranger(robot.endpoint) as stranger:
         stranger.pretend(key, answer)
         yield stranger
 
 
 @contextmanager
-def frozen_host(robot: Robot) -> Iterator[None]:
+def frozen_host(robot: AttackedRobot) -> Iterator[None]:
     pid = robot.run.part("host")
     os.kill(pid, signal.SIGSTOP)
     try:
@@ -54,7 +54,7 @@ def frozen_host(robot: Robot) -> Iterator[None]:
     ids=["disarm", "reset", "estop", "arm"],
 )
 def test_a2_a_second_answer_is_an_impostor(
-    routed: Robot, tool: str, before: str, lies: dict[str, Any], after: str, _time: int
+    routed: AttackedRobot, tool: str, before: str, lies: dict[str, Any], after: str, _time: int
 ) -> None:
     operator = routed.operator
     if before == "estop":
@@ -75,7 +75,7 @@ def test_a2_a_second_answer_is_an_impostor(
         operator.until(lambda: operator.lifecycle() in (after, "fault"), f"{after}, as the robot was asked, too", 3.0)
 
 
-def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: Robot) -> None:
+def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: AttackedRobot) -> None:
     operator = robot.operator
     answer = lie("disarmed", "disarmed on request")
     with impostor(robot, "hal/lifecycle", answer) as stranger:
@@ -95,7 +95,7 @@ def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: Robot) -> No
     ids=["estop", "disarm"][: 1 + FULL],
 )
 def test_a2_frozen_host_is_not_stopped_by_another_answer(
-    routed: Robot, tool: str, key: str, lies: dict[str, Any], word: str, _time: int
+    routed: AttackedRobot, tool: str, key: str, lies: dict[str, Any], word: str, _time: int
 ) -> None:
     with impostor(routed, key, lies), frozen_host(routed):
         ended = routed.run.run_tool(*(["estop"] if tool == "estop" else ["robot", tool]))
@@ -114,7 +114,7 @@ def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, 
         contextlib.ExitStack() as lies,
     ):
         operator.recover()
-        robot = Robot(run, operator)
+        robot = AttackedRobot(run, operator)
         if how.startswith("impostor"):
             lies.enter_context(impostor(robot, "hal/estop", answer))
         else:
@@ -125,7 +125,7 @@ def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, 
         assert ended.code == 1 and "planar13: stopped" not in ended.printed, ended.printed
 
 
-def test_a2_a_frozen_host_gives_no_answer(routed: Robot) -> None:
+def test_a2_a_frozen_host_gives_no_answer(routed: AttackedRobot) -> None:
     with frozen_host(routed):
         ended = routed.run.run_tool("estop")
     assert ended.code == 1 and "planar13" in ended.printed and "planar13: stopped" not in ended.printed, ended.printed

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 
 from verification.attack.command import HOLDING, STANDING, running
-from verification.attack.robot import Robot, joined
-from verification.attack.stranger import Stranger
+from verification.attack.robot import AttackedRobot, joined
+from verification.attack.stranger import NetworkStranger
 
 
-def test_a12_requesters_of_disarm_clear_and_arm_are_reported(robot: Robot) -> None:
+def test_a12_requesters_of_disarm_clear_and_arm_are_reported(robot: AttackedRobot) -> None:
     operator = robot.operator
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         for action, before in (("disarm", None), ("arm", "ready"), ("reset", "estop")):
             if before == "estop":
                 operator.ask("hal/estop", {"requester": "operator"})
@@ -26,7 +26,7 @@ def test_a12_requesters_of_disarm_clear_and_arm_are_reported(robot: Robot) -> No
 def test_a12_a_run_that_a_stranger_finishes_is_not_complete(tmp_path: Path) -> None:
     with running(tmp_path, *HOLDING, "--duration", "20") as run, joined(run) as operator:
         operator.until(lambda: operator.lifecycle() == "armed", "armed")
-        with Stranger(run.endpoint) as stranger:
+        with NetworkStranger(run.endpoint) as stranger:
             answer = stranger.request("finish", requester="mallory")
         code = run.end()
         summary = json.loads((run.out / "summary.json").read_text())
@@ -35,9 +35,9 @@ def test_a12_a_run_that_a_stranger_finishes_is_not_complete(tmp_path: Path) -> N
     assert "mallory" in run.printed(), run.printed()
 
 
-def test_a12_a_request_without_a_name_is_not_anonymous(robot: Robot) -> None:
+def test_a12_a_request_without_a_name_is_not_anonymous(robot: AttackedRobot) -> None:
     """Whoever leaves out who he is, is told as unknown; nothing is put into his mouth."""
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         assert stranger.ask("hal/lifecycle", {"action": "disarm"})[0]["ok"]
     assert "an unnamed client" in robot.operator.next("hal/status")["reason"]
 

@@ -13,8 +13,8 @@ from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.attack.command import HOLDING, running, steering
 from verification.attack.effort import Record, effort
 from verification.attack.means import wire
-from verification.attack.robot import Robot, joined
-from verification.attack.stranger import NAMESPACE, Stranger
+from verification.attack.robot import AttackedRobot, joined
+from verification.attack.stranger import NAMESPACE, NetworkStranger
 
 EVIL = "\x1b[2J\x1b]0;evil\x07\r\nplanar13: armed - all is well\n\x9b31m\u202e"
 STATUS_S = 20.0
@@ -46,14 +46,14 @@ def payloads() -> list[bytes]:
 
 
 @pytest.mark.parametrize("key", wire.QUERIES)
-def test_no_payload_of_a_query_harms_the_robot(robot: Robot, key: str) -> None:
+def test_no_payload_of_a_query_harms_the_robot(robot: AttackedRobot, key: str) -> None:
     before, operator = robot.health(), robot.operator
     operator.forget()
     targets = [key.replace("*", part) for part in ("run", "control", "hal")] if "*" in key else [key]
     small = [payload for payload in payloads() if len(payload) < MUCH_BYTES]
     large = [[payload] for payload in payloads() if len(payload) >= MUCH_BYTES]
     for target, group in itertools.product(targets, [small, *large]):
-        with Stranger(robot.endpoint) as stranger:  # one that sends too much may lose its connection
+        with NetworkStranger(robot.endpoint) as stranger:  # one that sends too much may lose its connection
             for payload in group:
                 for answer in stranger.ask(target, payload, 0.3):
                     assert not answer["ok"], f"{payload[:40]!r} at {target}: {answer}"
@@ -62,9 +62,9 @@ def test_no_payload_of_a_query_harms_the_robot(robot: Robot, key: str) -> None:
     robot.unharmed(before)
 
 
-def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot: Robot) -> None:
+def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot: AttackedRobot) -> None:
     before = robot.health()
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         for selector in ("**", "*/**", f"{NAMESPACE}/**", f"{NAMESPACE}/hal/*", f"{NAMESPACE}/hal/estop?_time=[..]"):
             for _ in range(effort(20, 300)):  # more at once may hold Zenoh up for longer than a lease
                 stranger.session.get(selector, zenoh.handlers.RingChannel(1), timeout=0.5)
@@ -76,7 +76,7 @@ def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
-def printed_safely(robot: Robot, before: str) -> None:
+def printed_safely(robot: AttackedRobot, before: str) -> None:
     """Nothing that a person reads has control characters, or lines that a stranger has written."""
     told = {
         f"snakesim {tool}": robot.run.run_tool(*tool.split()).printed for tool in ("status", "estop", "robot reset")
@@ -86,9 +86,9 @@ def printed_safely(robot: Robot, before: str) -> None:
         assert not any(line.startswith("planar13: armed - all is well") for line in said.splitlines()), said
 
 
-def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robot) -> None:
+def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: AttackedRobot) -> None:
     said = robot.run.printed()
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         stranger.ask("hal/estop", {"requester": EVIL})
     robot.operator.until(lambda: robot.operator.lifecycle() == "estop", "the stop")
     robot.run.wait_for("evil")
@@ -98,9 +98,9 @@ def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Robo
     printed_safely(robot, said)
 
 
-def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Robot) -> None:
+def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: AttackedRobot) -> None:
     said = robot.run.printed()
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         stranger.ask("hal/lease", {"action": "acquire", "holder": EVIL, "priority": 255})
         for action in ("disarm", "reset", "arm"):
             stranger.request(action, requester=EVIL)
@@ -108,7 +108,7 @@ def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Robo
         printed_safely(robot, said)
 
 
-def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) -> None:
+def test_control_characters_in_forged_streams_reach_no_terminal(robot: AttackedRobot) -> None:
     said, operator = robot.run.printed(), robot.operator
     fault = {"tick": 1, "what": EVIL[:60], "cause": EVIL, "joint": EVIL[:60], "reach": "robot"}
     status = {**operator.status(), "lifecycle": "fault", "reason": EVIL, "faults": [fault], "injected": [EVIL]}
@@ -122,7 +122,7 @@ def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) ->
         "state": "Idle",
         "reason": EVIL,
     }
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         publisher = stranger.latch("hal/status", status)
         for _ in range(20):
             publisher.put(wire.encode(status))
@@ -131,9 +131,9 @@ def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) ->
         printed_safely(robot, said)
 
 
-def test_control_characters_in_a_namespace_reach_no_terminal(robot: Robot) -> None:
+def test_control_characters_in_a_namespace_reach_no_terminal(robot: AttackedRobot) -> None:
     said = robot.run.printed()
-    with Stranger(robot.endpoint, "evil\x1b[2J\rplanar13: armed - all is well") as stranger:
+    with NetworkStranger(robot.endpoint, "evil\x1b[2J\rplanar13: armed - all is well") as stranger:
         stranger.seem_alive("alive/hal")
         stranger.pretend("hal/estop", {"ok": True, "reason": EVIL, "epoch": 0, "lifecycle": "estop"})
         stranger.latch("hal/status", {**robot.operator.status(), "reason": EVIL})
@@ -143,9 +143,9 @@ def test_control_characters_in_a_namespace_reach_no_terminal(robot: Robot) -> No
 # --- many -------------------------------------------------------------------------------------------------------------
 
 
-def test_many_tokens_of_services_change_nothing(robot: Robot) -> None:
+def test_many_tokens_of_services_change_nothing(robot: AttackedRobot) -> None:
     before, count = robot.health(), effort(200, 1000)  # 5000 at once hold Zenoh up for longer than a lease
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         for i in range(count):
             stranger.seem_alive(f"alive/service_{i}")
         robot.stays("armed", 1.0)
@@ -155,10 +155,10 @@ def test_many_tokens_of_services_change_nothing(robot: Robot) -> None:
     robot.unharmed(before)
 
 
-def test_service_token_that_flaps_stops_nothing(robot: Robot) -> None:
+def test_service_token_that_flaps_stops_nothing(robot: AttackedRobot) -> None:
     operator = robot.operator
     for name in ("control", "guidance", "hal") * effort(3, 100):
-        with Stranger(robot.endpoint) as stranger:
+        with NetworkStranger(robot.endpoint) as stranger:
             stranger.seem_alive(f"alive/{name}")
             time.sleep(0.05)
     robot.stays("armed", 0.5)
@@ -166,9 +166,9 @@ def test_service_token_that_flaps_stops_nothing(robot: Robot) -> None:
     operator.recover()
 
 
-def test_false_robots_do_not_keep_a_stop_from_real_one(robot: Robot, record_property: Record) -> None:
+def test_false_robots_do_not_keep_a_stop_from_real_one(robot: AttackedRobot, record_property: Record) -> None:
     operator = robot.operator
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         tokens = [stranger.session.liveliness().declare_token(f"robot_{i}/alive/hal") for i in range(effort(100, 1000))]
         asked_s = time.monotonic()
         ended = robot.run.run_tool("estop", limit_s=STATUS_S)
@@ -185,9 +185,9 @@ def test_false_robots_do_not_keep_a_stop_from_real_one(robot: Robot, record_prop
 
 
 @pytest.mark.parametrize("mode", ["router", pytest.param("peer", marks=pytest.mark.slow)])
-def test_stranger_joining_as_router_or_peer_changes_nothing(robot: Robot, mode: str) -> None:
+def test_stranger_joining_as_router_or_peer_changes_nothing(robot: AttackedRobot, mode: str) -> None:
     before = robot.health()
-    with Stranger(robot.endpoint, mode=mode, listen=find_free_endpoint()) as stranger:
+    with NetworkStranger(robot.endpoint, mode=mode, listen=find_free_endpoint()) as stranger:
         stranger.receive("hal/clock")
         stranger.until(lambda: stranger.heard("hal/clock"), "the clock")
         robot.stays("armed", 1.0)
@@ -197,10 +197,10 @@ def test_stranger_joining_as_router_or_peer_changes_nothing(robot: Robot, mode: 
     robot.unharmed(before)
 
 
-def test_the_hosts_zenoh_cannot_be_configured_by_a_stranger(robot: Robot) -> None:
+def test_the_hosts_zenoh_cannot_be_configured_by_a_stranger(robot: AttackedRobot) -> None:
     """A Zenoh router has an administration space; nobody may write there."""
     bait = find_free_endpoint()
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         answers = [
             str(reply.ok.key_expr) for reply in stranger.session.get("@/**", timeout=1.0) if reply.ok is not None
         ]
@@ -213,15 +213,15 @@ def test_the_hosts_zenoh_cannot_be_configured_by_a_stranger(robot: Robot) -> Non
                 stranger.session.put(f"@/{zid}/router/config/{what}", value)
         time.sleep(0.5)
         with pytest.raises(zenoh.ZError):
-            Stranger(bait, timeout_s=0.5)
-        with Stranger(robot.endpoint) as another:  # the number of sessions is what it was
+            NetworkStranger(bait, timeout_s=0.5)
+        with NetworkStranger(robot.endpoint) as another:  # the number of sessions is what it was
             assert another.next("hal/clock")["lifecycle"] == "armed"
     assert not [key for key in answers if "config" in key], f"readable by anybody: {answers}"
 
 
-def test_false_hosts_neither_stop_robot_nor_hide_a_stop(robot: Robot) -> None:
+def test_false_hosts_neither_stop_robot_nor_hide_a_stop(robot: AttackedRobot) -> None:
     before, operator = robot.health(), robot.operator
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         for i in range(effort(100, 2000)):
             stranger.seem_alive(f"hal/host/{i:04}{'x' * 60 if i % 2 else EVIL.replace('/', '')}")
         robot.stays("armed", 1.0)
@@ -237,7 +237,7 @@ def test_false_hosts_neither_stop_robot_nor_hide_a_stop(robot: Robot) -> None:
 def test_a_host_that_is_none_does_not_end_a_run(tmp_path: Path) -> None:
     with running(tmp_path, *HOLDING, "--duration", "4") as run, joined(run) as operator:
         operator.until(lambda: operator.lifecycle() == "armed", "armed")
-        with Stranger(run.endpoint) as stranger:
+        with NetworkStranger(run.endpoint) as stranger:
             stranger.seem_alive("hal/host/another")
             code = run.end()
     assert code == 0, f"exit code {code}: {run.printed()[-600:]}"

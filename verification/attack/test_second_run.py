@@ -13,14 +13,14 @@ from snakesim_testing.harness.wait import wait_until
 from verification.attack.command import HOLDING, STANDING, Run, running, snakesim
 from verification.attack.effort import effort
 from verification.attack.machine import lifecycles, machine_of_its_own
-from verification.attack.robot import Robot, joined
-from verification.attack.stranger import Stranger, settings
+from verification.attack.robot import AttackedRobot, joined
+from verification.attack.stranger import NetworkStranger, settings
 
 SHORT = (*HOLDING, "--duration", "1")
 TIMES = range(effort(1, 4))
 
 
-def stays_disarmed(operator: Stranger, home: Path, *network: str) -> None:
+def stays_disarmed(operator: NetworkStranger, home: Path, *network: str) -> None:
     """A second run starts on the network of a disarmed robot; it must refuse, and the robot must stay as it is."""
     armings = operator.next("hal/clock")["arm_session"]
     operator.forget()
@@ -34,12 +34,12 @@ def stays_disarmed(operator: Stranger, home: Path, *network: str) -> None:
 
 
 @pytest.mark.parametrize("_time", TIMES)
-def test_a1_second_run_on_a_router_does_not_arm_robot(routed: Robot, tmp_path: Path, _time: int) -> None:
+def test_a1_second_run_on_a_router_does_not_arm_robot(routed: AttackedRobot, tmp_path: Path, _time: int) -> None:
     routed.operator.stand_by()
     stays_disarmed(routed.operator, tmp_path, "--router", routed.endpoint)
 
 
-def test_a1_second_run_at_same_endpoint_does_not_arm_robot(robot: Robot, tmp_path: Path) -> None:
+def test_a1_second_run_at_same_endpoint_does_not_arm_robot(robot: AttackedRobot, tmp_path: Path) -> None:
     robot.operator.stand_by()
     stays_disarmed(robot.operator, tmp_path, "--endpoint", robot.endpoint)
 
@@ -59,9 +59,9 @@ def test_a1_second_run_at_router_endpoint_does_not_arm_robot(tmp_path: Path) -> 
         operator.recover()
 
 
-def test_a1_phantom_robot_only_keeps_a_run_from_starting(routed: Robot, tmp_path: Path) -> None:
+def test_a1_phantom_robot_only_keeps_a_run_from_starting(routed: AttackedRobot, tmp_path: Path) -> None:
     operator = routed.operator
-    with Stranger(routed.endpoint, "mamba") as stranger:
+    with NetworkStranger(routed.endpoint, "mamba") as stranger:
         stranger.seem_alive("alive/hal")
         stranger.latch("hal/status", {**operator.status(), "robot": "mamba"})
         stranger.latch("hal/description", {**operator.newest("hal/description"), "robot": "mamba"})

@@ -14,20 +14,20 @@ from typing import Any
 from verification.attack.limits import beyond_limits
 from verification.attack.means import wire
 from verification.attack.means.repeating import repeating
-from verification.attack.robot import Robot
-from verification.attack.stranger import Stranger
+from verification.attack.robot import AttackedRobot
+from verification.attack.stranger import NetworkStranger
 
 LISTENED = ("sensor/joints", "sensor/pose", "actuator/joints", "hal/clock", "hal/status", "hal/description")
 
 
-def test_anybody_may_listen_to_everything(robot: Robot) -> None:
-    with Stranger(robot.endpoint) as stranger:
+def test_anybody_may_listen_to_everything(robot: AttackedRobot) -> None:
+    with NetworkStranger(robot.endpoint) as stranger:
         for key in LISTENED:
             assert stranger.newest(key)
 
 
-def test_anybody_may_stop_clear_and_disarm(robot: Robot) -> None:
-    with Stranger(robot.endpoint) as stranger:
+def test_anybody_may_stop_clear_and_disarm(robot: AttackedRobot) -> None:
+    with NetworkStranger(robot.endpoint) as stranger:
         stranger.receive("hal/clock")
         assert stranger.ask("hal/estop", {"requester": "mallory"})[0]["ok"]
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "estop", "estop")
@@ -38,7 +38,7 @@ def test_anybody_may_stop_clear_and_disarm(robot: Robot) -> None:
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "disarmed", "disarmed")
 
 
-def commanding(stranger: Stranger, epoch: int, target: float) -> AbstractContextManager[None]:
+def commanding(stranger: NetworkStranger, epoch: int, target: float) -> AbstractContextManager[None]:
     """A controller of his own: it answers every tick, as schemas/ tells."""
     sequences = itertools.count(1)
 
@@ -52,11 +52,11 @@ def commanding(stranger: Stranger, epoch: int, target: float) -> AbstractContext
     return repeating(answer)
 
 
-def test_anyone_may_take_lease_and_move_within_limits(robot: Robot) -> None:
+def test_anyone_may_take_lease_and_move_within_limits(robot: AttackedRobot) -> None:
     operator = robot.operator
     about, armings = operator.newest("hal/description"), operator.next("hal/clock")["arm_session"]
     operator.forget()
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         stranger.receive("hal/clock", "sensor/joints", "hal/status", "hal/description")
         answer = stranger.ask("hal/lease", {"action": "acquire", "holder": "mallory", "priority": 255})[0]
         assert answer["ok"], answer
@@ -74,14 +74,14 @@ def test_anyone_may_take_lease_and_move_within_limits(robot: Robot) -> None:
     operator.recover()
 
 
-def test_a_forged_description_misleads_neither_host_nor_services(robot: Robot) -> None:
+def test_a_forged_description_misleads_neither_host_nor_services(robot: AttackedRobot) -> None:
     """A controller that is started again while a stranger describes another robot still learns its own."""
     operator = robot.operator
     about = operator.newest("hal/description")
     wild = {"angle_min_rad": -1e4, "angle_max_rad": 1e4, "speed_limit_rad_s": 1e5, "torque_limit_nm": 1e5}
     forged = {**about, "joints": [{**joint, **wild} for joint in about["joints"]], "max_step_rad": 10.0}
     operator.forget()
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         publisher = stranger.latch("hal/description", forged)
         os.kill(robot.run.part("control"), signal.SIGKILL)  # so that a controller learns the robot again
         with repeating(lambda: publisher.put(wire.encode(forged)), 0.02):
@@ -92,9 +92,9 @@ def test_a_forged_description_misleads_neither_host_nor_services(robot: Robot) -
     assert beyond_limits(about, rows) == []
 
 
-def test_impostor_blocks_confirmation_but_not_the_stop(robot: Robot) -> None:
+def test_impostor_blocks_confirmation_but_not_the_stop(robot: AttackedRobot) -> None:
     answer: dict[str, Any] = {"ok": False, "reason": "no", "refusal": "wrong_state", "epoch": 0, "lifecycle": "armed"}
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         stranger.pretend("hal/estop", answer)
         stranger.pretend("hal/lifecycle", answer)
         asked_s = time.monotonic()
@@ -104,10 +104,10 @@ def test_impostor_blocks_confirmation_but_not_the_stop(robot: Robot) -> None:
         assert robot.run.run_tool("robot", "reset").code == 1
 
 
-def test_anybody_may_release_the_lease_which_stops_the_robot(robot: Robot) -> None:
+def test_anybody_may_release_the_lease_which_stops_the_robot(robot: AttackedRobot) -> None:
     operator = robot.operator
     clock = operator.next("hal/clock")
-    with Stranger(robot.endpoint) as stranger:
+    with NetworkStranger(robot.endpoint) as stranger:
         release = {"action": "release", "holder": operator.status()["lease_holder"], "epoch": clock["lease_epoch"]}
         stranger.ask("hal/lease", release)
     operator.until(lambda: operator.lifecycle() != "armed", "a stop", 1.0)

@@ -13,7 +13,7 @@ from verification.attack.command import snakesim, steering
 from verification.attack.effort import FULL, Record, effort
 from verification.attack.means import datagrams
 from verification.attack.means.floods import end, flood, half_open
-from verification.attack.robot import Robot
+from verification.attack.robot import AttackedRobot
 from verification.attack.stranger import HostTime
 
 COMMAND_S = 5.0  # from typing `snakesim estop` to the stop, the start of a Python process included
@@ -22,7 +22,7 @@ FLOODED_S = float(effort(1, 5))  # before the stop is asked for
 TICKS_S = 1.0  # the host must not stand still for longer, whoever comes and goes
 TIMES = range(effort(1, 5))
 
-Flood = Callable[[Robot], AbstractContextManager[object]]
+Flood = Callable[[AttackedRobot], AbstractContextManager[object]]
 
 
 def flooding(kind: str, amount: int, processes: int = 1) -> Flood:
@@ -50,7 +50,9 @@ def _both(one: AbstractContextManager[object], two: AbstractContextManager[objec
 
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("name", FLOODS if FULL else ("half_open", "lease_queries"))
-def test_a4_the_command_stops_the_robot_under(robot: Robot, name: str, _time: int, record_property: Record) -> None:
+def test_a4_the_command_stops_the_robot_under(
+    robot: AttackedRobot, name: str, _time: int, record_property: Record
+) -> None:
     operator = robot.operator
     with FLOODS[name](robot):
         time.sleep(FLOODED_S)
@@ -70,7 +72,7 @@ def test_a4_the_command_stops_the_robot_under(robot: Robot, name: str, _time: in
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("by", ["query", pytest.param("datagram", marks=pytest.mark.slow)])
 def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
-    robot: Robot, by: str, _time: int, record_property: Record
+    robot: AttackedRobot, by: str, _time: int, record_property: Record
 ) -> None:
     """Zenoh holds up the whole network meanwhile, so the host's own ticks tell when the joints were made safe."""
     operator = robot.operator
@@ -101,7 +103,7 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
 # --- by UDP, beside the endpoint ------------------------------------------------------------------------------------
 
 
-def test_a4_datagram_stops_the_robot_and_names_its_sender(robot: Robot, record_property: Record) -> None:
+def test_a4_datagram_stops_the_robot_and_names_its_sender(robot: AttackedRobot, record_property: Record) -> None:
     asked_s = time.monotonic()
     answer = datagrams.ask(robot.endpoint, datagrams.stop("the bench's red button"), 2.0)
     assert answer is not None, "no answer at the endpoint's UDP port"
@@ -113,7 +115,7 @@ def test_a4_datagram_stops_the_robot_and_names_its_sender(robot: Robot, record_p
 
 
 @pytest.mark.parametrize("name", FLOODS if FULL else ("lease_queries",))
-def test_a4_a_datagram_stops_the_robot_under(robot: Robot, name: str, record_property: Record) -> None:
+def test_a4_a_datagram_stops_the_robot_under(robot: AttackedRobot, name: str, record_property: Record) -> None:
     with FLOODS[name](robot):
         time.sleep(FLOODED_S)
         asked_s = time.monotonic()
@@ -123,7 +125,7 @@ def test_a4_a_datagram_stops_the_robot_under(robot: Robot, name: str, record_pro
     assert answer is not None and took_s < QUERY_S
 
 
-def test_a4_flood_of_wrong_datagrams_blocks_no_right_one(robot: Robot, record_property: Record) -> None:
+def test_a4_flood_of_wrong_datagrams_blocks_no_right_one(robot: AttackedRobot, record_property: Record) -> None:
     before = robot.health()
     with datagrams.flood(robot.endpoint) as sent:
         time.sleep(float(effort(2, 10)))
@@ -137,7 +139,7 @@ def test_a4_flood_of_wrong_datagrams_blocks_no_right_one(robot: Robot, record_pr
     robot.unharmed(before)
 
 
-def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: Robot) -> None:
+def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: AttackedRobot) -> None:
     before = robot.health()
     for who in (b"", b"\xff\xfe\x80", b"\x1b[2J\r\nplanar13: armed", b"x" * 65, b"x" * 60_000, "é".encode() * 64):
         datagrams.ask(robot.endpoint, datagrams.stop(who), 0.2)
@@ -149,7 +151,7 @@ def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: Robot) ->
 
 
 @pytest.mark.parametrize("knows_nonce", [False, True], ids=["wrong_nonce", "right_nonce"])
-def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(robot: Robot, knows_nonce: bool) -> None:
+def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(robot: AttackedRobot, knows_nonce: bool) -> None:
     endpoint = find_free_endpoint()
     with datagrams.false_port(endpoint, knows_nonce=knows_nonce):
         ended = snakesim(robot.run.home, "estop", "--endpoint", endpoint)
@@ -157,7 +159,7 @@ def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(robot: Robot, knows
     assert "planar13: stopped\n" not in ended.printed, ended.printed
 
 
-def test_a4_a_stop_keeps_trying_while_the_network_is_shut(robot: Robot) -> None:
+def test_a4_a_stop_keeps_trying_while_the_network_is_shut(robot: AttackedRobot) -> None:
     with contextlib.ExitStack() as shut:
         shut.enter_context(half_open(robot.endpoint, effort(150, 2000)))
         opens = threading.Timer(1.5, shut.close)  # the tool is at it by then

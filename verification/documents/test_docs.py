@@ -14,12 +14,12 @@ import pytest
 
 from snakesim_testing.runs import documents
 from snakesim_testing.runs.command import make_environment
-from snakesim_testing.runs.documents import REPOSITORY, Section, needs_uv, parse_sections
+from snakesim_testing.runs.documents import REPOSITORY, DocumentSection, needs_uv, parse_sections
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
 
-def typed_in(page: str) -> list[Section]:
+def typed_in(page: str) -> list[DocumentSection]:
     """The sections of a page in which something is to be typed."""
     return [section for section in parse_sections(REPOSITORY / page) if section.has_commands]
 
@@ -48,7 +48,7 @@ README = typed_in("README.md")
 LIMIT_S = 500.0
 
 
-def named(section: Section) -> str:
+def named(section: DocumentSection) -> str:
     """A test's name."""
     return re.sub(r"\W+", "-", section.title).lower()
 
@@ -90,7 +90,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 @pytest.mark.parametrize(
     "section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *SCENES, *URDF, *LESSONS], ids=named
 )
-def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
+def test_a_section_as_printed(section: DocumentSection, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
     for name, content in section.files.items():

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.lab.machines import NET, Machine, connect_machines
+from snakesim_testing.lab.machines import NET, NamespaceMachine, connect_machines
 from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 pytestmark = [
@@ -43,7 +43,7 @@ def test_a_new_lab_step_by_step(tmp_path: Path) -> None:
                 typed(machines[where], script, tmp_path)
 
 
-def typed(machine: Machine, script: str, folder: Path) -> None:
+def typed(machine: NamespaceMachine, script: str, folder: Path) -> None:
     """Type a block, line by line; each line as often as somebody who waits for the machines would."""
     exported: list[str] = []
     env = environment(folder, machine.name)

@@ -15,8 +15,17 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, get_args
 
-from verification.faults.results import ROOT, Store, machine
-from verification.faults.row import TRIALS, Backend, Environment, Request, Result, Row, Trial, judge
+from verification.faults.results import ROOT, FaultResults, machine
+from verification.faults.row import (
+    TRIALS,
+    Backend,
+    Environment,
+    FaultRow,
+    InjectionTrial,
+    MeasurementRequest,
+    RowResult,
+    judge,
+)
 from verification.faults.table import ROWS
 
 # Set in a process that was started to measure rows in another environment: the name of this environment.
@@ -30,7 +39,7 @@ ENVIRONMENT_COMMANDS: dict[Environment, list[str]] = {
 ENVIRONMENT_LIMIT_S = 2400.0  # for all rows of one environment
 LOG_CHARACTERS = 800  # of each log, after an error
 
-Measurement = tuple[Row, Backend]
+Measurement = tuple[FaultRow, Backend]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 if every measured row is met, 1 otherwise.
     """
     arguments = _parse_arguments(argv)
-    store = Store(arguments.json)
+    store = FaultResults(arguments.json)
     measurements = _select_measurements(arguments.rows or list(ROWS), arguments.backends)
     started_in = os.environ.get(ENVIRONMENT_VARIABLE)
 
@@ -78,7 +87,7 @@ def _select_measurements(row_names: Sequence[str], only_backends: Sequence[str] 
     return measurements
 
 
-def _measure_row(row: Row, backend: Backend, trials: int) -> Result:
+def _measure_row(row: FaultRow, backend: Backend, trials: int) -> RowResult:
     """Measure a row on a backend. An exception ends the measurement, and is part of its result."""
     measure = row.measurement(backend)
     assert measure is not None, f"{row.name} does not apply to {backend}"
@@ -86,11 +95,11 @@ def _measure_row(row: Row, backend: Backend, trials: int) -> Result:
         trials = max(trials, row.min_trials)
     started_s = time.monotonic()
     load = _machine_load()
-    done: list[Trial] = []
+    done: list[InjectionTrial] = []
     broken = ""
     print(f"{datetime.now():%H:%M:%S} {row.name} on {backend} ...", flush=True)
     with tempfile.TemporaryDirectory(prefix=f"snakesim-{row.name}-") as folder:
-        request = Request(backend, trials, Path(folder), [])
+        request = MeasurementRequest(backend, trials, Path(folder), [])
         try:
             for trial in measure(request):
                 done.append(trial)
@@ -126,7 +135,7 @@ def _print_error(error: Exception, folder: Path) -> None:
 
 
 def _measure_in_environment(
-    environment: Environment, measurements: Sequence[Measurement], trials: int, store: Store
+    environment: Environment, measurements: Sequence[Measurement], trials: int, store: FaultResults
 ) -> None:
     """Measure rows by a process in another environment, which writes its results into the same file."""
     before = store.read()
@@ -148,7 +157,7 @@ def _measure_in_environment(
             store.save(_make_result(row, backend, broken=f"no result from the environment {environment!r}"))
 
 
-def _writable_folder_options(store: Store) -> list[str]:
+def _writable_folder_options(store: FaultResults) -> list[str]:
     """Return the options with which a guest may write into the folder of the results, if it is not in the checkout."""
     folder = store.path.resolve().parent
     if folder.is_relative_to(ROOT):
@@ -156,14 +165,16 @@ def _writable_folder_options(store: Store) -> list[str]:
     return ["--rwdir", str(folder)]
 
 
-def _make_result(row: Row, backend: Backend, **measured: Any) -> Result:
+def _make_result(row: FaultRow, backend: Backend, **measured: Any) -> RowResult:
     """Return a result of now; `measured` replaces the values of a result without trials."""
     values: dict[str, Any] = {"took_s": 0.0, "load": _machine_load(), "trials": []}
     values |= measured
-    return Result(row=row.name, backend=backend, when=f"{datetime.now():%Y-%m-%d %H:%M}", machine=machine(), **values)
+    return RowResult(
+        row=row.name, backend=backend, when=f"{datetime.now():%Y-%m-%d %H:%M}", machine=machine(), **values
+    )
 
 
-def _print_result(row: Row, backend: Backend, store: Store) -> list[str]:
+def _print_result(row: FaultRow, backend: Backend, store: FaultResults) -> list[str]:
     """Print the result of a row. Returns row and backend in words if the row is not met, otherwise nothing."""
     result = store.read()[row.name, backend]
     verdict = judge(row, result)
@@ -185,7 +196,9 @@ def _parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--write", action="store_true", help="write docs/benchmarks/faults.md and docs/fault-table.csv from all results"
     )
-    parser.add_argument("--json", type=Path, default=Store().path, help="raw results (docs/benchmarks/faults.json)")
+    parser.add_argument(
+        "--json", type=Path, default=FaultResults().path, help="raw results (docs/benchmarks/faults.json)"
+    )
     return parser.parse_args(argv)
 
 

@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 from snakesim_hal.base.process import set_parent_death_signal
-from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.session import ConnectionSettings, open_session
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 
 SLEEP_S = 0.5
@@ -24,13 +24,13 @@ def main() -> None:
     set_parent_death_signal()
     was_reported: list[bool] = []
 
-    def sleeps(_arrival: Arrival) -> None:
+    def sleeps(_arrival: ReceivedSample) -> None:
         if not was_reported:
             was_reported.append(True)
             print(STUCK, flush=True)
         time.sleep(SLEEP_S)
 
-    def writes(arrival: Arrival) -> None:
+    def writes(arrival: ReceivedSample) -> None:
         try:
             with Path("/dev/full").open("wb") as file:
                 file.write(arrival.payload)
@@ -40,7 +40,7 @@ def main() -> None:
                 print(f"{STUCK}: {error.strerror}", flush=True)
             raise
 
-    with open_session(Link(endpoint, namespace)) as session:
+    with open_session(ConnectionSettings(endpoint, namespace)) as session:
         for key in KEYS:
             session.on_arrival(key, sleeps if kind == "sleep" else writes)
         while True:

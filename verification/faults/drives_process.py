@@ -40,7 +40,7 @@ from snakesim_hal.model.scenario import RunConfig, load_scenario
 from snakesim_hal.programs.preflight import decode_backend_settings
 from snakesim_serial_backend.emulation import create_named_ptys
 from snakesim_serial_backend.servo_backend import ServoBackend
-from snakesim_serial_backend.wire import Pty
+from snakesim_serial_backend.wire import PseudoTerminal
 from snakesim_testing.benches.emulated_drives import list_enabled_drives
 
 PAUSE_S = 0.0005
@@ -49,7 +49,7 @@ DRIVEN = (ModuleState.ARMED, ModuleState.STOPPING)
 
 
 @dataclass(frozen=True)
-class Drives:
+class DriveProcesses:
     """Drives on their buses: what lets them run, and which of them are enabled, tail to head."""
 
     run: Callable[[], object]
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
+def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> DriveProcesses:
     """Open the buses of a configuration, and put its drives on them."""
     backend: Any = load_plugin(BACKENDS, config.backend)
     settings = decode_backend_settings(config, backend)
@@ -103,7 +103,7 @@ def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> Drives:
             found |= dict(zip(part.joints, list_enabled_drives(emulator), strict=True))
         return [found[joint] for joint in range(len(found))]
 
-    return Drives(run, enabled)
+    return DriveProcesses(run, enabled)
 
 
 def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, opened: ExitStack) -> Any:
@@ -115,17 +115,17 @@ def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, open
         context = CanEmulatorContext(joints, part.settings, body, [wire] * len(joints), clock.now_ns)
         return opened.enter_context(closing(driver_type.emulator_class(context)))
     assert issubclass(driver_type, ServoBackend), f"no emulator of {driver_type.name} as a process"
-    ptys: list[Pty] = opened.enter_context(create_named_ptys([Path(part.ports[0])]))
+    ptys: list[PseudoTerminal] = opened.enter_context(create_named_ptys([Path(part.ports[0])]))
     return driver_type.make_emulator(joints, part.settings, body, ptys * len(joints), clock)
 
 
-def _modules(config: RunConfig, settings: Any, pose: str, opened: ExitStack) -> Drives:
+def _modules(config: RunConfig, settings: Any, pose: str, opened: ExitStack) -> DriveProcesses:
     wires = [opened.enter_context(closing(open_wire(c, FROM_HOST, settings.bit_rate))) for c in settings.channels]
     send_pose = opened.enter_context(closing(PoseSender(pose)))
     physics_model = make_physics_model(config, settings, config.backend)
     chain = ModuleChain(config, settings, physics_model, stepped=False, send_pose=send_pose)
     server = EmulatorServer(wires, chain)
-    return Drives(
+    return DriveProcesses(
         lambda: server.run_due(time.monotonic_ns()), lambda: [slot.module.state in DRIVEN for slot in chain.slots]
     )
 

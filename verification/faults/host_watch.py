@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 import msgspec
 
 from snakesim_hal.network.private_channel import MAX_BYTES, HostMessage, socket_pair
-from snakesim_hal.wire.messages import Status
-from verification.faults.observer import Received, TrialError
+from snakesim_hal.wire.messages import RobotStatus
+from verification.faults.observer import ReceivedMessage, TrialError
 
 LOOK_S = 0.0005
 LIMIT_S = 10.0
@@ -42,7 +42,7 @@ class HostWatch:
     def __init__(self) -> None:
         self._socket, self.inherited = socket_pair()
         self._socket.settimeout(0.1)
-        self._statuses: list[Received[Status]] = []
+        self._statuses: list[ReceivedMessage[RobotStatus]] = []
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="host watch", daemon=True)
         with urgently():
@@ -59,7 +59,7 @@ class HostWatch:
         """Return the newest status."""
         return self._statuses[-1].message.lifecycle if self._statuses else None
 
-    def first(self, condition: Callable[[Status], bool], since_ns: int, what: str) -> Received[Status]:
+    def first(self, condition: Callable[[RobotStatus], bool], since_ns: int, what: str) -> ReceivedMessage[RobotStatus]:
         """The first status after a time of which a condition holds. Raises TrialError when none comes."""
         deadline = time.monotonic() + LIMIT_S
         while time.monotonic() < deadline:
@@ -80,4 +80,4 @@ class HostWatch:
                 self._over.wait(0.1)
                 continue
             if host_message.status is not None:
-                self._statuses.append(Received(time.monotonic_ns(), host_message.status))
+                self._statuses.append(ReceivedMessage(time.monotonic_ns(), host_message.status))

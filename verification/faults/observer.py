@@ -11,20 +11,20 @@ from typing import Any, Generic, TypeVar
 
 from snakesim_hal.base.errors import NotConnectedError, WireError
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
     Clock,
-    Description,
     FaultRequest,
+    JointMode,
     JointState,
     LifecycleRequest,
     Message,
-    Mode,
-    Status,
+    RobotDescription,
+    RobotStatus,
 )
 
 LIMIT_S = 30.0
@@ -39,7 +39,7 @@ class TrialError(AssertionError):
 
 
 @dataclass(frozen=True)
-class Received(Generic[MessageT]):
+class ReceivedMessage(Generic[MessageT]):
     """A message, and when it arrived."""
 
     at_ns: int
@@ -51,25 +51,25 @@ class Observer:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self.status: Status | None = None
+        self.status: RobotStatus | None = None
         self.stumbles = 0  # armings that did not last, or were refused at the last moment
-        self.statuses: list[Received[Status]] = []
-        self.applied: list[Received[AppliedCommand]] = []
-        self.clocks: list[Received[Clock]] = []
+        self.statuses: list[ReceivedMessage[RobotStatus]] = []
+        self.applied: list[ReceivedMessage[AppliedCommand]] = []
+        self.clocks: list[ReceivedMessage[Clock]] = []
         self.joints: dict[int, JointState] = {}
-        self.commands: list[Arrival] = []
-        self._inbox: SimpleQueue[Arrival] = SimpleQueue()
-        self._decoders: dict[str, Decoder[Any]] = {
-            key: Decoder(message)
+        self.commands: list[ReceivedSample] = []
+        self._inbox: SimpleQueue[ReceivedSample] = SimpleQueue()
+        self._decoders: dict[str, MessageDecoder[Any]] = {
+            key: MessageDecoder(message)
             for key, message in (
-                (keys.STATUS, Status),
+                (keys.STATUS, RobotStatus),
                 (keys.APPLIED, AppliedCommand),
                 (keys.CLOCK, Clock),
                 (keys.JOINTS, JointState),
             )
         }
-        self._descriptions = session.declare_latched_reader(keys.DESCRIPTION, Description)
-        self._description: Description | None = None
+        self._descriptions = session.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
+        self._description: RobotDescription | None = None
         session.on_latched_arrival(keys.STATUS, self._inbox.put)
         for key in (keys.APPLIED, keys.CLOCK, keys.JOINTS, keys.JOINT_COMMAND):
             session.on_arrival(key, self._inbox.put)
@@ -93,19 +93,19 @@ class Observer:
             else:
                 self.receive(arrival.monotonic_ns, message)
 
-    def on_unreadable(self, arrival: Arrival, error: WireError) -> None:
+    def on_unreadable(self, arrival: ReceivedSample, error: WireError) -> None:
         """Ignore a sample that cannot be decoded. Subclasses may record it."""
 
     def receive(self, at_ns: int, message: Any) -> None:
         """Record a message. at_ns: its arrival, by the monotonic clock."""
         match message:
-            case Status():
+            case RobotStatus():
                 self.status = message
-                self.statuses.append(Received(at_ns, message))
+                self.statuses.append(ReceivedMessage(at_ns, message))
             case AppliedCommand():
-                self.applied.append(Received(at_ns, message))
+                self.applied.append(ReceivedMessage(at_ns, message))
             case Clock():
-                self.clocks.append(Received(at_ns, message))
+                self.clocks.append(ReceivedMessage(at_ns, message))
             case _:
                 self.joints[message.tick] = message
 
@@ -141,10 +141,10 @@ class Observer:
         """Return the newest lifecycle state."""
         return None if self.status is None else self.status.lifecycle
 
-    def description(self) -> Description:
+    def description(self) -> RobotDescription:
         """The robot."""
 
-        def found() -> Description | None:
+        def found() -> RobotDescription | None:
             self._description = (self._descriptions.drain() or [self._description])[-1]
             return self._description
 
@@ -152,7 +152,7 @@ class Observer:
 
     # --- what is looked for -----------------------------------------------------------------------------------
 
-    def first_safe(self, since_ns: int) -> Received[AppliedCommand] | None:
+    def first_safe(self, since_ns: int) -> ReceivedMessage[AppliedCommand] | None:
         """Return the first setpoints after a time that are the host's own stop mode."""
         return next((h for h in self.applied if h.at_ns >= since_ns and h.message.sequence is None), None)
 
@@ -160,10 +160,10 @@ class Observer:
         """How long until then."""
         return (self.until(lambda: self.first_safe(since_ns), "the stop mode", 3.0).at_ns - since_ns) / 1e6
 
-    def first_fault(self, since_ns: int) -> Status:
+    def first_fault(self, since_ns: int) -> RobotStatus:
         """The first status after a time that tells a fault."""
 
-        def found() -> list[Status]:
+        def found() -> list[RobotStatus]:
             return [h.message for h in self.statuses if h.at_ns >= since_ns and h.message.lifecycle == "fault"]
 
         return self.until(found, "a fault in the status", 3.0)[0]
@@ -257,9 +257,9 @@ class Observer:
             now = received.message
             measured = self.joints.get(now.tick)
             for i, mode in enumerate(now.mode):
-                if mode is not Mode.POSITION:
+                if mode is not JointMode.POSITION:
                     continue
-                if before is not None and before.tick == now.tick - 1 and before.mode[i] is Mode.POSITION:
+                if before is not None and before.tick == now.tick - 1 and before.mode[i] is JointMode.POSITION:
                     within = max(within, abs(now.target[i] - before.target[i]))
                 elif measured is not None:
                     first = max(first, abs(now.target[i] - measured.angle_rad[i]))

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from verification.faults.results import ROOT, Store
-from verification.faults.row import TRIALS, Heading, Result, Row, judge
+from verification.faults.results import ROOT, FaultResults
+from verification.faults.row import TRIALS, FaultHeading, FaultRow, RowResult, judge
 from verification.faults.table import HEADINGS
 from verification.faults.table.row_kinds import LEASE_MS, PERIOD_MS
 
@@ -65,10 +65,10 @@ EXPLANATION = """\
 Measure one row again with `python -m verification.faults --rows NAME --write`.
 """
 
-Results = Mapping[tuple[str, str], Result]
+Results = Mapping[tuple[str, str], RowResult]
 
 
-def write(store: Store, page: Path = PAGE) -> Path:
+def write(store: FaultResults, page: Path = PAGE) -> Path:
     """Write the page, and the table beside it. Return the path of the page."""
     results = store.read()
     page.with_name(TABLE_NAME).write_text(_format_table(results), encoding="utf-8")
@@ -104,7 +104,7 @@ def _page_lines(results: Results) -> Iterator[str]:
     yield EXPLANATION
 
 
-def _format_days(results: Sequence[Result]) -> str:
+def _format_days(results: Sequence[RowResult]) -> str:
     """Return when the results were measured."""
     days = sorted({result.when.split()[0] for result in results})
     if not days:
@@ -114,17 +114,17 @@ def _format_days(results: Sequence[Result]) -> str:
     return f", measured from {days[0]} to {days[-1]}"
 
 
-def _measurable(heading: Heading) -> list[tuple[Row, str]]:
+def _measurable(heading: FaultHeading) -> list[tuple[FaultRow, str]]:
     """Return row and backend of each measurement; a row that does not apply to a backend is left out."""
     return [(row, backend) for row in heading.rows for backend in row.backends()]
 
 
-def _key(pair: tuple[Row, str]) -> tuple[str, str]:
+def _key(pair: tuple[FaultRow, str]) -> tuple[str, str]:
     row, backend = pair
     return row.name, backend
 
 
-def _is_met(pair: tuple[Row, str], results: Results) -> bool:
+def _is_met(pair: tuple[FaultRow, str], results: Results) -> bool:
     result = results.get(_key(pair))
     return result is not None and judge(pair[0], result).met
 
@@ -157,7 +157,7 @@ def _format_table(results: Results) -> str:
     return text.getvalue()
 
 
-def _measured_cells(row: Row, result: Result) -> dict[str, Any]:
+def _measured_cells(row: FaultRow, result: RowResult) -> dict[str, Any]:
     """Return the cells of a measurement that was made."""
     verdict = judge(row, result)
     return {
@@ -176,7 +176,7 @@ def _measured_cells(row: Row, result: Result) -> dict[str, Any]:
     }
 
 
-def _recovery_cells(result: Result) -> dict[str, Any]:
+def _recovery_cells(result: RowResult) -> dict[str, Any]:
     """Return the cells about the recovery; none if there was nothing to recover from."""
     tried = [trial for trial in result.trials if trial.recovered is not None]
     if not tried:

@@ -6,26 +6,26 @@ from pathlib import Path
 
 import msgspec
 
-from verification.faults.row import Result
+from verification.faults.row import RowResult
 
 ROOT = Path(__file__).resolve().parents[2]
 RAW = ROOT / "docs" / "benchmarks" / "faults.json"
 
 
-class Store:
+class FaultResults:
     """Results by row and backend."""
 
     def __init__(self, path: Path = RAW) -> None:
         self.path = path
 
-    def read(self) -> dict[tuple[str, str], Result]:
+    def read(self) -> dict[tuple[str, str], RowResult]:
         """Return every stored result by row and backend."""
         if not self.path.is_file():
             return {}
-        results = msgspec.json.decode(self.path.read_bytes(), type=list[Result])
+        results = msgspec.json.decode(self.path.read_bytes(), type=list[RowResult])
         return {(result.row, result.backend): result for result in results}
 
-    def save(self, result: Result) -> None:
+    def save(self, result: RowResult) -> None:
         """Store a result, in place of an older one of the same row and backend."""
         results = self.read() | {(result.row, result.backend): result}
         ordered = [results[key] for key in sorted(results)]

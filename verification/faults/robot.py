@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, write_config
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, write_config
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_operator.run import children
-from snakesim_operator.run.children import Child
+from snakesim_operator.run.children import ChildProcess
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.faults.host_watch import HostWatch, urgently
 from verification.faults.observer import Observer, TrialError
-from verification.faults.row import Request, Trial
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 START_LIMIT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0  # an emulated machine is slow
 MOVING_S = 0.25  # from arming to the injection
@@ -29,25 +29,25 @@ PERIOD_S = 0.01
 def configuration(backend: str, **dotted: Any) -> RunConfig:
     """The triplet in real time at 100 Hz, for as long as anybody likes; `__` in a name stands for the dot."""
     values = {"backend": backend, "clock_mode": "realtime", "duration_s": 3600.0, **dotted}
-    overrides = [Override(name.replace("__", "."), value, f"--{name}") for name, value in values.items()]
+    overrides = [KeyOverride(name.replace("__", "."), value, f"--{name}") for name, value in values.items()]
     return load_scenario("triplet", overrides).config
 
 
-class Robot:
+class ProcessRobot:
     """Host, guidance, navigation and control, each a process of its own; any can be killed, frozen, started again."""
 
     def __init__(self, folder: Path, config: RunConfig, *, endpoint: str | None = None, router: bool = False) -> None:
         """router: another process listens at the endpoint."""
         self.folder, self.config, self.router = folder, config, router
         self.endpoint = endpoint or find_free_endpoint()
-        self.running: dict[str, Child] = {}
+        self.running: dict[str, ChildProcess] = {}
         self._stack = ExitStack()
         self.host = HostWatch()  # of the first host
         self._stack.callback(self.host.close)
         self.random = random.Random(config.seed)
         write_config(config, folder / "config.json")
 
-    def __enter__(self) -> "Robot":
+    def __enter__(self) -> "ProcessRobot":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -57,7 +57,7 @@ class Robot:
         children.stop_children(list(self.running.values()))
         self._stack.close()
 
-    def start(self, name: str) -> Child:
+    def start(self, name: str) -> ChildProcess:
         """Start one of its processes."""
         common = [str(self.folder / "config.json"), "--endpoint", self.endpoint]
         inherits: list[int] = []
@@ -89,7 +89,7 @@ class Robot:
     def observe(self) -> Observer:
         """Join the network as soon as there is one."""
         deadline = time.monotonic() + START_LIMIT_S
-        link = Link(self.endpoint, self.config.robot.name)
+        link = ConnectionSettings(self.endpoint, self.config.robot.name)
         while True:
             try:
                 with urgently():
@@ -129,10 +129,12 @@ class Robot:
 
 @contextlib.contextmanager
 def robot(
-    request: Request, config: RunConfig | None = None, *, router: bool = False, **dotted: Any
-) -> Iterator[tuple[Robot, Observer]]:
+    request: MeasurementRequest, config: RunConfig | None = None, *, router: bool = False, **dotted: Any
+) -> Iterator[tuple[ProcessRobot, Observer]]:
     """A robot with all its processes, and who watches it. config: other than `configuration` with these values."""
-    with Robot(request.folder, config or configuration(request.backend, **dotted), router=router) as started_robot:
+    with ProcessRobot(
+        request.folder, config or configuration(request.backend, **dotted), router=router
+    ) as started_robot:
         if router:
             started_robot.start("router")
             started_robot.observe().session.close()  # it is there
@@ -143,15 +145,15 @@ def robot(
         request.retry(observer.stumbles)
 
 
-def recovered(observer: Observer, value: float | None, failure: str = "") -> Trial:
+def recovered(observer: Observer, value: float | None, failure: str = "") -> InjectionTrial:
     """Bring the robot back by an operator's commands, and look at how its targets step."""
     try:
         observer.arm(START_LIMIT_S)
     except TrialError as error:
-        return Trial(value=value, failure="; ".join(filter(None, (failure, str(error)))), recovered=False)
+        return InjectionTrial(value=value, failure="; ".join(filter(None, (failure, str(error)))), recovered=False)
     observer.watch(SETTLED_S)
     steps = observer.steps()
     bound = observer.description().max_step_rad
     if max(steps.values()) > bound + 1e-9:
         failure = "; ".join(filter(None, (failure, f"a target jumped by more than {bound} rad at recovery")))
-    return Trial(value=value, failure=failure, recovered=True, **steps)
+    return InjectionTrial(value=value, failure=failure, recovered=True, **steps)

@@ -17,7 +17,7 @@ Environment = Literal["here", "namespaces", "guest"]
 TRIALS = 20  # of each row and backend in a whole table
 
 
-class Trial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class InjectionTrial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The measurement of one injection."""
 
     value: float | None  # in the row's unit; None: the expected reaction did not happen
@@ -27,7 +27,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     first_rad: float | None = None  # largest distance of the first angle targets from the measured angles
 
 
-class Result(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class RowResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The measurements of a row on one backend."""
 
     row: str
@@ -36,14 +36,16 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     took_s: float
     load: float  # of the machine, at the beginning
     machine: str
-    trials: list[Trial]
-    retried: int | None = None  # trials that were repeated, see `Request.retry`; None: they were not counted then
+    trials: list[InjectionTrial]
+    retried: int | None = (
+        None  # trials that were repeated, see `MeasurementRequest.retry`; None: they were not counted then
+    )
     notes: list[str] = []
     broken: str = ""  # why the measurement ended early
 
 
 @dataclass
-class Request:
+class MeasurementRequest:
     """A request to measure a row. The measurement adds its notes and its repeated trials."""
 
     backend: str
@@ -62,12 +64,12 @@ class Request:
             self.notes.append(text)
 
 
-Measure = Callable[[Request], Iterator[Trial]]
+Measure = Callable[[MeasurementRequest], Iterator[InjectionTrial]]
 """Yields the trials of a row as they are done."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class FaultRow:
     """One row of the table: a fault, the expected reaction, and how it is measured on each backend."""
 
     name: str
@@ -91,17 +93,17 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Heading:
+class FaultHeading:
     """A fault as the page summarizes it. It may need several rows."""
 
     fault: str
     expected: str
     deadline: str
-    rows: tuple[Row, ...]
+    rows: tuple[FaultRow, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class RowVerdict:
     """Whether a row is met."""
 
     met: bool
@@ -110,7 +112,7 @@ class Verdict:
     worst: float | None = None
 
 
-def judge(row: Row, result: Result) -> Verdict:
+def judge(row: FaultRow, result: RowResult) -> RowVerdict:
     """Return whether a row is met in all of its trials, and every objection if it is not."""
     values = [trial.value for trial in result.trials if trial.value is not None]
     failures = [trial.failure for trial in result.trials if trial.failure]
@@ -131,7 +133,7 @@ def judge(row: Row, result: Result) -> Verdict:
         objections.append(f"no recovery in {not_recovered} trials")
     if not result.trials and not result.broken:
         objections.append("no trial")
-    return Verdict(
+    return RowVerdict(
         met=not objections,
         reason="; ".join(objections),
         median=statistics.median(values) if values else None,

@@ -9,7 +9,7 @@ import msgspec
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointCommand
 from verification.faults.observer import Observer
 
@@ -22,14 +22,14 @@ def send_raw(session: Session, payload: bytes, encoding: str | None = None) -> N
     session._zenoh.put(keys.JOINT_COMMAND, payload, encoding=encoding or format_encoding(JointCommand))
 
 
-class Stranger:
+class CommandForger:
     """Copies the controller's newest command, lease epoch and all, and spoils one thing in it."""
 
     def __init__(self, observer: Observer, seed: int = 1) -> None:
         self.observer = observer
         self.random = random.Random(seed)
         self._sequence = FORGED
-        self._decoder = Decoder(JointCommand)
+        self._decoder = MessageDecoder(JointCommand)
 
     def forged(self, **changes: Any) -> JointCommand:
         """As the controller would send it now, but for the changes."""

@@ -36,7 +36,7 @@ def over_network(asked: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory(prefix="snakesim-fuzz-") as temporary:
         out = (asked.out or Path(temporary) / "run").resolve()
         out.parent.mkdir(parents=True, exist_ok=True)
-        request = network.Request(asked.payloads, asked.rate, asked.seed, asked.backend, robot_hz=asked.robot_hz)
+        request = network.FuzzRequest(asked.payloads, asked.rate, asked.seed, asked.backend, robot_hz=asked.robot_hz)
         verdict = network.fuzz(out, request)
     print(network.table(verdict))
     return 1 if verdict.violations else 0

@@ -18,7 +18,7 @@ from snakesim_can_backend.protocol.definitions import (
     FROM_HOST,
     NODE_BITS,
     WITH_CHECKSUM,
-    Frame,
+    CanFrame,
     Opcode,
     checksum,
     frame_id,
@@ -26,8 +26,8 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
-from snakesim_testing.can.driver_loop import JOINTS, Loop, config, loop
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
+from snakesim_testing.can.driver_loop import JOINTS, DriverLoop, config, loop
 from verification.fuzz.texts import flipped
 
 PER_TICK = 40
@@ -41,9 +41,9 @@ class FrameMaker:
 
     def __init__(self, rng: random.Random) -> None:
         self._rng = rng
-        self.heard: list[Frame] = [Frame(0x080, bytes(5)), Frame(frame_id(Opcode.HEARTBEAT, 1), bytes(8))]
+        self.heard: list[CanFrame] = [CanFrame(0x080, bytes(5)), CanFrame(frame_id(Opcode.HEARTBEAT, 1), bytes(8))]
 
-    def make(self) -> tuple[str, Frame]:
+    def make(self) -> tuple[str, CanFrame]:
         """What was done, and the frame."""
         rng = self._rng
         kind, (identifier, data) = rng.choice(KINDS), rng.choice(self.heard)
@@ -64,10 +64,10 @@ class FrameMaker:
                 pass
         if data and rng.random() < 0.5 and parse_opcode(identifier) in WITH_CHECKSUM:
             data = data[:-1] + bytes([checksum(identifier, data[:-1])])
-        return kind, Frame(identifier, data)
+        return kind, CanFrame(identifier, data)
 
 
-class Stranger:
+class BusIntruder:
     """A third end of the bus."""
 
     def __init__(self, channel: str, maker: FrameMaker, words: Counter[str]) -> None:
@@ -80,7 +80,7 @@ class Stranger:
         """
         while (message := self.bus.recv(0)) is not None:
             if len(self._maker.heard) < 2000:
-                self._maker.heard.append(Frame(message.arbitration_id, bytes(message.data)))
+                self._maker.heard.append(CanFrame(message.arbitration_id, bytes(message.data)))
         for _ in range(frames):
             kind, (identifier, data) = self._maker.make()
             while as_modules and not is_from_module(identifier):
@@ -112,16 +112,16 @@ def run(frames: int, seed: int) -> Counter[str]:
 
 
 @contextmanager
-def _opened(maker: FrameMaker, words: Counter[str]) -> Iterator[tuple[Loop, Stranger]]:
+def _opened(maker: FrameMaker, words: Counter[str]) -> Iterator[tuple[DriverLoop, BusIntruder]]:
     """A driver on its bus, and the stranger; at every second opening he speaks from the beginning."""
-    strangers: list[Stranger] = []
+    strangers: list[BusIntruder] = []
     early = words["openings"] % 2 == 1
     words["openings"] += 1
     idle = VirtualWire.idle
 
     def speaks_when_idle(wire: VirtualWire) -> float | None:
         if not strangers:
-            strangers.append(Stranger(wire.channel, maker, words))
+            strangers.append(BusIntruder(wire.channel, maker, words))
         if early:
             strangers[0].speak(1, as_modules=True)
         return idle(wire)
@@ -137,7 +137,7 @@ def _opened(maker: FrameMaker, words: Counter[str]) -> Iterator[tuple[Loop, Stra
             stranger.bus.shutdown()
 
 
-def _tick(run: Loop, stranger: Stranger, words: Counter[str]) -> None:
+def _tick(run: DriverLoop, stranger: BusIntruder, words: Counter[str]) -> None:
     """A period under fire; now and then somebody resets and arms."""
     if run.tick % 20 == 10:
         run.lifecycle, run.wanted = "disarmed", None
@@ -149,5 +149,5 @@ def _tick(run: Loop, stranger: Stranger, words: Counter[str]) -> None:
     words.update(f"fault {fault.what}" for fault in run.faults[reported:])
     samples = run.samples[-1]
     for message in (samples.joints, *samples.by_key.values()):
-        assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
+        assert MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
     del run.samples[:-1]

@@ -21,7 +21,7 @@ UNTIL = b"console: "  # printed by a command that goes on until it is told to st
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CommandOutcome:
     """A command that has ended. code: below 0 for a signal."""
 
     code: int
@@ -31,7 +31,7 @@ class Outcome:
     peak_mb: float
 
 
-Forked = Callable[..., Outcome]
+Forked = Callable[..., CommandOutcome]
 
 
 @contextmanager
@@ -45,9 +45,9 @@ def forked(home: Path) -> Iterator[Forked]:
         asked, answers = process.stdin, process.stdout
         assert asked is not None and answers is not None
 
-        def snakesim(cwd: Path, *arguments: str) -> Outcome:
+        def snakesim(cwd: Path, *arguments: str) -> CommandOutcome:
             print(json.dumps([str(cwd), *arguments]), file=asked, flush=True)
-            return Outcome(**json.loads(answers.readline()))
+            return CommandOutcome(**json.loads(answers.readline()))
 
         yield snakesim
 

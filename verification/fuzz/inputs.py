@@ -28,7 +28,7 @@ from snakesim_hal.model.scene import SceneFile
 from snakesim_hal.network.local_registry import LocalRobot, list_local_robots
 from snakesim_hal.network.router import read_router_settings
 from snakesim_hal.network.stop_port import REQUEST_HEADER, open_stop_port, request_stop, start_stop_server
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import EstopRequest, Pose
 from snakesim_operator.results.last_run import read_last_run
 from snakesim_operator.results.run_log import RunRecord
@@ -56,7 +56,7 @@ FAULTS = [
 
 
 @dataclass(frozen=True)
-class Input:
+class DecoderInput:
     """One decoder, as the product reaches it."""
 
     name: str
@@ -66,19 +66,19 @@ class Input:
 
 
 @dataclass
-class Outcome:
+class PayloadOutcomes:
     """What became of one input's payloads."""
 
     words: Counter[str] = field(default_factory=Counter[str])
     longest_s: float = 0.0
 
 
-def run(inputs: list[Input], payloads: int, seed: int) -> dict[str, Outcome]:
+def run(inputs: list[DecoderInput], payloads: int, seed: int) -> dict[str, PayloadOutcomes]:
     """So many payloads into each. Raises whatever an input raises that it must not."""
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, PayloadOutcomes] = {}
     for number, one in enumerate(inputs):
         maker = TextMaker(random.Random(seed * 1000 + number), one.seeds, one.max_bytes)
-        outcome = outcomes[one.name] = Outcome()
+        outcome = outcomes[one.name] = PayloadOutcomes()
         for _ in range(payloads):
             kind, payload = maker.make()
             started = time.monotonic()
@@ -98,7 +98,7 @@ def run(inputs: list[Input], payloads: int, seed: int) -> dict[str, Outcome]:
 
 
 @contextmanager
-def all_inputs(folder: Path) -> Iterator[list[Input]]:
+def all_inputs(folder: Path) -> Iterator[list[DecoderInput]]:
     """Every input, with `folder` for its files. It takes a short run of the product to have a record to spoil."""
     record = folder / "record"
     done = snakesim("run", "triplet", "--duration", "0.3", "--out", str(record), cwd=folder)
@@ -110,7 +110,7 @@ def all_inputs(folder: Path) -> Iterator[list[Input]]:
 
 
 @contextmanager
-def mocap() -> Iterator[Input]:
+def mocap() -> Iterator[DecoderInput]:
     """Motion capture: a datagram by UDP, as a stranger would send it, and a good one after it."""
     now_ns = 0
     receiver = MocapReceiver("127.0.0.1:0", 0.01, lambda _timestamp_ns: now_ns)
@@ -124,7 +124,7 @@ def mocap() -> Iterator[Input]:
             stranger.sendto(payload, (host, int(port)))
             pose = receiver.read_newest(now_ns // 10_000_000, now_ns)
             if pose is not None:
-                assert Decoder(Pose).decode(encode(pose), format_encoding(Pose)) == pose
+                assert MessageDecoder(Pose).decode(encode(pose), format_encoding(Pose)) == pose
                 return "a pose"
             return next(iter(receiver.rejected_count_by_reason - before), "no velocity yet")
 
@@ -135,11 +135,11 @@ def mocap() -> Iterator[Input]:
             return word
 
         poses = [*map(_pose, (1, 10**7, 10**9)), _pose(10**8, reported=False)]
-        yield Input("motion capture", poses, take, MAX_DATAGRAM_BYTES + 100)
+        yield DecoderInput("motion capture", poses, take, MAX_DATAGRAM_BYTES + 100)
 
 
 @contextmanager
-def stop_port() -> Iterator[Input]:
+def stop_port() -> Iterator[DecoderInput]:
     """The stop port: a datagram by UDP, and now and then a real stop, which must be answered."""
     opened = open_stop_port("127.0.0.1", 0)
     host, port = opened.getsockname()
@@ -147,7 +147,9 @@ def stop_port() -> Iterator[Input]:
     count = 0
 
     def stop(who: str, reply: Callable[[str], None]) -> None:
-        assert Decoder(EstopRequest).decode(encode(EstopRequest(requester=who[:64])), format_encoding(EstopRequest))
+        assert MessageDecoder(EstopRequest).decode(
+            encode(EstopRequest(requester=who[:64])), format_encoding(EstopRequest)
+        )
         heard.append(who)
         reply("stopped")
 
@@ -165,7 +167,7 @@ def stop_port() -> Iterator[Input]:
             heard.clear()
             return "a stop" if heard_now else "no stop yet"
 
-        yield Input(
+        yield DecoderInput(
             "stop port", [REQUEST_HEADER + bytes(16) + who for who in (b"", b"a person", b"x" * 64)], take, 60_000
         )
 
@@ -176,7 +178,7 @@ def _pose(timestamp_ns: int, *, reported: bool = True) -> bytes:
     return msgspec.json.encode({**plain, **(velocities if reported else {})})
 
 
-def texts() -> list[Input]:
+def texts() -> list[DecoderInput]:
     """What is typed: flags of a command, faults on request."""
 
     def typed(parse: Callable[[str], object]) -> Callable[[bytes], str]:
@@ -187,19 +189,19 @@ def texts() -> list[Input]:
         return take
 
     return [
-        Input(
+        DecoderInput(
             "--set",
             FLAGS,
             typed(lambda text: scenario.load_scenario("triplet", [scenario.parse_set_option(text)])),
             LARGEST // 8,
         ),
-        Input(
+        DecoderInput(
             "a fault",
             FAULTS,
             typed(lambda text: (injection.parse_injection(text), twin_faults.parse_fault(text, 13))),
             LARGEST // 8,
         ),
-        Input(
+        DecoderInput(
             "a typed fault",
             [b"mute joint_3 off", b"leak joint_1"],
             typed(lambda t: twin_faults.parse_typed_fault(t, 13, 1.0)),
@@ -207,7 +209,7 @@ def texts() -> list[Input]:
     ]
 
 
-def written(folder: Path) -> list[Input]:
+def written(folder: Path) -> list[DecoderInput]:
     """Files that people write, and those that the product keeps for itself."""
 
     def shipped(kind: str) -> list[bytes]:
@@ -243,26 +245,28 @@ def written(folder: Path) -> list[Input]:
     )
     config = (folder / "record" / "config.json").read_bytes()
     return [
-        Input(
+        DecoderInput(
             "a robot file",
             shipped("robots"),
             file("r.toml", lambda p: files.decode_table(files.read_table(p), RobotFile)),
         ),
-        Input(
+        DecoderInput(
             "a scene file",
             shipped("scenes"),
             file("s.toml", lambda p: files.decode_table(files.read_table(p), SceneFile)),
         ),
-        Input("a scenario", shipped("scenarios"), file("x.toml", lambda p: scenario.load_scenario(str(p)))),
-        Input("config.json", [config], file("x.json", lambda p: scenario.load_scenario(str(p)))),
-        Input("router.json5", [files.ROUTER_CONFIG_PATH.read_bytes()], file("router.json5", read_router_settings)),
-        Input(ESTOP, [b'{"requester":"a person","tick":7}'], file(ESTOP, latch)),
-        Input(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: read_last_run())),
-        Input("a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)),
+        DecoderInput("a scenario", shipped("scenarios"), file("x.toml", lambda p: scenario.load_scenario(str(p)))),
+        DecoderInput("config.json", [config], file("x.json", lambda p: scenario.load_scenario(str(p)))),
+        DecoderInput(
+            "router.json5", [files.ROUTER_CONFIG_PATH.read_bytes()], file("router.json5", read_router_settings)
+        ),
+        DecoderInput(ESTOP, [b'{"requester":"a person","tick":7}'], file(ESTOP, latch)),
+        DecoderInput(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: read_last_run())),
+        DecoderInput("a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)),
     ]
 
 
-def recorded(record: Path, path: Path) -> Input:
+def recorded(record: Path, path: Path) -> DecoderInput:
     """A run's folder with one file spoilt."""
     good = path.read_bytes()
 
@@ -274,4 +278,4 @@ def recorded(record: Path, path: Path) -> Input:
             path.write_bytes(good)
         return "taken"
 
-    return Input(f"a run's {path.name}", [good], take)
+    return DecoderInput(f"a run's {path.name}", [good], take)

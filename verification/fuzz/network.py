@@ -17,16 +17,16 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.run_log.black_box import read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Mode, Status
+from snakesim_hal.wire.messages import JointMode, RobotStatus
 from snakesim_testing.harness.processes import find_processes_of_run, find_run_processes
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import TIMEOUT_S, Running, running_snakesim
-from verification.fuzz.vitals import Vitals, complaints, vitals
-from verification.fuzz.writer import Sent
+from snakesim_testing.runs.command import TIMEOUT_S, RunningCommand, running_snakesim
+from verification.fuzz.vitals import ProcessVitals, complaints, vitals
+from verification.fuzz.writer import SentSample
 
 ROBOT = "planar13"
 SCENARIO = ("triplet", "--controller", "hold", "--clock-mode", "realtime", "--duration", "86400")
@@ -39,12 +39,12 @@ TAKEN_SHARE = 0.01  # of the ticks, fewer commands taken than in the quiet stret
 
 
 @dataclass
-class Stretch:
+class ObservedPeriod:
     """Some time of a run, as it was watched from outside."""
 
-    first: Status
-    last: Status
-    seen: dict[str, list[Vitals]] = field(default_factory=dict[str, list[Vitals]])
+    first: RobotStatus
+    last: RobotStatus
+    seen: dict[str, list[ProcessVitals]] = field(default_factory=dict[str, list[ProcessVitals]])
     failure: list[str] = field(default_factory=list[str])
 
     def counted(self, what: Literal["tick", "overruns", "commands_accepted"]) -> int:
@@ -63,27 +63,27 @@ class Stretch:
 
 
 @dataclass
-class Verdict:
+class NetworkVerdict:
     """Everything that was measured, and what of it must not be."""
 
-    quiet: Stretch
-    fuzzed: Stretch
-    sent: Sent
+    quiet: ObservedPeriod
+    fuzzed: ObservedPeriod
+    sent: SentSample
     record: HostRecord
     violations: list[str]
 
 
-class Watcher:
+class RunWatcher:
     """Looks at a run again and again."""
 
     def __init__(self, session: Session, out: Path) -> None:
-        self._statuses = session.declare_latched_reader(keys.STATUS, Status)
+        self._statuses = session.declare_latched_reader(keys.STATUS, RobotStatus)
         self._out = out
         self._parts = find_run_processes(out)
-        self._status: Status | None = None
+        self._status: RobotStatus | None = None
         wait_until(lambda: self.status() is not None, "a status")
 
-    def status(self) -> Status | None:
+    def status(self) -> RobotStatus | None:
         """The newest one."""
         self._status = (self._statuses.drain() or [self._status])[-1]
         return self._status
@@ -93,10 +93,10 @@ class Watcher:
         status = self.status()
         return status is not None and status.lifecycle == "armed" and status.commands_accepted > 0
 
-    def stretch(self, going_on: Callable[[], bool]) -> Stretch:
+    def stretch(self, going_on: Callable[[], bool]) -> ObservedPeriod:
         """Watch for as long as something goes on."""
         first = self._fresh()
-        stretch = Stretch(first, first)
+        stretch = ObservedPeriod(first, first)
         while going_on():
             time.sleep(LOOK_S)
             for name, pid in self._parts.items():
@@ -113,7 +113,7 @@ class Watcher:
         stretch.last = self._fresh()
         return stretch
 
-    def _fresh(self) -> Status:
+    def _fresh(self) -> RobotStatus:
         """A status that comes after now, or the last one when no more comes."""
         before = self.status()
         give_up = time.monotonic() + 5.0
@@ -124,7 +124,7 @@ class Watcher:
 
 
 @dataclass(frozen=True)
-class Request:
+class FuzzRequest:
     """What is asked for."""
 
     payloads: int
@@ -135,12 +135,12 @@ class Request:
     robot_hz: float = 100.0
 
 
-def fuzz(out: Path, request: Request) -> Verdict:
+def fuzz(out: Path, request: FuzzRequest) -> NetworkVerdict:
     """Run it."""
     given = ("--backend", request.backend, "--set", f"rate_hz={request.robot_hz}")
-    sent = Sent()
+    sent = SentSample()
     with running_and_joined(out, ROBOT, *SCENARIO, *given) as (run, session):
-        watcher = Watcher(session, out)
+        watcher = RunWatcher(session, out)
         wait_until(watcher.ready, "armed and commanded")
         until = time.monotonic() + (request.payloads / request.rate if request.quiet_s is None else request.quiet_s)
         quiet = fuzzed = watcher.stretch(lambda: time.monotonic() < until)
@@ -151,7 +151,7 @@ def fuzz(out: Path, request: Request) -> Verdict:
                     stranger.kill()
                 said, _ = stranger.communicate(timeout=TIMEOUT_S)
             if stranger.returncode == 0:
-                sent = msgspec.json.decode(said, type=Sent)
+                sent = msgspec.json.decode(said, type=SentSample)
         run.interrupt()
     wait_until(lambda: not find_processes_of_run(out), "all processes of the run gone")
     record = msgspec.json.decode((out / HOST_RECORD).read_bytes(), type=HostRecord)
@@ -160,20 +160,20 @@ def fuzz(out: Path, request: Request) -> Verdict:
         failure += [f"before anything was sent, {what}: is this machine too busy?" for what in quiet.failure]
     else:
         failure += [*fuzzed.failure, *_differences(quiet, fuzzed, sent, request.payloads)]
-    return Verdict(quiet, fuzzed, sent, record, failure)
+    return NetworkVerdict(quiet, fuzzed, sent, record, failure)
 
 
 @contextmanager
-def running_and_joined(out: Path, robot: str, *arguments: str) -> Iterator[tuple[Running, Session]]:
+def running_and_joined(out: Path, robot: str, *arguments: str) -> Iterator[tuple[RunningCommand, Session]]:
     """A run, and a session on its network; what the run said when it does not come up."""
     with running_snakesim(out, *arguments) as run:
         run.wait_for("network:")
-        with open_session(Link(run.endpoint, robot)) as session:
+        with open_session(ConnectionSettings(run.endpoint, robot)) as session:
             yield run, session
 
 
 @contextmanager
-def _stranger(endpoint: str, request: Request) -> Iterator[subprocess.Popen[bytes]]:
+def _stranger(endpoint: str, request: FuzzRequest) -> Iterator[subprocess.Popen[bytes]]:
     given = [endpoint, ROBOT, *map(str, (request.payloads, request.rate, request.seed))]
     process = subprocess.Popen([sys.executable, "-m", "verification.fuzz.writer", *given], stdout=subprocess.PIPE)
     try:
@@ -189,8 +189,8 @@ def _foreign(out: Path, record: HostRecord) -> list[str]:
     found = [f"fault {fault.what}: {fault.cause}" for fault in record.faults]
     _, box = read_black_box(out / BLACK_BOX)
     modes, targets = box["mode"], box["target"]
-    if (modes != Mode.POSITION).any():
-        found.append(f"{int((modes != Mode.POSITION).any(axis=1).sum())} ticks in another mode than position")
+    if (modes != JointMode.POSITION).any():
+        found.append(f"{int((modes != JointMode.POSITION).any(axis=1).sum())} ticks in another mode than position")
     elif len(targets) and (targets != targets[-1]).any():
         moved = np.flatnonzero((targets != targets[-1]).any(axis=1))
         off = float(np.abs(targets - targets[-1]).max())
@@ -199,7 +199,7 @@ def _foreign(out: Path, record: HostRecord) -> list[str]:
     return found
 
 
-def _differences(quiet: Stretch, fuzzed: Stretch, sent: Sent, payloads: int) -> list[str]:
+def _differences(quiet: ObservedPeriod, fuzzed: ObservedPeriod, sent: SentSample, payloads: int) -> list[str]:
     found: list[str] = []
     first, last = quiet.first, fuzzed.last
     if last.lifecycle != "armed":
@@ -225,7 +225,7 @@ def _differences(quiet: Stretch, fuzzed: Stretch, sent: Sent, payloads: int) -> 
     return found
 
 
-def table(verdict: Verdict) -> str:
+def table(verdict: NetworkVerdict) -> str:
     """The result, for people."""
     quiet, fuzzed, sent = verdict.quiet, verdict.fuzzed, verdict.sent
     asked, put = sum(sent.queries.values()), sum(sent.samples.values())

@@ -80,7 +80,7 @@ RARE = 500  # one in so many is as large as a payload may be, or larger
 
 
 @dataclass(frozen=True)
-class Seed:
+class SeedMessage:
     """A valid message to start from."""
 
     message: type[Message]
@@ -90,7 +90,7 @@ class Seed:
 
 
 @dataclass(frozen=True)
-class Sample:
+class FuzzSample:
     """What arrives at the decoder of a message."""
 
     message: type[Message]
@@ -99,26 +99,26 @@ class Sample:
     encoding: str
 
 
-def seeds() -> list[Seed]:
+def seeds() -> list[SeedMessage]:
     """At least one of every message that may stand alone on the wire."""
-    found: list[Seed] = []
+    found: list[SeedMessage] = []
     for message in VERSIONS:
         plain = make_plain_example(message)
-        found.append(Seed(message, plain, encode(plain), list(iter_places(plain, inspect.type_info(message)))))
+        found.append(SeedMessage(message, plain, encode(plain), list(iter_places(plain, inspect.type_info(message)))))
         for real in REAL.get(message, []):
             plain: dict[str, Any] = {name: getattr(real, name) for name in real.__struct_fields__}
-            found.append(Seed(message, plain, encode(real), [((name,), inspect.AnyType()) for name in plain]))
+            found.append(SeedMessage(message, plain, encode(real), [((name,), inspect.AnyType()) for name in plain]))
     return found
 
 
-class Maker:
+class SampleMaker:
     """Makes one sample after the other; the same ones for the same random numbers."""
 
-    def __init__(self, rng: random.Random, start_from: Sequence[Seed] | None = None) -> None:
+    def __init__(self, rng: random.Random, start_from: Sequence[SeedMessage] | None = None) -> None:
         """start_from: valid messages to make others of; None: `seeds()`."""
         self._rng = rng
         self._seeds = list(start_from or seeds())
-        self._kinds: dict[str, Callable[[Seed], bytes]] = {
+        self._kinds: dict[str, Callable[[SeedMessage], bytes]] = {
             "valid": lambda seed: seed.payload,
             "random": lambda seed: rng.randbytes(rng.randrange(200)),
             "truncated": lambda seed: seed.payload[: rng.randrange(len(seed.payload))],
@@ -132,7 +132,7 @@ class Maker:
             "other message": lambda seed: rng.choice(self._seeds).payload,
         }
 
-    def make(self) -> Sample:
+    def make(self) -> FuzzSample:
         """The next sample."""
         rng = self._rng
         seed = rng.choice(self._seeds)
@@ -141,28 +141,28 @@ class Maker:
         if rng.random() < 0.02:
             at = rng.randrange(len(encoding))
             encoding = rng.choice([encoding[:at], encoding + "0", encoding[:at] + chr(rng.randrange(1, 0xD800)), ""])
-        return Sample(seed.message, kind, self._kinds[kind](seed), encoding)
+        return FuzzSample(seed.message, kind, self._kinds[kind](seed), encoding)
 
-    def _spliced(self, seed: Seed) -> bytes:
+    def _spliced(self, seed: SeedMessage) -> bytes:
         one, other = seed.payload, self._rng.choice(self._seeds).payload
         at, since = self._rng.randrange(len(one)), self._rng.randrange(len(other))
         return one[:at] + other[since : since + self._rng.randrange(60)] + one[at + self._rng.randrange(10) :]
 
-    def _confused(self, seed: Seed) -> bytes:
+    def _confused(self, seed: SeedMessage) -> bytes:
         at, info = self._rng.choice(seed.places)
         wrong = list_invalid_values(info)
         value = self._rng.choice(wrong) if wrong and self._rng.random() < 0.5 else self._rng.choice(WEIRD)
         return encode(replace_at(seed.plain, at, value))
 
-    def _lost(self, seed: Seed) -> bytes:
+    def _lost(self, seed: SeedMessage) -> bytes:
         return encode({name: value for name, value in seed.plain.items() if self._rng.random() < 0.8})
 
-    def _huge_length(self, seed: Seed) -> bytes:
+    def _huge_length(self, seed: SeedMessage) -> bytes:
         at = self._rng.randrange(len(seed.payload))
         length = self._rng.choice((b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\x00\x10\x00\x00", b"\xff\xff", b"\xff"))
         return seed.payload[:at] + self._rng.choice(HEADS) + length + seed.payload[at:]
 
-    def _huge(self, seed: Seed) -> bytes:
+    def _huge(self, seed: SeedMessage) -> bytes:
         count = self._rng.choice((2_000, 20_000))
         if self._rng.random() < 1 / RARE:
             count = self._rng.choice((MAX_PAYLOAD_BYTES // 9, MAX_PAYLOAD_BYTES))
@@ -173,7 +173,7 @@ class Maker:
         head = bytes([0x80 + min(len(rest) + 1, 15)])
         return head + encode(name) + body + encode(rest)[1:]
 
-    def _nested(self, seed: Seed) -> bytes:
+    def _nested(self, seed: SeedMessage) -> bytes:
         depth = self._rng.choice((10, 100, 1_000, 5_000))
         if self._rng.random() < 1 / RARE:
             depth = MAX_PAYLOAD_BYTES // 9

@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC
 from snakesim_operator.recording.chunks import RECORD_HEADER, unpack_chunk
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from snakesim_testing.operator.damaged_recordings import Span, chunks, flipped, packed, recorded, spans
+from snakesim_testing.operator.damaged_recordings import RecordSpan, chunks, flipped, packed, recorded, spans
 from verification.fuzz.forked import Forked, forked
 
 SPOILT, WHOLE, OUT = "spoilt.mcap", "whole.mcap", "made"
@@ -100,7 +100,7 @@ def foreign(chance: random.Random, content: bytes) -> bytes:
 
 def forged(chance: random.Random, content: bytes) -> bytes:
     """A chunk that is whole, with messages that are not: other bytes, times, numbers and channels."""
-    span: Span = chance.choice(chunks(content))
+    span: RecordSpan = chance.choice(chunks(content))
     data = unpack_chunk(content[span.begin + RECORD_HEADER.size : span.end])
     places = [one.begin + RECORD_HEADER.size for one in spans(data, magic=0) if one.opcode == Opcode.MESSAGE]
     for at in chance.sample(places, min(len(places), chance.choice((1, 5, 50)))):
@@ -132,7 +132,7 @@ DAMAGES: tuple[Damage, ...] = (flips, cut, hole, swapped, lying_head, foreign, f
 
 
 @dataclass
-class Verdict:
+class RecordingsVerdict:
     """What became of all of them."""
 
     codes: dict[str, Counter[int]] = field(default_factory=dict[str, Counter[int]])  # by command
@@ -141,10 +141,10 @@ class Verdict:
     peak_mb: float = 0.0
 
 
-def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> Verdict:
+def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> RecordingsVerdict:
     """So many damaged copies, each into all commands, or so many of them in turn."""
     recorded(folder / "run", 0.6, 40_000)
-    content, verdict = (folder / "run" / RECORDING_FILENAME).read_bytes(), Verdict()
+    content, verdict = (folder / "run" / RECORDING_FILENAME).read_bytes(), RecordingsVerdict()
     names = [name for name in COMMANDS if name != TRUTH]
     with forked(folder) as snakesim:
         for number in range(copies):
@@ -157,7 +157,13 @@ def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> V
 
 
 def _try(
-    folder: Path, snakesim: Forked, spoilt: bytes, content: bytes, names: Sequence[str], what: str, verdict: Verdict
+    folder: Path,
+    snakesim: Forked,
+    spoilt: bytes,
+    content: bytes,
+    names: Sequence[str],
+    what: str,
+    verdict: RecordingsVerdict,
 ) -> None:
     incomplete = False
     for name in (TRUTH, *names):
@@ -180,7 +186,7 @@ def _try(
     shutil.rmtree(folder)
 
 
-def table(verdict: Verdict) -> str:
+def table(verdict: RecordingsVerdict) -> str:
     """For people."""
     lines = [
         f"{name:<18}" + ", ".join(f"{count} with {code}" for code, count in sorted(codes.items()))

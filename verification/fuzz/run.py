@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Answer,
@@ -21,17 +21,17 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_testing.hal.authority_rig import AuthorityRig, make_armed_rig
 from snakesim_testing.hal.small_robots import PERIOD_NS
-from verification.fuzz.payloads import Maker
+from verification.fuzz.payloads import SampleMaker
 from verification.fuzz.vitals import vitals
 
 LONGEST_REASON = 400  # characters of an error's text, whatever a sender wrote
 PER_ROBOT = 1000  # payloads until a fresh robot is armed
 PER_TICK = 10
-ANSWERS = Decoder(Answer)
+ANSWERS = MessageDecoder(Answer)
 
 
 @dataclass
-class Report:
+class FuzzReport:
     """What became of the samples."""
 
     outcomes: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])  # by kind of mutation
@@ -76,10 +76,10 @@ def pass_tick(hal: AuthorityRig) -> None:
     assert all(abs(target) <= 5.0 for target in hal.authority.compute_setpoints().setpoints.target)
 
 
-def run(payloads: int, seed: int) -> Report:
+def run(payloads: int, seed: int) -> FuzzReport:
     """Raises whatever a decoder or the authority raises that it must not."""
-    maker, report = Maker(random.Random(seed)), Report()
-    decoders: dict[type[Message], Decoder[Any]] = {message: Decoder(message) for message in VERSIONS}
+    maker, report = SampleMaker(random.Random(seed)), FuzzReport()
+    decoders: dict[type[Message], MessageDecoder[Any]] = {message: MessageDecoder(message) for message in VERSIONS}
     hal = make_armed_rig()
     for number in range(payloads):
         if number % PER_ROBOT == 0:

@@ -10,7 +10,7 @@ COMPLAINTS = re.compile(r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Er
 
 
 @dataclass(frozen=True)
-class Vitals:
+class ProcessVitals:
     """One process at one moment."""
 
     resident_mb: float
@@ -18,11 +18,11 @@ class Vitals:
     files: int
 
 
-def vitals(pid: int) -> Vitals | None:
+def vitals(pid: int) -> ProcessVitals | None:
     """None when the process is gone."""
     try:
         process = psutil.Process(pid)
-        return Vitals(process.memory_info().rss / 2**20, process.num_threads(), process.num_fds())
+        return ProcessVitals(process.memory_info().rss / 2**20, process.num_threads(), process.num_fds())
     except psutil.Error:
         return None
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.model import fault_kinds as injection
-from snakesim_hal.model.fault_kinds import Injection
-from snakesim_hal.wire.codec import Decoder, format_encoding
+from snakesim_hal.model.fault_kinds import FaultInjection
+from snakesim_hal.wire.codec import MessageDecoder, format_encoding
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Clock,
@@ -20,26 +20,28 @@ from snakesim_hal.wire.messages import (
     LeaseRequest,
     LifecycleRequest,
     Message,
-    Status,
+    RobotStatus,
 )
 
 PRIORITY = 100  # of a controller that asks for nothing else
 
 
 @dataclass(frozen=True)
-class Live:
+class HeldCommand:
     """What the robot's rightful controller holds while the fuzzing goes on."""
 
     epoch: int
     sequence: int  # the newest of its commands that was overheard; it is replayed
 
 
-class Withholding:
+class EffectiveSamples:
     """Knows which samples are effective."""
 
-    def __init__(self, live: Live) -> None:
+    def __init__(self, live: HeldCommand) -> None:
         self._live = live
-        self._decoders: dict[str, Decoder[Any]] = {format_encoding(message): Decoder(message) for message in VERSIONS}
+        self._decoders: dict[str, MessageDecoder[Any]] = {
+            format_encoding(message): MessageDecoder(message) for message in VERSIONS
+        }
 
     def effect(self, payload: bytes, encoding: str) -> str | None:
         """What a sample would do by right, in a few words; None when it may be sent."""
@@ -56,7 +58,7 @@ class Withholding:
         match message:
             case Clock():  # the services have no other time
                 return "a valid clock"
-            case Status():  # whoever looks at the run has no other news
+            case RobotStatus():  # whoever looks at the run has no other news
                 return "a valid status"
             case EstopRequest():
                 return "an emergency stop"
@@ -76,7 +78,7 @@ class Withholding:
 
 def _is_known(request: FaultRequest) -> bool:
     try:
-        injection.validate_and_complete_injection(Injection(request.kind, request.target))
+        injection.validate_and_complete_injection(FaultInjection(request.kind, request.target))
     except ConfigError:
         return False
     return True

@@ -18,13 +18,13 @@ from msgspec import inspect
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.model import fault_kinds as injection
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, MessageDecoder
 from snakesim_hal.wire.messages import Answer, JointCommand, Message
-from verification.fuzz.payloads import Maker, Seed, seeds
-from verification.fuzz.withheld import Live, Withholding
+from verification.fuzz.payloads import SampleMaker, SeedMessage, seeds
+from verification.fuzz.withheld import EffectiveSamples, HeldCommand
 
 OVERHEAR_S = 2.0
 SETTLE_S = 10.0
@@ -39,7 +39,7 @@ TO_HAL = (keys.LEASE, keys.LIFECYCLE, keys.ESTOP)  # who asks there gets an answ
 STREAMS = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
 
 
-class Sent(msgspec.Struct, kw_only=True):
+class SentSample(msgspec.Struct, kw_only=True):
     """What the stranger did, and what came back."""
 
     seconds: float = 0.0
@@ -52,15 +52,15 @@ class Sent(msgspec.Struct, kw_only=True):
     megabytes: float = 0.0
 
 
-class Stranger:
+class SampleWriter:
     """Sends samples and asks queries."""
 
-    def __init__(self, session: Session, rng: random.Random, heard: list[Seed], live: Live) -> None:
+    def __init__(self, session: Session, rng: random.Random, heard: list[SeedMessage], live: HeldCommand) -> None:
         self._zenoh = session._zenoh  # pyright: ignore[reportPrivateUsage] - a stranger does not keep to our session
         self._rng = rng
-        self._maker = Maker(rng, [*seeds(), *heard])
-        self._withholding = Withholding(live)
-        self._answer_decoder = Decoder(Answer)
+        self._maker = SampleMaker(rng, [*seeds(), *heard])
+        self._withholding = EffectiveSamples(live)
+        self._answer_decoder = MessageDecoder(Answer)
         self._open = 0
         self._closed: Mailbox[tuple[bool, list[str]]] = Mailbox()
         self._by: dict[str, Counter[str]] = {
@@ -70,7 +70,7 @@ class Stranger:
         self._to_hal = 0
         self._answered = 0
 
-    def send(self, payloads: int, rate: float) -> Sent:
+    def send(self, payloads: int, rate: float) -> SentSample:
         """Send so many, that many a second."""
         started = time.monotonic()
         for number in range(payloads):
@@ -83,7 +83,7 @@ class Stranger:
         while self._open and time.monotonic() < give_up:
             self._collect(0.1)
         counts = {part: dict(counter) for part, counter in self._by.items()}
-        return Sent(seconds=took, unanswered=self._to_hal - self._answered, megabytes=self._bytes / 1e6, **counts)
+        return SentSample(seconds=took, unanswered=self._to_hal - self._answered, megabytes=self._bytes / 1e6, **counts)
 
     def _send_one(self) -> None:
         while True:
@@ -162,28 +162,28 @@ class Stranger:
         return keys.done_key(rng.choice(SERVICES)) if key == keys.DONE_ALL else key
 
 
-def overhear(link: Link) -> tuple[list[Seed], Live]:
+def overhear(link: ConnectionSettings) -> tuple[list[SeedMessage], HeldCommand]:
     """One real message of every key on which this robot speaks, and what its controller holds."""
-    arrivals: Mailbox[Arrival] = Mailbox()
+    arrivals: Mailbox[ReceivedSample] = Mailbox()
     with open_session(link) as session:
         for key in STREAMS:
             latched = key in (keys.STATUS, keys.DESCRIPTION)
             (session.on_latched_arrival if latched else session.on_arrival)(key, arrivals.put)
         time.sleep(OVERHEAR_S)
-    newest: dict[str, Arrival] = {}
+    newest: dict[str, ReceivedSample] = {}
     while not arrivals.empty():
         arrival = arrivals.get()
         newest[arrival.key] = arrival
-    found: list[Seed] = []
-    live: Live | None = None
+    found: list[SeedMessage] = []
+    live: HeldCommand | None = None
     for key, arrival in newest.items():
         message = keys.find_message(key)
         assert message is not None
-        real: Any = Decoder(message).decode(arrival.payload, arrival.encoding)
+        real: Any = MessageDecoder(message).decode(arrival.payload, arrival.encoding)
         plain: dict[str, Any] = msgspec.to_builtins(real)
-        found.append(Seed(message, plain, arrival.payload, [((name,), inspect.AnyType()) for name in plain]))
+        found.append(SeedMessage(message, plain, arrival.payload, [((name,), inspect.AnyType()) for name in plain]))
         if isinstance(real, JointCommand):
-            live = Live(real.lease_epoch, real.sequence)
+            live = HeldCommand(real.lease_epoch, real.sequence)
     assert live is not None, f"nobody commands this robot; heard only {', '.join(newest)}"
     return found, live
 
@@ -191,10 +191,10 @@ def overhear(link: Link) -> tuple[list[Seed], Live]:
 def main() -> int:
     """Prints what was sent as JSON."""
     endpoint, namespace, payloads, rate, seed = sys.argv[1:]
-    link = Link(endpoint, namespace)
+    link = ConnectionSettings(endpoint, namespace)
     heard, live = overhear(link)
     with open_session(link) as session:
-        sent = Stranger(session, random.Random(int(seed)), heard, live).send(int(payloads), float(rate))
+        sent = SampleWriter(session, random.Random(int(seed)), heard, live).send(int(payloads), float(rate))
     sys.stdout.buffer.write(msgspec.json.encode(sent))
     return 0
 

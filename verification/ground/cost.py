@@ -8,12 +8,12 @@ import mujoco
 
 from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build_sim_model
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
-from snakesim_testing.sim.waves import SERVO_NM_PER_RAD, Wave
+from snakesim_testing.sim.waves import SERVO_NM_PER_RAD, JointWave
 
-WAVE = Wave(0.3, 0.7, 4.0)
+WAVE = JointWave(0.3, 0.7, 4.0)
 STEPS_PER_ROUND = 100
 WARM_UP_STEPS = 100
 STEPS_PER_TARGET = 5
@@ -29,7 +29,7 @@ class TimedSnake:
         self._data = mujoco.MjData(sim.model)
         self._data.qpos[2] = config.robot.module.radius_m
         self._count = config.robot.chain.modules
-        self._physics = Physics(sim, self._data)
+        self._physics = PhysicsStepper(sim, self._data)
         self._physics.reset()
         self._model.dof_damping[FREE_DOFS:] = 10.0
         self._step_count = 0

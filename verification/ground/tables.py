@@ -6,9 +6,9 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
-from snakesim_testing.sim.gliding import FRICTION, SURFACES, Glider, glide_without_mujoco
+from snakesim_testing.sim.gliding import FRICTION, SURFACES, GlidingSnake, glide_without_mujoco
 from snakesim_testing.sim.simulator_rig import G
-from snakesim_testing.sim.waves import Wave, integrate_momentum_balance, simulate_wave
+from snakesim_testing.sim.waves import JointWave, integrate_momentum_balance, simulate_wave
 from verification.ground.cost import measure_medians_us
 from verification.ground.wheeled import ROLLING_FRICTION, TIRE_FRICTION, WHEELS, WheeledSnake
 
@@ -21,9 +21,9 @@ CLOTH = {"friction": FRICTION}
 MUD = {"friction": 0.0, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 3.0}}
 MUD_S_PER_M = 0.5 + 3.0j
 WAVES = {
-    "0.3 sin(4 t + 0.7 i)": Wave(0.3, 0.7, 4.0),
-    "its reverse, 0.3 sin(4 t - 0.7 i)": Wave(0.3, -0.7, 4.0),
-    "0.5 sin(6.28 t + 0.5 i)": Wave(0.5, 0.5, 6.28),
+    "0.3 sin(4 t + 0.7 i)": JointWave(0.3, 0.7, 4.0),
+    "its reverse, 0.3 sin(4 t - 0.7 i)": JointWave(0.3, -0.7, 4.0),
+    "0.5 sin(6.28 t + 0.5 i)": JointWave(0.5, 0.5, 6.28),
 }
 THROWS = {"1.0 forward, 0.6 left": (1.0, 0.6), "0.8 backward, 0.8 left": (-0.8, 0.8)}
 GLIDING_S = 1.5
@@ -75,7 +75,7 @@ def compare_gliding() -> list[str]:
     ]
     for surface in SURFACES:
         for name, velocity in THROWS.items():
-            glider = Glider(surface, SKIN)
+            glider = GlidingSnake(surface, SKIN)
             glider.throw(np.array(velocity))
             start = glider.position_w
             glider.go(GLIDING_S)
@@ -93,7 +93,7 @@ def compare_drag() -> list[str]:
     for surface in SURFACES:
         found: list[str] = []
         for direction in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)):
-            glider = Glider(surface, SKIN)
+            glider = GlidingSnake(surface, SKIN)
             force_n = glider.drag(DRAG_M_S * np.array(direction), 0.6)
             found.append(f"{np.linalg.norm(force_n) / (glider.mass_kg * G):.4f}")
         rows.append(f"| {surface} | {' | '.join(found)} |")
@@ -103,9 +103,9 @@ def compare_drag() -> list[str]:
 def compare_wheels() -> list[str]:
     """Return the rows of wheels as bodies, and of wheels as friction."""
     bodies = WheeledSnake()
-    glider = Glider("flat ground", ON_WHEELS)
+    glider = GlidingSnake("flat ground", ON_WHEELS)
     rolling_m_s2 = np.linalg.norm(glider.drag(np.array([0.5, 0.0]), 0.4)) / glider.mass_kg
-    creep = Glider("flat ground", ON_WHEELS)
+    creep = GlidingSnake("flat ground", ON_WHEELS)
     creep.push(np.array([0.0, 0.8 * TIRE_FRICTION]))
     creep.go(0.5)
     before = creep.position_w

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from snakesim_testing.sim.simulator_rig import G, make_config
-from snakesim_testing.sim.waves import PERIODS, SERVO_NM_PER_RAD, SERVO_NM_S_PER_RAD, BodyTrack, Wave
+from snakesim_testing.sim.waves import PERIODS, SERVO_NM_PER_RAD, SERVO_NM_S_PER_RAD, BodyTrack, JointWave
 
 TIRE_FRICTION = 0.6
 WHEEL_RADIUS_M = 0.03
@@ -80,7 +80,7 @@ class WheeledSnake:
                 conaffinity=0,
             )
 
-    def swim(self, wave: Wave) -> BodyTrack:
+    def swim(self, wave: JointWave) -> BodyTrack:
         """Let the joints follow a wave."""
         data = self.data
         mujoco.mj_resetData(self.model, data)

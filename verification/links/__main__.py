@@ -17,7 +17,7 @@ import numpy as np
 
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_operator.results.run_log import RunRecord
-from verification.links.lab import Lab, lab
+from verification.links.lab import LinkLab, lab
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks" / "lab-links.md"
 ARMED_S = 10.0
@@ -26,7 +26,7 @@ WRITTEN_S = 1.0  # until rows are on disk
 
 
 @dataclass(frozen=True)
-class Condition:
+class LinkCondition:
     """A link that is bad in one way, for as long as the robot is armed."""
 
     name: str
@@ -38,18 +38,18 @@ class Condition:
 
 # Each way, so that a round trip takes twice as long, and is lost about twice as often. A lease is longer at 50 Hz.
 CONDITIONS = (
-    Condition("good"),
-    Condition("1 % of packets lost", loss=0.01),
-    Condition("5 % of packets lost", loss=0.05),
-    Condition("5 +- 2.5 ms", delay_s=0.005, jitter_s=0.0025),
-    Condition("10 +- 5 ms", delay_s=0.01, jitter_s=0.005),
-    Condition("20 +- 10 ms", delay_s=0.02, jitter_s=0.01),
-    Condition("20 +- 10 ms, at 50 Hz", delay_s=0.02, jitter_s=0.01, rate_hz=50),
-    Condition("5 % of packets lost, at 50 Hz", loss=0.05, rate_hz=50),
+    LinkCondition("good"),
+    LinkCondition("1 % of packets lost", loss=0.01),
+    LinkCondition("5 % of packets lost", loss=0.05),
+    LinkCondition("5 +- 2.5 ms", delay_s=0.005, jitter_s=0.0025),
+    LinkCondition("10 +- 5 ms", delay_s=0.01, jitter_s=0.005),
+    LinkCondition("20 +- 10 ms", delay_s=0.02, jitter_s=0.01),
+    LinkCondition("20 +- 10 ms, at 50 Hz", delay_s=0.02, jitter_s=0.01, rate_hz=50),
+    LinkCondition("5 % of packets lost, at 50 Hz", loss=0.05, rate_hz=50),
 )
 
 
-def held(condition: Condition, trials: int) -> str:
+def held(condition: LinkCondition, trials: int) -> str:
     """A line of the table: how long an armed robot keeps going, how fast, and what ends it."""
     armed_s: list[float] = []
     ended: list[str] = []
@@ -93,7 +93,9 @@ def moved(folder: Path) -> tuple[str, str]:
     return f"{speed:.2f}", "-" if p50 is None or p99 is None else f"{p50 / 1000:.1f} / {p99 / 1000:.1f}"
 
 
-def event(name: str, trials: int, break_it: Callable[[Lab], None], mend: Callable[[Lab], None], broken_s: float) -> str:
+def event(
+    name: str, trials: int, break_it: Callable[[LinkLab], None], mend: Callable[[LinkLab], None], broken_s: float
+) -> str:
     """A line of the other table: until the robot has stopped, and from the repair until it is armed again."""
     stopped_ms: list[float] = []
     again_s: list[float] = []
@@ -118,7 +120,7 @@ def events(trials: int) -> list[str]:
     return [
         event("link cut for 0.5 s", trials, cut, mend, 0.5),
         event("link cut for 5 s, and the machine joins again", max(trials // 4, 1), cut, mend, 5.0),
-        event("router killed, and a new one started", trials, Lab.kill_router, Lab.start_router, 0.2),
+        event("router killed, and a new one started", trials, LinkLab.kill_router, LinkLab.start_router, 0.2),
     ]
 
 

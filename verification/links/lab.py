@@ -12,8 +12,8 @@ from pathlib import Path
 
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, write_config
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
-from snakesim_hal.wire.messages import LifecycleRequest, Status
-from snakesim_testing.lab.machines import Machine, RadioLink, connect_by_cable, connect_by_radio
+from snakesim_hal.wire.messages import LifecycleRequest, RobotStatus
+from snakesim_testing.lab.machines import NamespaceMachine, RadioLink, connect_by_cable, connect_by_radio
 from snakesim_testing.runs.command import SNAKESIM_COMMAND
 
 SCENARIO = "triplet"
@@ -21,7 +21,7 @@ CHANGES = ("clock_mode=realtime", "duration_s=86400")
 START_LIMIT_S = 60.0
 
 
-class Lab:
+class LinkLab:
     """Three machines, and what runs there."""
 
     def __init__(self, folder: Path, stack: ExitStack, *changes: str) -> None:
@@ -31,7 +31,7 @@ class Lab:
         ).config
         self._saved = folder / "config.json"
         write_config(self.config, self._saved)
-        self.router_machine, self.robot, self.workstation = (Machine(stack) for _ in range(3))
+        self.router_machine, self.robot, self.workstation = (NamespaceMachine(stack) for _ in range(3))
         connect_by_cable(self.router_machine, self.robot, "robot", "10.77.1")
         self.link: RadioLink = stack.enter_context(
             connect_by_radio(self.router_machine, self.workstation, "workstation", "10.77.2")
@@ -81,12 +81,12 @@ class Lab:
         return StarterEnd(ours)
 
     @property
-    def status(self) -> Status | None:
+    def status(self) -> RobotStatus | None:
         """The host's newest."""
         self.host.receive()
         return self.host.status
 
-    def until(self, condition: Callable[[Status], bool], what: str, limit_s: float = START_LIMIT_S) -> float:
+    def until(self, condition: Callable[[RobotStatus], bool], what: str, limit_s: float = START_LIMIT_S) -> float:
         """Wait for a status. Returns how long it took, in s."""
         began = time.monotonic()
         while (status := self.status) is None or not condition(status):
@@ -123,9 +123,9 @@ class Lab:
 
 
 @contextmanager
-def lab(folder: Path, *changes: str) -> Iterator[Lab]:
+def lab(folder: Path, *changes: str) -> Iterator[LinkLab]:
     """A lab whose robot is ready to be armed. changes: of the scenario, as `--set` takes them."""
     with ExitStack() as stack:
-        made = Lab(folder, stack, *changes)
+        made = LinkLab(folder, stack, *changes)
         made.until(lambda status: status.ready_to_arm, "ready")
         yield made

@@ -37,7 +37,7 @@ def interface(pid: str, name: str) -> int:
     return tap
 
 
-class Way:
+class RelayDirection:
     """One direction."""
 
     def __init__(self, source: int, sink: int) -> None:
@@ -73,7 +73,7 @@ def main() -> None:
     pid_a, pid_b, name = sys.argv[1:]
     a, b = interface(pid_a, name), interface(pid_b, name)
     set_realtime_priority(HOST_PRIORITY + 1)
-    ways = Way(a, b), Way(b, a)
+    ways = RelayDirection(a, b), RelayDirection(b, a)
     link = {"loss": 0.0, "delay_s": 0.0, "jitter_s": 0.0, "cut": False}
     os.set_blocking(0, False)
     print("ready", flush=True)

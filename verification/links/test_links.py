@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from verification.links.lab import Lab, lab
+from verification.links.lab import LinkLab, lab
 
 pytestmark = [
     pytest.mark.e2e,
@@ -22,18 +22,18 @@ STOP_LIMIT_S = 0.3  # 50 ms of the lease, a period, and a busy computer
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LinkLab]:
     with lab(tmp_path_factory.mktemp("lab")) as made:
         yield made
 
 
-def armed(made: Lab) -> None:
+def armed(made: LinkLab) -> None:
     """Moving for a moment."""
     made.arm()
     time.sleep(0.3)
 
 
-def test_cut_link_stops_robot_and_restored_one_allows_arming(robot: Lab) -> None:
+def test_cut_link_stops_robot_and_restored_one_allows_arming(robot: LinkLab) -> None:
     armed(robot)
     robot.link.set_quality(cut=True)
     assert robot.until(lambda status: status.lifecycle == "fault", "stopped") < STOP_LIMIT_S
@@ -42,7 +42,7 @@ def test_cut_link_stops_robot_and_restored_one_allows_arming(robot: Lab) -> None
     robot.arm()
 
 
-def test_dead_router_stops_robot_and_new_one_allows_arming(robot: Lab) -> None:
+def test_dead_router_stops_robot_and_new_one_allows_arming(robot: LinkLab) -> None:
     """Again and again: a row of the fault table."""
     armed(robot)
     robot.kill_router()
@@ -51,7 +51,7 @@ def test_dead_router_stops_robot_and_new_one_allows_arming(robot: Lab) -> None:
     robot.arm()
 
 
-def test_a_link_with_some_delay_keeps_the_robot_armed(robot: Lab) -> None:
+def test_a_link_with_some_delay_keeps_the_robot_armed(robot: LinkLab) -> None:
     robot.link.set_quality(delay_s=0.005)
     try:
         armed(robot)

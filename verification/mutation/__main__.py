@@ -12,7 +12,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from verification.mutation import trial
-from verification.mutation.mutants import Mutant, mutants_of
+from verification.mutation.mutants import SourceMutant, mutants_of
 
 EQUIVALENT = Path(__file__).with_name("equivalent.toml")
 FORK = multiprocessing.get_context("fork")
@@ -30,13 +30,13 @@ def main() -> int:
     trial.warm_up()
     started = time.monotonic()
     sources = {file: (trial.ROOT / trial.place_of(file)).read_text() for file in asked.files}
-    unchanged = [Mutant(file, "module", 0, "unchanged", source) for file, source in sources.items()]
+    unchanged = [SourceMutant(file, "module", 0, "unchanged", source) for file, source in sources.items()]
     for mutant, outcome in outcomes(iter(unchanged), asked.workers, asked.time_limit):
         if outcome != trial.SURVIVED:
             print(f"mutation: the tests of {mutant.file} fail without any mutation (pytest exit {outcome})")
             return 2
     tried = killed = late = 0
-    unexplained: list[Mutant] = []
+    unexplained: list[SourceMutant] = []
     reasons = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))
     equivalent = {mutant for mutants in reasons.values() for mutant in mutants}
     explained: set[str] = set()
@@ -62,10 +62,12 @@ def main() -> int:
     return 1 if unexplained or stale else 0
 
 
-def outcomes(mutants: Iterator[Mutant], workers: int, limit_s: float) -> Iterator[tuple[Mutant, int | None]]:
+def outcomes(
+    mutants: Iterator[SourceMutant], workers: int, limit_s: float
+) -> Iterator[tuple[SourceMutant, int | None]]:
     """Pytest's exit code for each mutant; None for one that had to be stopped."""
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
-        running: list[tuple[Mutant, BaseProcess, float]] = []
+        running: list[tuple[SourceMutant, BaseProcess, float]] = []
         more = True
         while more or running:
             while more and len(running) < workers:

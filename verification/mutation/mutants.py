@@ -35,7 +35,7 @@ Change = Callable[[], object]  # makes one change, in place
 
 
 @dataclass(frozen=True)
-class Mutant:
+class SourceMutant:
     """One change of one file."""
 
     file: str  # such as limiter.py
@@ -48,7 +48,7 @@ class Mutant:
         return f"{self.file}:{self.line} in {self.where}: {self.change}"
 
 
-def mutants_of(file: str, source: str) -> Iterator[Mutant]:
+def mutants_of(file: str, source: str) -> Iterator[SourceMutant]:
     """All mutants of a file, from top to bottom."""
     tree = ast.parse(source)
     seen = {ast.unparse(tree)}
@@ -66,7 +66,7 @@ def mutants_of(file: str, source: str) -> Iterator[Mutant]:
                 change = f"{before} -> {'(removed)' if removed else _shown(node)}"
                 if original is not statement:
                     change += f" in `{_shown(statement)}`"
-                yield Mutant(file, where, getattr(node, "lineno", 0), change, text)
+                yield SourceMutant(file, where, getattr(node, "lineno", 0), change, text)
 
 
 def _walk(

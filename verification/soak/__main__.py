@@ -19,9 +19,9 @@ from snakesim_testing.harness.wait import wait_until
 from verification.faults.observer import TrialError
 from verification.fuzz.network import running_and_joined
 from verification.fuzz.vitals import complaints
-from verification.soak.faults import Dice, Event
-from verification.soak.health import Health
-from verification.soak.watch import Watch
+from verification.soak.faults import EventDrawer, SoakEvent
+from verification.soak.health import ProcessHealth
+from verification.soak.watch import JudgingObserver
 
 ROBOT = "planar13"
 RUN = ("triplet", "--clock-mode", "realtime", "--duration", "86400", "--stay")
@@ -35,7 +35,7 @@ LOOK_S = 0.01
 ONLY_BEHIND_THE_ROBOT = ("Traceback", "panicked", "Exception")
 
 
-class Line(msgspec.Struct, kw_only=True):
+class EventLogLine(msgspec.Struct, kw_only=True):
     """One event in the log."""
 
     at_s: float
@@ -50,11 +50,11 @@ class Line(msgspec.Struct, kw_only=True):
 
 
 @dataclass
-class Soak:
+class SoakResult:
     """What a soak has found."""
 
     seed: int
-    lines: list[Line] = field(default_factory=list[Line])
+    lines: list[EventLogLine] = field(default_factory=list[EventLogLine])
     violations: list[str] = field(default_factory=list[str])
     impossible: Counter[str] = field(default_factory=Counter[str])
     health: list[str] = field(default_factory=list[str])
@@ -62,14 +62,14 @@ class Soak:
     took_s: float = 0.0
 
 
-class Operator:
+class SoakOperator:
     """Lets one thing go wrong after the other, and gets the robot going again."""
 
-    def __init__(self, watch: Watch, health: Health, soak: Soak, log: Any) -> None:
+    def __init__(self, watch: JudgingObserver, health: ProcessHealth, soak: SoakResult, log: Any) -> None:
         self._watch, self._health, self._soak, self._log = watch, health, soak, log
         self._started = time.monotonic()
 
-    def go(self, dice: Dice, seconds: float) -> None:
+    def go(self, dice: EventDrawer, seconds: float) -> None:
         """Until the time is over, or too much is wrong."""
         for event in dice.events():
             if time.monotonic() - self._started > seconds or len(self._soak.violations) >= MAX_VIOLATIONS:
@@ -83,7 +83,7 @@ class Operator:
                 else:
                     self._violated(event, [f"the injector says no: {answer.reason}"])
                 continue
-            line = Line(
+            line = EventLogLine(
                 at_s=round(time.monotonic() - self._started, 3),
                 event=str(event),
                 follows=event.follows,
@@ -102,7 +102,7 @@ class Operator:
             if line.recovered_s is None:
                 return
 
-    def _suffer(self, event: Event, line: Line) -> None:
+    def _suffer(self, event: SoakEvent, line: EventLogLine) -> None:
         """Watch what follows, look at how it is explained, and recover."""
         watch, began_ns = self._watch, time.monotonic_ns()
         watch.blind = {event.request.target}
@@ -191,25 +191,25 @@ class Operator:
                 return
             time.sleep(min(left, LOOK_S))
 
-    def _violated(self, event: Event, what: list[str]) -> None:
+    def _violated(self, event: SoakEvent, what: list[str]) -> None:
         for text in what:
             found = f"seed {self._soak.seed}, {event}: {text}"
             print(f"VIOLATION {found}", flush=True)
             self._soak.violations.append(found)
 
 
-def soak(out: Path, minutes: float, seed: int, backend: str) -> Soak:
+def soak(out: Path, minutes: float, seed: int, backend: str) -> SoakResult:
     """Run it."""
-    found = Soak(seed)
+    found = SoakResult(seed)
     log_path, began = out.with_suffix(".jsonl"), time.monotonic()
     with (
         running_and_joined(out, ROBOT, *RUN, "--backend", backend, "--seed", str(seed)) as (run, session),
         log_path.open("wb") as log,
     ):
-        watch, health = Watch(session), Health(out)
+        watch, health = JudgingObserver(session), ProcessHealth(out)
         watch.until(lambda: watch.state() == "armed", "armed", START_S)
         joints = len(watch.description().joints)
-        Operator(watch, health, found, log).go(Dice(seed, joints), 60 * minutes)
+        SoakOperator(watch, health, found, log).go(EventDrawer(seed, joints), 60 * minutes)
         if run.process.poll() is not None:
             found.violations.append(f"the run has ended by itself: {run.printed()[-500:]}")
         code = run.interrupt()
@@ -228,9 +228,9 @@ def soak(out: Path, minutes: float, seed: int, backend: str) -> Soak:
     return found
 
 
-def summary(found: Soak) -> str:
+def summary(found: SoakResult) -> str:
     """For people."""
-    by_kind: dict[str, list[Line]] = {}
+    by_kind: dict[str, list[EventLogLine]] = {}
     for line in found.lines:
         what = line.event.split(" ")[1].partition("=")[0]
         by_kind.setdefault(what, []).append(line)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_hal.model.fault_kinds import FAULT_KINDS, Injection, TargetType, validate_and_complete_injection
+from snakesim_hal.model.fault_kinds import FAULT_KINDS, FaultInjection, TargetType, validate_and_complete_injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
 
@@ -39,7 +39,7 @@ LONG_FREEZE_S = 0.5  # beyond any doubt longer than a lease
 
 
 @dataclass(frozen=True)
-class Event:
+class SoakEvent:
     """One fault of a soak."""
 
     number: int
@@ -53,7 +53,7 @@ class Event:
     @property
     def end_request(self) -> FaultRequest | None:
         """How a person ends it; None when it ends by itself, or has no end."""
-        about = FAULT_KINDS[Injection(self.request.kind, self.request.target).target_type][self.request.kind]
+        about = FAULT_KINDS[FaultInjection(self.request.kind, self.request.target).target_type][self.request.kind]
         if about.is_instantaneous or self.request.for_s is not None:
             return None
         return FaultRequest(kind=self.request.kind, target=self.request.target, end=True)
@@ -63,7 +63,7 @@ class Event:
         return f"#{self.number} {self.request.kind}:{self.request.target}{amount} for {self.lasts_s:g} s"
 
 
-class Dice:
+class EventDrawer:
     """Draws events; the same ones for the same seed, as long as the same ones are found impossible."""
 
     def __init__(self, seed: int, joints: int) -> None:
@@ -74,17 +74,17 @@ class Dice:
         }
         self._impossible: set[tuple[TargetType, str]] = set()
 
-    def rule_out(self, event: Event) -> None:
+    def rule_out(self, event: SoakEvent) -> None:
         """This backend cannot do it."""
-        injection = Injection(event.request.kind, event.request.target)
+        injection = FaultInjection(event.request.kind, event.request.target)
         self._impossible.add((injection.target_type, injection.kind))
 
-    def events(self) -> Iterator[Event]:
+    def events(self) -> Iterator[SoakEvent]:
         """One after the other, without end."""
         for number in itertools.count(1):
             yield self._draw(number)
 
-    def _draw(self, number: int) -> Event:
+    def _draw(self, number: int) -> SoakEvent:
         dice = self._random
         while True:
             sort = dice.choice(SORTS)
@@ -96,17 +96,19 @@ class Dice:
             lasts_s, pause_s, by_itself = dice.choice(LASTS_S), dice.uniform(0.5, 3.0), dice.random() < 0.5
             if (sort, kind) in self._impossible or (kind == "corrupt" and target not in SPOILT_KEYS):
                 continue
-            injection = validate_and_complete_injection(Injection(kind, target, 0.0, lasts_s, amount))
+            injection = validate_and_complete_injection(FaultInjection(kind, target, 0.0, lasts_s, amount))
             once = injection.kind_info.is_instantaneous
             by_itself |= (kind, target) == ("freeze", "host")  # nobody can ask for its end
             request = FaultRequest(
                 kind=kind, target=target, amount=amount, for_s=lasts_s if by_itself and not once else None
             )
             follows, names = _follows(injection)
-            return Event(number, pause_s, request, injection.executing_part, 0.0 if once else lasts_s, follows, names)
+            return SoakEvent(
+                number, pause_s, request, injection.executing_part, 0.0 if once else lasts_s, follows, names
+            )
 
 
-def _follows(injection: Injection) -> tuple[Follows, tuple[str, ...]]:
+def _follows(injection: FaultInjection) -> tuple[Follows, tuple[str, ...]]:
     """What comes of it, and whom the causes of faults may name."""
     kind, target, lasts_s = injection.kind, injection.target, injection.end_s
     match injection.target_type:

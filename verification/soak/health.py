@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_testing.harness.processes import find_run_processes
-from verification.fuzz.vitals import Vitals, vitals
+from verification.fuzz.vitals import ProcessVitals, vitals
 
 EVERY_S = 2.0
 WARM_UP_S = 20.0  # of a process: until then, anything may grow
@@ -19,18 +19,18 @@ ORPHANED_S = 10.0
 
 
 @dataclass(frozen=True)
-class Row:
+class HealthRow:
     """One look at one process."""
 
     at_s: float
-    vitals: Vitals
+    vitals: ProcessVitals
 
 
-class Health:
+class ProcessHealth:
     """Looks at a run's processes every now and then."""
 
     def __init__(self, out: Path) -> None:
-        self.rows: dict[tuple[str, int], list[Row]] = {}  # by part and process id
+        self.rows: dict[tuple[str, int], list[HealthRow]] = {}  # by part and process id
         self.violations: list[str] = []
         self._out = out
         self._due_s = 0.0
@@ -46,7 +46,7 @@ class Health:
         for name, pid in found.items():
             seen = vitals(pid)
             if seen is not None:
-                self.rows.setdefault((name, pid), []).append(Row(now, seen))
+                self.rows.setdefault((name, pid), []).append(HealthRow(now, seen))
         extra = {pid: name for name, pid in found.items() if name.endswith("again")}
         self._extra_since = {pid: self._extra_since.get(pid, now) for pid in extra}
         for pid, since in self._extra_since.items():

@@ -14,11 +14,11 @@ from typing import Literal, get_args
 import msgspec
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.stop_port import request_stop
 from snakesim_hal.run_log.host_record import HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
+from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, RobotStatus
 from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.harness.command import running_snakesim
@@ -40,7 +40,7 @@ MARK = "SNAKESIM_KILLS"  # in the environment of everything that descends from a
 
 
 @dataclass(frozen=True)
-class Hit:
+class ProcessKill:
     """A signal to one process, so long after the moment."""
 
     victim: str
@@ -54,7 +54,7 @@ class Hit:
 
 
 @dataclass(frozen=True)
-class Trial:
+class KillTrial:
     """What is drawn."""
 
     number: int
@@ -65,7 +65,7 @@ class Trial:
     asked_s: float
     moment: Moment
     by_datagram: bool  # how the emergency stop is asked for
-    hits: tuple[Hit, ...]
+    hits: tuple[ProcessKill, ...]
 
     def __str__(self) -> str:
         kind = " ".join([self.backend, self.clock_mode, *self._flags])
@@ -91,10 +91,10 @@ class Trial:
 
 
 @dataclass
-class Outcome:
+class KillOutcome:
     """What became of it."""
 
-    trial: Trial
+    trial: KillTrial
     reached: bool = False  # the moment
     hits: int = 0
     code: int | None = None
@@ -114,17 +114,17 @@ class Outcome:
 class KilledRun:
     """A run, and who watches it from its network."""
 
-    def __init__(self, trial: Trial, folder: Path) -> None:
+    def __init__(self, trial: KillTrial, folder: Path) -> None:
         self._trial, self._folder, self._out = trial, folder, folder / "run"
-        self._outcome = Outcome(trial)
+        self._outcome = KillOutcome(trial)
         self._mark = f"{os.getpid()}-{trial.number}-{time.monotonic_ns()}"
-        self._status: Status | None = None
+        self._status: RobotStatus | None = None
         self._armed: set[tuple[int, int]] = set()  # epoch of the lease, tick
         self._frozen: set[str] = set()
         self._asking = ThreadPoolExecutor(2)
         self._asked: list[Future[None]] = []
 
-    def go(self) -> Outcome:
+    def go(self) -> KillOutcome:
         """Carry it out, wait for the end, and gather what is left."""
         with running_snakesim(self._out, *self._trial.arguments(), extra_env={MARK: self._mark}) as run:
             self._process, self._endpoint = run.process, run.endpoint
@@ -165,8 +165,10 @@ class KilledRun:
 
     def _join(self, stack: contextlib.ExitStack) -> bool:
         with contextlib.suppress(NotConnectedError):
-            session = stack.enter_context(open_session(Link(self._endpoint, ROBOT), connect_timeout_s=0.2))
-            self._statuses = session.declare_latched_reader(keys.STATUS, Status)
+            session = stack.enter_context(
+                open_session(ConnectionSettings(self._endpoint, ROBOT), connect_timeout_s=0.2)
+            )
+            self._statuses = session.declare_latched_reader(keys.STATUS, RobotStatus)
             self._clocks = session.declare_reader(keys.CLOCK, Clock)
             self._session = session
         return self._session is not None

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from verification.soak.killed_run import MOMENTS, RATE_HZ, SUPERVISOR, Hit, KilledRun, Outcome, Trial
+from verification.soak.killed_run import MOMENTS, RATE_HZ, SUPERVISOR, KilledRun, KillOutcome, KillTrial, ProcessKill
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGSTOP, signal.SIGSTOP, signal.SIGTERM, signal.SIGINT)
 VICTIMS = (SUPERVISOR, "host", "host", "guidance", "navigation", "control")
@@ -33,19 +33,19 @@ WITHIN_S = {  # of the moment, the hits come
 THREW = re.compile(r"Traceback|panicked|Exception ignored|RuntimeWarning|Fatal Python error")
 
 
-def draw(seed: int, *, backend: str | None = None) -> Iterator[Trial]:
+def draw(seed: int, *, backend: str | None = None) -> Iterator[KillTrial]:
     """Trials without end; the same ones for the same seed. Backends and moments take turns."""
     dice = random.Random(seed)
     for number in itertools.count():
         moment, router = MOMENTS[number % len(MOMENTS)], dice.random() < 0.25
         clock_mode = dice.choice(("realtime", "realtime", "lockstep"))
         victims = (*VICTIMS, "router") if router else VICTIMS
-        hits: list[Hit] = []
+        hits: list[ProcessKill] = []
         for _ in range(dice.choice((1, 1, 1, 2, 3))):
             what = dice.choice(SIGNALS)
             thaw_s = dice.choice((0.02, 0.2, 1.0, 3.0, None)) if what is signal.SIGSTOP else None
-            hits.append(Hit(dice.choice(victims), what, round(dice.uniform(0.0, WITHIN_S[moment]), 3), thaw_s))
-        yield Trial(
+            hits.append(ProcessKill(dice.choice(victims), what, round(dice.uniform(0.0, WITHIN_S[moment]), 3), thaw_s))
+        yield KillTrial(
             number=number,
             backend=backend or ("sim", "can")[number // len(MOMENTS) % 2],
             clock_mode=clock_mode,
@@ -62,7 +62,7 @@ def draw(seed: int, *, backend: str | None = None) -> Iterator[Trial]:
         )
 
 
-def judge(outcome: Outcome) -> list[str]:
+def judge(outcome: KillOutcome) -> list[str]:
     """What was wrong; empty when nothing was."""
     trial, wrong = outcome.trial, [f"left behind: {what}" for what in outcome.left_behind]
     wrong += [
@@ -80,13 +80,13 @@ def judge(outcome: Outcome) -> list[str]:
     return wrong
 
 
-def _before_our_code(trial: Trial, name: str, text: str) -> bool:
+def _before_our_code(trial: KillTrial, name: str, text: str) -> bool:
     """Whether Ctrl-C came while Python itself was starting: no line of ours had been read."""
     interrupted = any(hit.victim == SUPERVISOR and hit.number is signal.SIGINT for hit in trial.hits)
     return interrupted and name == "the run" and "KeyboardInterrupt" in text and "snakesim_" not in text
 
 
-def _lies(outcome: Outcome) -> list[str]:
+def _lies(outcome: KillOutcome) -> list[str]:
     """Exit codes that are not so: 0 armed for as long as asked, 1 a fault, 130 interrupted, else by that signal."""
     code, trial = outcome.code, outcome.trial
     asked = round(trial.asked_s * RATE_HZ)
@@ -112,7 +112,7 @@ def _around(text: str, at: int) -> str:
     return " | ".join(line.strip() for line in text[at:].splitlines()[:40] if line.strip())[-600:]
 
 
-def carry_out(trial: Trial, folder: Path) -> tuple[Outcome, list[str]]:
+def carry_out(trial: KillTrial, folder: Path) -> tuple[KillOutcome, list[str]]:
     """One trial in a folder of its own."""
     folder.mkdir(parents=True)
     outcome = KilledRun(trial, folder).go()

@@ -4,14 +4,14 @@ from itertools import islice
 
 import pytest
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, Description, Fault, Mode, Status
+from snakesim_hal.wire.messages import AppliedCommand, Fault, JointMode, RobotDescription, RobotStatus
 from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_status
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from verification.soak.faults import Dice
-from verification.soak.watch import Watch
+from verification.soak.faults import EventDrawer
+from verification.soak.watch import JudgingObserver
 
 ROBOT = make_description()  # 5 rad/s at 100 Hz, and 0.3 rad from the measured angle at most
 
@@ -21,13 +21,13 @@ def applied(tick: int, target: float) -> AppliedCommand:
         tick=tick,
         timestamp_ns=0,
         sequence=tick,
-        mode=[Mode.POSITION] * 3,
+        mode=[JointMode.POSITION] * 3,
         target=[target] * 3,
         torque_limit_nm=[1.0] * 3,
     )
 
 
-def stopped(why: str, *causes: str) -> Status:
+def stopped(why: str, *causes: str) -> RobotStatus:
     return make_status(
         tick=1, lifecycle="fault", reason=why, faults=[Fault(tick=1, what="hot", cause=c) for c in causes]
     )
@@ -44,9 +44,12 @@ def stopped(why: str, *causes: str) -> Status:
 )
 def test_set_points_are_judged(targets: list[float], measured: list[float], found: str | None) -> None:
     endpoint = find_free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
-        hal.declare_latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
-        watch = Watch(session)
+    with (
+        open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal,
+        open_session(ConnectionSettings(endpoint, "worm")) as session,
+    ):
+        hal.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(ROBOT)
+        watch = JudgingObserver(session)
         watch.joints = {tick: make_joint_state(ROBOT, angle, tick=tick) for tick, angle in enumerate(measured)}
         for tick, target in enumerate(targets):
             watch.judge(applied(tick, target))
@@ -55,8 +58,11 @@ def test_set_points_are_judged(targets: list[float], measured: list[float], foun
 
 def test_a_fault_that_is_not_explained_is_found() -> None:
     endpoint = find_free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
-        watch, teller = Watch(session), hal.declare_latched_publisher(keys.STATUS, Status)
+    with (
+        open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal,
+        open_session(ConnectionSettings(endpoint, "worm")) as session,
+    ):
+        watch, teller = JudgingObserver(session), hal.declare_latched_publisher(keys.STATUS, RobotStatus)
         for reported in (stopped("too hot", "too hot"), stopped("too hot"), stopped("", "too hot")):
             watch.status = None
             teller.put(reported)
@@ -66,7 +72,7 @@ def test_a_fault_that_is_not_explained_is_found() -> None:
 
 
 def test_one_seed_draws_the_same_faults() -> None:
-    drawn = [[str(event) for event in islice(Dice(seed, 13).events(), 200)] for seed in (1, 1, 2)]
+    drawn = [[str(event) for event in islice(EventDrawer(seed, 13).events(), 200)] for seed in (1, 1, 2)]
     assert drawn[0] == drawn[1] != drawn[2]
     kinds = {text.split()[1].partition(":")[0] for text in drawn[0]}
     assert {"kill", "freeze", "drop", "corrupt", "mute", "slow"} <= kinds

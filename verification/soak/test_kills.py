@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from verification.soak.killed_run import MOMENTS, SUPERVISOR, Hit, Outcome, Trial
+from verification.soak.killed_run import MOMENTS, SUPERVISOR, KillOutcome, KillTrial, ProcessKill
 from verification.soak.kills import carry_out, draw, judge
 
 TRIALS = list(islice(draw(11), 2 * len(MOMENTS)))
@@ -19,7 +19,7 @@ TRIALS = list(islice(draw(11), 2 * len(MOMENTS)))
     [pytest.param(trial, marks=[pytest.mark.slow] if i not in (0, 3) else []) for i, trial in enumerate(TRIALS[3:10])],
     ids=str,
 )
-def test_what_a_killed_run_leaves(tmp_path: Path, trial: Trial) -> None:
+def test_what_a_killed_run_leaves(tmp_path: Path, trial: KillTrial) -> None:
     _, wrong = carry_out(trial, tmp_path / "trial")
     assert wrong == []
 
@@ -46,7 +46,7 @@ def test_kills_of_one_seed_are_same_on_both_backends() -> None:
     ],
 )
 def test_the_judge_sees_what_is_wrong(outcome: dict[str, object], word: str | None) -> None:
-    trial = replace(TRIALS[0], asked_s=8.0, moment="armed", hits=(Hit("host", signal.SIGKILL, 0.1),))
-    wrong = judge(Outcome(trial, **outcome))  # pyright: ignore[reportArgumentType]
+    trial = replace(TRIALS[0], asked_s=8.0, moment="armed", hits=(ProcessKill("host", signal.SIGKILL, 0.1),))
+    wrong = judge(KillOutcome(trial, **outcome))  # pyright: ignore[reportArgumentType]
     assert any(word in what for what in wrong) if word else wrong == []
     assert SUPERVISOR not in str(trial)

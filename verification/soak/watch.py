@@ -6,16 +6,16 @@ from typing import Any
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, Clock, Description, Mode, Status
+from snakesim_hal.wire.messages import AppliedCommand, Clock, JointMode, RobotDescription, RobotStatus
 from verification.faults.observer import Observer
 
 ROUNDING_RAD = 1e-6
 KEPT = 200  # joint states, and statuses
 
 
-class Watch(Observer):
+class JudgingObserver(Observer):
     """An observer that judges at once what it hears, and keeps little."""
 
     def __init__(self, session: Session) -> None:
@@ -24,7 +24,7 @@ class Watch(Observer):
         self.counts: Counter[str] = Counter()
         self.sequences = 0  # applied commands of a controller
         self.blind: set[str] = set()  # keys that are corrupted on purpose: what comes there proves nothing
-        self._robot: Description | None = None
+        self._robot: RobotDescription | None = None
         self._before: AppliedCommand | None = None
         self._pending: list[AppliedCommand] = []
 
@@ -33,7 +33,7 @@ class Watch(Observer):
         super().listen()
         self.commands.clear()
 
-    def on_unreadable(self, arrival: Arrival, error: WireError) -> None:
+    def on_unreadable(self, arrival: ReceivedSample, error: WireError) -> None:
         """It is counted, by key and reason."""
         self.counts[f"{arrival.key}: {error.reason}"] += 1
 
@@ -41,7 +41,7 @@ class Watch(Observer):
         """Judge it at once, and keep little."""
         super().receive(at_ns, message)
         match message:
-            case Status():
+            case RobotStatus():
                 del self.statuses[:-KEPT]
                 self._explained(message)
             case AppliedCommand():
@@ -62,7 +62,7 @@ class Watch(Observer):
         self._pending.clear()
         self._before = None
 
-    def _explained(self, status: Status) -> None:
+    def _explained(self, status: RobotStatus) -> None:
         """A state that does not say why, or says something else."""
         if not status.reason:
             self._violated(f"{status.lifecycle} without a why")
@@ -87,14 +87,14 @@ class Watch(Observer):
         robot, measured = self._robot, self.joints.get(now.tick)
         follows = before is not None and before.tick == now.tick - 1
         for i, (joint, mode, target) in enumerate(zip(robot.joints, now.mode, now.target, strict=True)):
-            if mode is not Mode.POSITION:
+            if mode is not JointMode.POSITION:
                 continue
             edge = math.nan if measured is None else abs(target - measured.angle_rad[i])
             in_range = joint.angle_min_rad < target < joint.angle_max_rad
             if now.sequence is not None and in_range and edge > robot.max_step_rad + ROUNDING_RAD:
                 most = f"at most {robot.max_step_rad:g}"
                 self._violated(f"tick {now.tick}: {joint.name} is sent {edge:.3f} rad away from where it is, {most}")
-            if not follows or before is None or before.mode[i] is not Mode.POSITION:
+            if not follows or before is None or before.mode[i] is not JointMode.POSITION:
                 continue
             step, most = abs(target - before.target[i]), joint.speed_limit_rad_s * robot.period_ns * 1e-9
             if step <= most + ROUNDING_RAD:

@@ -13,7 +13,7 @@ import numpy as np
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, GaitParametersT, Seconds
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded, from_zero
 
 Swing = Annotated[float, bounded(-2, 2, "rad")]
@@ -25,7 +25,7 @@ class _WaveGait(Gait[GaitParametersT]):
 
     _blends_after_hold = False  # the digests of recorded runs depend on it
 
-    def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
+    def __init__(self, robot: RobotDescription, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
         self._yaw_joints = self.find_joints("yaw")
         self._pitch_joints = self.find_joints("pitch")

@@ -23,12 +23,12 @@ import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, GaitParametersT, Seconds
 from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
-from snakesim_gnc.control.gaits.chain_fit import Backbone, KeyframeWaves, sample_by_arc_length
+from snakesim_gnc.control.gaits.chain_fit import BackboneCurve, KeyframeWaves, sample_by_arc_length
 from snakesim_gnc.control.gaits.serpenoid import Wavelength
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.controller import ControllerCommand, Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded, from_zero
 
 DENSE_POINT_COUNT = 400  # of a curve, for its arc length
@@ -73,7 +73,7 @@ class BackboneRollingParameters(GaitParameters, frozen=True, kw_only=True):
 class _BackboneGait(Gait[GaitParametersT]):
     """A gait whose joints are fitted to a curve. It holds the pose in the first cycles, until the fit is complete."""
 
-    def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
+    def __init__(self, robot: RobotDescription, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
         self._point_fractions = compute_node_fractions(robot)
         self._length_m = sum(link.length_m for link in robot.links)
@@ -89,7 +89,7 @@ class _BackboneGait(Gait[GaitParametersT]):
         return self._keyframe_waves.compute_joint_angles_rad(phase_rad)
 
     @abstractmethod
-    def compute_backbone(self, phase_rad: float) -> Backbone:
+    def compute_backbone(self, phase_rad: float) -> BackboneCurve:
         """Return the curve at a phase."""
 
     def fit_and_validate(self, parameter_label: str) -> None:
@@ -125,7 +125,7 @@ class BackboneSidewinding(_BackboneGait[BackboneSidewindingParameters]):
     Parameters = BackboneSidewindingParameters
 
     @classmethod
-    def check(cls, robot: Description, parameters: BackboneSidewindingParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: BackboneSidewindingParameters) -> None:
         """Check that the joints can form the helix. Raises ConfigError."""
         for axis in cls._required_axes:
             curve = BodyCurve(robot, axis)
@@ -134,7 +134,7 @@ class BackboneSidewinding(_BackboneGait[BackboneSidewindingParameters]):
             )
         cls(robot, parameters).fit_and_validate(f"control.half_width of {parameters.half_width:g}")
 
-    def compute_backbone(self, phase_rad: float) -> Backbone:
+    def compute_backbone(self, phase_rad: float) -> BackboneCurve:
         return compute_helix(self._point_fractions, self._length_m, self.parameters, phase_rad)
 
 
@@ -144,15 +144,15 @@ class BackboneRolling(_BackboneGait[BackboneRollingParameters]):
     Parameters = BackboneRollingParameters
 
     @classmethod
-    def check(cls, robot: Description, parameters: BackboneRollingParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: BackboneRollingParameters) -> None:
         """Check that the joints can form the arc. Raises ConfigError."""
         cls(robot, parameters).fit_and_validate(f"control.bend_rad of {parameters.bend_rad:g} rad")
 
-    def compute_backbone(self, phase_rad: float) -> Backbone:
+    def compute_backbone(self, phase_rad: float) -> BackboneCurve:
         return compute_arc(self._point_fractions, self._length_m, self.parameters.bend_rad, phase_rad)
 
 
-def compute_node_fractions(robot: Description) -> Floats:
+def compute_node_fractions(robot: RobotDescription) -> Floats:
     """Return where the tail end, the joints and the head end are, as fractions of the body from the tail."""
     ends_m = np.cumsum([link.length_m for link in robot.links])
     return np.concatenate(([0.0], ends_m / ends_m[-1]))
@@ -160,7 +160,7 @@ def compute_node_fractions(robot: Description) -> Floats:
 
 def compute_helix(
     point_fractions: Floats, length_m: float, parameters: BackboneSidewindingParameters, phase_rad: float
-) -> Backbone:
+) -> BackboneCurve:
     """Return the helix of sidewinding, from the tail to the head.
 
     Args:
@@ -181,10 +181,10 @@ def compute_helix(
     arc_lengths = np.concatenate(([0.0], np.cumsum(segment_lengths)))
     start_arc_length = 0.5 * (arc_lengths[-1] - 1.0)
     points = sample_by_arc_length(dense_points, (start_arc_length + point_fractions) / arc_lengths[-1])
-    return Backbone(length_m * points, np.array([0.0, 0.0, 1.0]))
+    return BackboneCurve(length_m * points, np.array([0.0, 0.0, 1.0]))
 
 
-def compute_arc(point_fractions: Floats, length_m: float, bend_rad: float, phase_rad: float) -> Backbone:
+def compute_arc(point_fractions: Floats, length_m: float, bend_rad: float, phase_rad: float) -> BackboneCurve:
     """Return the arc of rolling, from the tail to the head, and the roll of its middle.
 
     Args:
@@ -201,7 +201,7 @@ def compute_arc(point_fractions: Floats, length_m: float, bend_rad: float, phase
     )
     roll_rad = math.copysign(phase_rad, bend_rad)
     roll_normal = np.array([0.0, -math.sin(roll_rad), math.cos(roll_rad)])
-    return Backbone(points, roll_normal)
+    return BackboneCurve(points, roll_normal)
 
 
 def _find_axis_wavelength(arc_wavelength: float, width: float, height: float) -> float:

@@ -11,7 +11,7 @@ from snakesim_gnc.control.gaits.body_curve import DIRECTIONS
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Axis, Description
+from snakesim_hal.wire.messages import Axis, RobotDescription
 from snakesim_hal.wire.quantities import above
 
 Seconds = Annotated[float, above(100, "s")]
@@ -46,7 +46,7 @@ class Gait(Controller[GaitParametersT]):
     False: at once, so that only the command limiter smooths it.
     """
 
-    def __init__(self, robot: Description, parameters: GaitParametersT) -> None:
+    def __init__(self, robot: RobotDescription, parameters: GaitParametersT) -> None:
         super().__init__(robot, parameters)
         self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
         self._phase_rad = 0.0
@@ -105,7 +105,7 @@ def get_travel_sign(observation: Observation) -> float:
     return math.copysign(1.0, observation.trajectory.speed_m_s)
 
 
-def explain_missing_joints(robot: Description, required_axes: tuple[Axis, ...]) -> str:
+def explain_missing_joints(robot: RobotDescription, required_axes: tuple[Axis, ...]) -> str:
     """Return why a robot cannot move by a gait that needs joints with these axes; empty if it can."""
     available_axes = {joint.axis for joint in robot.joints}
     directions = [DIRECTIONS[axis] for axis in required_axes if axis not in available_axes]

@@ -15,7 +15,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.messages import Axis, Description
+from snakesim_hal.wire.messages import Axis, RobotDescription
 
 DIRECTIONS: dict[Axis, str] = {"pitch": "up and down", "yaw": "left and right"}  # of a joint, by its axis
 MIN_JOINTS_PER_WAVE = 3.0  # with fewer, the body is far from the curve
@@ -25,7 +25,7 @@ CHECKED_PHASES_RAD = np.linspace(0.0, math.tau, 32, endpoint=False)  # rad, at w
 class BodyCurve:
     """The joints of a robot that bend in one plane, and the straight pieces between them."""
 
-    def __init__(self, robot: Description, axis: Axis) -> None:
+    def __init__(self, robot: RobotDescription, axis: Axis) -> None:
         """Compute the lengths of the straight pieces of the body between the joints with one axis.
 
         Args:

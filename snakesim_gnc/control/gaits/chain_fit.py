@@ -24,7 +24,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames
-from snakesim_hal.wire.messages import Axis, Description
+from snakesim_hal.wire.messages import Axis, RobotDescription
 
 GROUP_LINKS = 6  # links that are fitted together: three yaw and three pitch joints
 FINAL_STEPS = 8  # Gauss-Newton steps of all joints, in the first keyframe
@@ -36,7 +36,7 @@ KEYFRAME_COUNT = 16
 
 
 @dataclass(frozen=True)
-class Backbone:
+class BackboneCurve:
     """A curve at one phase, as the places that the nodes of a chain should have."""
 
     node_positions: Floats  # (n_joints + 2, 3) m, tail end to head end
@@ -46,7 +46,7 @@ class Backbone:
 class ChainFit:
     """The chain of one robot, which is laid on one curve after the other."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         self._axes: list[Axis] = [joint.axis for joint in robot.joints]
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._mean_link_length_m = float(self._lengths_m.mean())
@@ -57,7 +57,7 @@ class ChainFit:
         self._position = np.zeros(3)
         self._rotation = np.eye(3)
 
-    def fit_first(self, backbone: Backbone) -> Iterator[None]:
+    def fit_first(self, backbone: BackboneCurve) -> Iterator[None]:
         """Fit the chain to a curve from the tail to the head, group after group, and then all joints together.
 
         Yields:
@@ -74,7 +74,7 @@ class ChainFit:
             self._do_gauss_newton_step(backbone, 0, joint_count)
             yield
 
-    def fit_next(self, backbone: Backbone) -> Iterator[None]:
+    def fit_next(self, backbone: BackboneCurve) -> Iterator[None]:
         """Fit the chain to a curve that differs little from the last one.
 
         Yields:
@@ -94,7 +94,7 @@ class ChainFit:
             self._position, self._rotation, self.angles_rad, self._axes, self._lengths_m.tolist()
         )
 
-    def _do_gauss_newton_step(self, backbone: Backbone, first_joint: int, end_joint: int) -> None:
+    def _do_gauss_newton_step(self, backbone: BackboneCurve, first_joint: int, end_joint: int) -> None:
         """Do one Gauss-Newton step of a group of joints, and of the base if the group begins at the tail.
 
         Args:
@@ -165,7 +165,10 @@ class KeyframeWaves:
     """
 
     def __init__(
-        self, robot: Description, compute_backbone: Callable[[float], Backbone], phase_count: int = KEYFRAME_COUNT
+        self,
+        robot: RobotDescription,
+        compute_backbone: Callable[[float], BackboneCurve],
+        phase_count: int = KEYFRAME_COUNT,
     ) -> None:
         """Prepare to fit the joints of a robot to the keyframes of a gait; `advance_fit` does the steps.
 
@@ -244,7 +247,7 @@ def sample_by_arc_length(points: Floats, fractions: Sequence[float] | Floats) ->
     )
 
 
-def _compute_initial_rotation(backbone: Backbone) -> Floats:
+def _compute_initial_rotation(backbone: BackboneCurve) -> Floats:
     """Return a rotation matrix whose x axis is along the start of the curve, and whose y axis fits the roll normal."""
     x = backbone.node_positions[1] - backbone.node_positions[0]
     x /= np.linalg.norm(x)

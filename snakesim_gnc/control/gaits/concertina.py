@@ -25,7 +25,7 @@ from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds
 from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import from_zero
 
 
@@ -63,14 +63,14 @@ class Concertina(Gait[ConcertinaParameters]):
     _required_axes = ("yaw",)
 
     @classmethod
-    def check(cls, robot: Description, parameters: ConcertinaParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: ConcertinaParameters) -> None:
         """Check that the joints can form the folds. Raises ConfigError."""
         curve = BodyCurve(robot, "yaw")
         curve.check_wavelength(0.5 / parameters.folds, f"control.folds of {parameters.folds}", "reduce it")
         shapes_rad = np.array([_compute_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD])
         curve.check_limits(shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad")
 
-    def __init__(self, robot: Description, parameters: ConcertinaParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: ConcertinaParameters) -> None:
         super().__init__(robot, parameters)
         self._curve = BodyCurve(robot, "yaw")
 

@@ -38,7 +38,7 @@ from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead
 from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, check_serpenoid
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description, World
+from snakesim_hal.wire.messages import RobotDescription, WorldModel
 from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 MAX_FEEDBACK_RATIO = 0.8  # of the feedback to 2 pi nu
@@ -82,7 +82,7 @@ class CpgParameters(GaitParameters, frozen=True, kw_only=True):
     """Time over which the command changes smoothly to a new reference."""
 
 
-class Oscillators:
+class OscillatorChains:
     """Two chains of oscillators, left and right. All arrays are (2, n_joints): left and right, tail to head."""
 
     def __init__(self, phase_bias_rad: Floats, coupling: float, amplitude_rate: float) -> None:
@@ -150,11 +150,11 @@ class Cpg(Gait[CpgParameters]):
     _required_axes = ("yaw",)
 
     @classmethod
-    def check(cls, robot: Description, parameters: CpgParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: CpgParameters) -> None:
         """Check that the joints can form the curve of the limit cycle. Raises ConfigError."""
         check_serpenoid(robot, parameters.winding_angle_rad, parameters.wavelength)
 
-    def __init__(self, robot: Description, parameters: CpgParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: CpgParameters) -> None:
         """Create the oscillators whose limit cycle is the serpenoid curve, and the heading control.
 
         Args:
@@ -177,7 +177,7 @@ class Cpg(Gait[CpgParameters]):
         self._amplitude_rad = 2.0 * parameters.winding_angle_rad * np.sin(0.5 * wave_number * piece_distance)
         self._bend_fraction = piece_distance  # of the bend of the whole body, in each joint
         phase_bias_rad = 0.5 * math.pi - wave_number * joint_from_head
-        self._oscillators = Oscillators(phase_bias_rad, parameters.coupling, parameters.amplitude_rate)
+        self._oscillators = OscillatorChains(phase_bias_rad, parameters.coupling, parameters.amplitude_rate)
 
     def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
         intrinsic_frequency_rad_s = get_travel_sign(observation) * math.tau / self.parameters.period_s
@@ -198,7 +198,7 @@ class Cpg(Gait[CpgParameters]):
             "oscillator_amplitude_rad": float(self._oscillators.r_rad.mean()),
         }
 
-    def _compute_feedback_rad_s(self, world: World | None) -> Floats:
+    def _compute_feedback_rad_s(self, world: WorldModel | None) -> Floats:
         """Compute the feedback of contact forces, sigma F_i cos(theta_i - psi), limited so that no oscillator stops.
 
         Args:

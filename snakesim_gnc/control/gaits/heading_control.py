@@ -29,7 +29,7 @@ import numpy as np
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Observation
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import above, from_zero
 
 MIN_MEAN_RESULTANT = 0.2  # resultant of the headings below which they have no mean direction
@@ -43,7 +43,7 @@ class HeadingControl:
     """Computes the bend of one robot."""
 
     def __init__(
-        self, robot: Description, *, k_theta: float, look_ahead: float, max_bend_rad: float, time_constant_s: float
+        self, robot: RobotDescription, *, k_theta: float, look_ahead: float, max_bend_rad: float, time_constant_s: float
     ) -> None:
         """Create a heading control without a path, whose bend is zero.
 

@@ -24,7 +24,7 @@ from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_gnc.control.gaits.serpenoid import Wavelength
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import from_zero
 
 
@@ -54,14 +54,14 @@ class Rectilinear(Gait[RectilinearParameters]):
     _required_axes = ("pitch", "yaw")
 
     @classmethod
-    def check(cls, robot: Description, parameters: RectilinearParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: RectilinearParameters) -> None:
         """Check that the joints can form the wave. Raises ConfigError."""
         curve = BodyCurve(robot, "pitch")
         curve.check_wavelength(parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it")
         shapes_rad = np.array([_compute_slope_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD])
         curve.check_limits(shapes_rad, f"control.slope_rad of {parameters.slope_rad:g} rad")
 
-    def __init__(self, robot: Description, parameters: RectilinearParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: RectilinearParameters) -> None:
         super().__init__(robot, parameters)
         self._pitch_curve = BodyCurve(robot, "pitch")
         yaw_curve = BodyCurve(robot, "yaw")

@@ -21,7 +21,7 @@ from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
 from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded, from_zero
 
 WindingAngle = Annotated[float, from_zero(2.2, "rad")]
@@ -70,7 +70,7 @@ def compute_serpenoid_headings(
     return winding_angle_rad * np.cos(phase_rad - math.tau * from_head / wavelength)
 
 
-def check_serpenoid(robot: Description, winding_angle_rad: float, wavelength: float) -> None:
+def check_serpenoid(robot: RobotDescription, winding_angle_rad: float, wavelength: float) -> None:
     """Check that the yaw joints of a robot can form the serpenoid curve at every phase.
 
     Args:
@@ -99,11 +99,11 @@ class Serpenoid(Gait[SerpenoidParameters]):
     _required_axes = ("yaw",)
 
     @classmethod
-    def check(cls, robot: Description, parameters: SerpenoidParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: SerpenoidParameters) -> None:
         """Check that the joints can form the curve. Raises ConfigError."""
         check_serpenoid(robot, parameters.winding_angle_rad, parameters.wavelength)
 
-    def __init__(self, robot: Description, parameters: SerpenoidParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: SerpenoidParameters) -> None:
         super().__init__(robot, parameters)
         self._curve = BodyCurve(robot, "yaw")
         self._heading_control = HeadingControl(

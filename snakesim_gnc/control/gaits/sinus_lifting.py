@@ -25,7 +25,7 @@ from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead
 from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, compute_serpenoid_headings
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded
 
 
@@ -64,7 +64,7 @@ class SinusLifting(Gait[SinusLiftingParameters]):
     _required_axes = ("pitch", "yaw")
 
     @classmethod
-    def check(cls, robot: Description, parameters: SinusLiftingParameters) -> None:
+    def check(cls, robot: RobotDescription, parameters: SinusLiftingParameters) -> None:
         """Check that the joints can form the curve. Raises ConfigError."""
         curves = (BodyCurve(robot, "yaw"), BodyCurve(robot, "pitch"))
         yaw_curve, pitch_curve = curves
@@ -75,7 +75,7 @@ class SinusLifting(Gait[SinusLiftingParameters]):
             shapes_rad = np.array([_compute_angles_rad(curves, parameters, phase, 0.0) for phase in CHECKED_PHASES_RAD])
             yaw_curve.check_limits(shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad")
 
-    def __init__(self, robot: Description, parameters: SinusLiftingParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: SinusLiftingParameters) -> None:
         super().__init__(robot, parameters)
         self._curves = (BodyCurve(robot, "yaw"), BodyCurve(robot, "pitch"))
         self._heading_control = HeadingControl(

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_gnc.geometry.body_on_path import BodyPose
+from snakesim_gnc.geometry.body_on_path import PathBodyPose
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 
 Planar = tuple[float, float]
 
@@ -48,7 +48,7 @@ class PushPoint:
 
 
 def plan_contact(
-    route: Route, obstacle: Obstacle, body_radius_m: float, *, near_s_m: float, window_m: float
+    route: Route, obstacle: KnownObstacle, body_radius_m: float, *, near_s_m: float, window_m: float
 ) -> PlannedContact:
     """Find the point of the route that is nearest to an obstacle, where the body will push off the obstacle.
 
@@ -88,7 +88,7 @@ def plan_contact(
 
 
 def _find_nearest_point_to_box(
-    route: Route, box: Obstacle, near_s_m: float, window_m: float
+    route: Route, box: KnownObstacle, near_s_m: float, window_m: float
 ) -> tuple[float, Planar, float]:
     """Find the point of a route that is nearest to a box, by a coarse and a fine search.
 
@@ -102,7 +102,7 @@ def _find_nearest_point_to_box(
         The arc length of the nearest point in m, the unit vector from the box to this point, and its distance from the
         box in m.
     """
-    outline = Outlines.from_obstacles([box])
+    outline = ObstacleOutlines.from_obstacles([box])
     low_s_m = near_s_m - window_m
     high_s_m = near_s_m + window_m
     nearest_s_m = near_s_m
@@ -126,7 +126,7 @@ def _find_nearest_point_to_box(
 def find_push_points(
     planned_contacts: Sequence[PlannedContact],
     retained_obstacles: Collection[str],
-    body_pose: BodyPose,
+    body_pose: PathBodyPose,
     measured_points_w: Floats,
     body_points_s_m: Sequence[float],
     *,

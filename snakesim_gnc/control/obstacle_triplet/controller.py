@@ -34,14 +34,14 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
     TripletFinder,
     choose_triplet,
 )
-from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallDetector, explain_stall
+from snakesim_gnc.control.obstacle_triplet.stall import StallDetector, StallReason, explain_stall
 from snakesim_gnc.control.obstacle_triplet.telemetry import compute_bending_torques_nm, make_contact_messages
 from snakesim_gnc.control.progress import BodyLocation, PathProgress
-from snakesim_gnc.geometry.body_on_path import BodyPose
+from snakesim_gnc.geometry.body_on_path import PathBodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
-from snakesim_hal.wire.messages import Description, Mode, Obstacle
+from snakesim_hal.wire.messages import JointMode, KnownObstacle, RobotDescription
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 PLAN_WINDOW_M = 1.0  # the path may pass an obstacle that is near the body so far beyond the body's ends
@@ -68,10 +68,10 @@ class ObstacleTriplet(Controller[TripletParameters]):
     """
 
     Parameters = TripletParameters
-    required_modes = (Mode.POSITION, Mode.TORQUE)
+    required_modes = (JointMode.POSITION, JointMode.TORQUE)
     required_measurements = ("torque",)
 
-    def __init__(self, robot: Description, parameters: TripletParameters) -> None:
+    def __init__(self, robot: RobotDescription, parameters: TripletParameters) -> None:
         """Create a controller that pushes off three obstacles at a time, with one joint in torque mode.
 
         It starts without push-points and triplet: all joints are in position mode until a world model shows three
@@ -90,11 +90,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
         # Joints in position mode.
         self._bumpless_transfer = BumplessTransfer(robot)
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._body_pose: BodyPose | None = None  # the pose on the path that these joints follow
+        self._body_pose: PathBodyPose | None = None  # the pose on the path that these joints follow
         self._reference_rad = np.empty(0)  # (n_joints,) rad, angles of that pose; empty before the first tick
         self._filtered_loads_nm = np.zeros(len(robot.joints))  # filtered load that their targets compensate
         # Push-points and triplets.
-        self._planned_contacts: dict[str, tuple[Obstacle, PlannedContact]] = {}  # by the obstacle's name
+        self._planned_contacts: dict[str, tuple[KnownObstacle, PlannedContact]] = {}  # by the obstacle's name
         self._push_points: list[PushPoint] = []
         self._triplet_finder = TripletFinder(
             condition_max=parameters.condition_max,
@@ -110,7 +110,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self._stall_detector = StallDetector(
             stall_m=parameters.stall_m, stall_s=parameters.stall_s, propulsion_n=parameters.propulsion_n
         )
-        self._stall: tuple[Stall, float] | None = None  # last stall, and the arc length of the tail where it occurred
+        self._stall: tuple[StallReason, float] | None = (
+            None  # last stall, and the arc length of the tail where it occurred
+        )
         self._banned_triplets: dict[ObstacleNames, float] = {}  # triplet -> arc length at which it was stationary
         self._excluded_joint: tuple[int, float] | None = None  # joint among those that bend, time until which
         self._position_mode_until_s = 0.0
@@ -175,7 +177,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         )
 
     def _make_command(
-        self, observation: Observation, location: BodyLocation, body_pose: BodyPose, reference_rad: Floats
+        self, observation: Observation, location: BodyLocation, body_pose: PathBodyPose, reference_rad: Floats
     ) -> ControllerCommand:
         """Set all joints to position mode at their reference, and the propulsion joint, if there is one, to its torque.
 
@@ -189,7 +191,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             The setpoints, with telemetry. Without a chosen triplet, no joint propels.
         """
         targets: list[float] = self._bumpless_transfer.compute_position_targets_rad(reference_rad).tolist()
-        modes = [Mode.POSITION] * len(targets)
+        modes = [JointMode.POSITION] * len(targets)
         setpoints = RequestedSetpoints(modes, targets, self._body.torque_limit_nm)
         choice = self._choice
         if choice is None:
@@ -198,14 +200,14 @@ class ObstacleTriplet(Controller[TripletParameters]):
             return ControllerCommand(setpoints, self._make_rest_telemetry(location))
         demand = self._compute_propulsion_demand(observation, location, choice)
         self._force_n = demand.force_n
-        modes[demand.joint] = Mode.TORQUE
+        modes[demand.joint] = JointMode.TORQUE
         targets[demand.joint] = demand.torque_nm
         self._watch_stall(observation, location, choice, demand)
         return ControllerCommand(setpoints, self._make_push_telemetry(location, body_pose, choice, demand))
 
     # --- control law ---------------------------------------------------------------------------------------------
 
-    def _update_reference_pose(self, observation: Observation, location: BodyLocation) -> BodyPose:
+    def _update_reference_pose(self, observation: Observation, location: BodyLocation) -> PathBodyPose:
         """Update the pose on the path that the joints in position mode follow, without a jump of their targets.
 
         Its arc length follows the measured one with slack, no faster than `overspeed_ratio` times the mission's speed,
@@ -239,7 +241,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self._reference_rad = reference_rad
         return body_pose
 
-    def _compute_load_compensation_rad(self, observation: Observation, body_pose: BodyPose) -> Floats:
+    def _compute_load_compensation_rad(self, observation: Observation, body_pose: PathBodyPose) -> Floats:
         """Update the filtered loads, and return by how much targets lead the path's angles: load / stiffness.
 
         The load of a joint is `load_ratio` times its torque for the planned contact forces. A servo gives way under a
@@ -313,7 +315,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
 
     # --- push-points and triplets --------------------------------------------------------------------------------
 
-    def _update_push_points(self, location: BodyLocation, body_pose: BodyPose) -> None:
+    def _update_push_points(self, location: BodyLocation, body_pose: PathBodyPose) -> None:
         """Plan the contacts with the obstacles near the body, and find those that the body can push off now.
 
         Obstacles that the body touches or pushes off already remain push-points up to a wider gap, `give_up_gap_m`.
@@ -350,7 +352,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             if known_contact is None or known_contact[0] != obstacle:
                 self._planned_contacts[name] = (obstacle, self._plan_contact(location, obstacle))
 
-    def _plan_contact(self, location: BodyLocation, obstacle: Obstacle) -> PlannedContact:
+    def _plan_contact(self, location: BodyLocation, obstacle: KnownObstacle) -> PlannedContact:
         half_length_m = self._body.length_m / 2
         return plan_contact(
             location.body_on_path.route,
@@ -360,7 +362,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             window_m=half_length_m + PLAN_WINDOW_M,
         )
 
-    def _update_choice(self, observation: Observation, location: BodyLocation, body_pose: BodyPose) -> None:
+    def _update_choice(self, observation: Observation, location: BodyLocation, body_pose: PathBodyPose) -> None:
         """Choose the triplet that propels, with its joint, from the current push-points; `_choice` is None without one.
 
         No triplet is chosen if no motion is desired, or for some time after a stall. A triplet at which the body was
@@ -405,7 +407,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
 
     # --- supervision ---------------------------------------------------------------------------------------------
 
-    def _release_swung_out_joint(self, observation: Observation, body_pose: BodyPose) -> None:
+    def _release_swung_out_joint(self, observation: Observation, body_pose: PathBodyPose) -> None:
         """Return the propulsion joint to position mode if it has swung out too far, and exclude it for `guard_s`."""
         if self._choice is None:
             return
@@ -511,7 +513,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         return self._stall is not None and self._stall[0].is_jammed
 
     def _make_push_telemetry(
-        self, location: BodyLocation, body_pose: BodyPose, choice: PropulsionChoice, demand: PropulsionDemand
+        self, location: BodyLocation, body_pose: PathBodyPose, choice: PropulsionChoice, demand: PropulsionDemand
     ) -> Telemetry:
         """Return the telemetry of a tick in which a triplet propels: its joint, its contacts and its forces.
 

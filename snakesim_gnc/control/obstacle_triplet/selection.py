@@ -31,7 +31,7 @@ TORQUE_DECIMALS = 3  # triplets whose torque per newton is equal to 1 mN·m/N co
 
 
 @dataclass(frozen=True)
-class Triplet:
+class ContactTriplet:
     """Three planned contacts, solved once. They do not depend on the body's position."""
 
     names: ObstacleNames
@@ -53,13 +53,13 @@ class Triplet:
 class PropulsionChoice:
     """A triplet, its current place on the body, and the propulsion joint."""
 
-    triplet: Triplet
+    triplet: ContactTriplet
     body_s_m: tuple[float, float, float]  # of o_1, o_2, o_3, from the tail end along the body
     joint: int  # index among the yaw joints, tail to head
     torque_per_n: float  # N·m/N, on the part of the body ahead of that joint
 
 
-def solve_triplets(contact_triples: Sequence[ContactTriple], *, condition_max: float) -> list[Triplet]:
+def solve_triplets(contact_triples: Sequence[ContactTriple], *, condition_max: float) -> list[ContactTriplet]:
     """Solve the contact forces for 1 N of propulsion of several triplets at once.
 
     Args:
@@ -83,11 +83,13 @@ def solve_triplets(contact_triples: Sequence[ContactTriple], *, condition_max: f
     ]
 
 
-def _make_triplet(contact_triple: ContactTriple, unit_forces: UnitForces) -> Triplet:
+def _make_triplet(contact_triple: ContactTriple, unit_forces: UnitForces) -> ContactTriplet:
     _, middle, front = contact_triple
     force_3_per_n = float(unit_forces.forces[2])
     max_torque = compute_torque_per_newton(force_3_per_n, front.point_w, front.normal_w, middle.point_w)
-    return Triplet(_get_obstacle_names(contact_triple), contact_triple, unit_forces, force_3_per_n, abs(max_torque))
+    return ContactTriplet(
+        _get_obstacle_names(contact_triple), contact_triple, unit_forces, force_3_per_n, abs(max_torque)
+    )
 
 
 def _get_obstacle_names(contact_triple: ContactTriple) -> ObstacleNames:
@@ -142,7 +144,7 @@ def find_propulsion_joint(
 
 def choose_triplet(
     choices: Sequence[PropulsionChoice],
-    current_triplet: Triplet | None,
+    current_triplet: ContactTriplet | None,
     *,
     switch_fraction: float,
     banned_triplets: Collection[ObstacleNames] = (),
@@ -200,7 +202,7 @@ class TripletFinder:
         self._condition_max = condition_max
         self._authority_min = authority_min
         self._hold_on_m = hold_on_m
-        self._solved_triplets: dict[ObstacleNames, Triplet] = {}
+        self._solved_triplets: dict[ObstacleNames, ContactTriplet] = {}
 
     def find_propulsion_choices(
         self,
@@ -247,7 +249,7 @@ class TripletFinder:
 
     def _choose_propulsion_joint(
         self,
-        triplet: Triplet,
+        triplet: ContactTriplet,
         contacts_s_m: tuple[float, float, float],
         body_points_w: Floats,
         body_points_s_m: Sequence[float],
@@ -281,9 +283,9 @@ class TripletFinder:
         torque_per_n = compute_torque_per_newton(triplet.force_3_per_n, o_3.point_w, o_3.normal_w, joint_w)
         return PropulsionChoice(triplet, contacts_s_m, joint, torque_per_n)
 
-    def _solve_triplets_cached(self, contact_triples: Sequence[ContactTriple]) -> list[Triplet]:
+    def _solve_triplets_cached(self, contact_triples: Sequence[ContactTriple]) -> list[ContactTriplet]:
         """Return the triplets of these contacts in order. Solve only those that are new, and forget all others."""
-        solved_triplets: dict[ObstacleNames, Triplet] = {}
+        solved_triplets: dict[ObstacleNames, ContactTriplet] = {}
         for contact_triple in contact_triples:
             known_triplet = self._solved_triplets.get(_get_obstacle_names(contact_triple))
             if known_triplet is not None and known_triplet.contacts == contact_triple:

@@ -11,7 +11,7 @@ TIME_TOLERANCE_S = 1e-9  # rounding of sums of ticks
 
 
 @dataclass(frozen=True)
-class Stall:
+class StallReason:
     """Why the body is stationary."""
 
     is_jammed: bool  # obstacles hold the body back, by its measured contact forces
@@ -77,7 +77,7 @@ def explain_stall(
     swung_out_joint: str | None,
     jam_force_n: float,
     drag_ratio: float,
-) -> Stall:
+) -> StallReason:
     """Explain why the body does not move although it pushes, as far as the measurements show the cause.
 
     Args:
@@ -107,7 +107,7 @@ def explain_stall(
         reason += f"; {saturated_joint} at its limit of torque gives no more of the {desired_force_n:.1f} N desired"
     elif net_force is not None and not jammed and may_touch_obstacles:
         reason += "; raise propulsion_n"
-    return Stall(
+    return StallReason(
         is_jammed=jammed,
         should_release_triplet=may_touch_obstacles and (is_joint_strained or are_contacts_strained),
         reason=reason,

@@ -6,14 +6,14 @@ import numpy as np
 
 from snakesim_gnc.control.obstacle_triplet.selection import PropulsionChoice
 from snakesim_gnc.control.obstacle_triplet.statics import compute_joint_torques
-from snakesim_gnc.geometry.body_on_path import BodyPose
+from snakesim_gnc.geometry.body_on_path import PathBodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import World, WorldContact
+from snakesim_hal.wire.messages import WorldContact, WorldModel
 
 
 def compute_bending_torques_nm(
-    body: PlanarBody, body_pose: BodyPose, choice: PropulsionChoice, force_n: float
+    body: PlanarBody, body_pose: PathBodyPose, choice: PropulsionChoice, force_n: float
 ) -> Floats:
     """Compute the torque of every joint for the planned contact forces.
 
@@ -34,7 +34,7 @@ def compute_bending_torques_nm(
 
 
 def make_contact_messages(
-    body: PlanarBody, world: World, choice: PropulsionChoice, forces_n: Sequence[float]
+    body: PlanarBody, world: WorldModel, choice: PropulsionChoice, forces_n: Sequence[float]
 ) -> list[WorldContact]:
     """Return the three contacts of a triplet with their desired forces, as messages.
 

@@ -8,13 +8,13 @@ A scenario names a robot, a scene, a controller, a clock mode and the services. 
 
 from snakesim_hal.model.scenario.loading import (
     CHOSEN_PREFIXES,
+    KeyOverride,
     LoadedScenario,
-    Override,
     compose_config_table,
     load_scenario,
     parse_set_option,
 )
-from snakesim_hal.model.scenario.mission import HeadingGoal, Mission, Start, WaypointGoal
+from snakesim_hal.model.scenario.mission import HeadingGoal, Mission, StartPlacement, WaypointGoal
 from snakesim_hal.model.scenario.run_config import (
     POLICY,
     POLICY_CONTROLLER,
@@ -43,13 +43,13 @@ __all__ = [
     "POLICY_CONTROLLER",
     "SENSOR",
     "HeadingGoal",
+    "KeyOverride",
     "LoadedScenario",
     "MaxAge",
     "Mission",
-    "Override",
     "RunConfig",
     "ServiceSchedule",
-    "Start",
+    "StartPlacement",
     "StartPose",
     "WaypointGoal",
     "compose_config_table",

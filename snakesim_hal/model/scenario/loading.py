@@ -42,7 +42,7 @@ class LoadedScenario:
 
 
 @dataclass(frozen=True)
-class Override:
+class KeyOverride:
     """A value that the command line gives for one key."""
 
     key: str  # dotted
@@ -50,7 +50,7 @@ class Override:
     flag: str  # as written on the command line, for error messages
 
 
-def parse_set_option(text: str) -> Override:
+def parse_set_option(text: str) -> KeyOverride:
     """Parse the text `section.key=value` of a --set option.
 
     The value is read as TOML. If it is not valid TOML, it is taken as plain text.
@@ -72,10 +72,10 @@ def parse_set_option(text: str) -> Override:
         parsed = parse_toml(f"value = {value}", "--set")["value"]
     except ConfigError:
         parsed = value.strip()
-    return Override(key, parsed, f"--set {shorten(text)}")
+    return KeyOverride(key, parsed, f"--set {shorten(text)}")
 
 
-def load_scenario(scenario: str, overrides: Sequence[Override] = ()) -> LoadedScenario:
+def load_scenario(scenario: str, overrides: Sequence[KeyOverride] = ()) -> LoadedScenario:
     """Read a scenario with its robot and scene, apply the flags, and check the result.
 
     Args:
@@ -91,7 +91,7 @@ def load_scenario(scenario: str, overrides: Sequence[Override] = ()) -> LoadedSc
     return LoadedScenario(config, table)
 
 
-def compose_config_table(scenario: str, overrides: Sequence[Override] = ()) -> ConfigTable:
+def compose_config_table(scenario: str, overrides: Sequence[KeyOverride] = ()) -> ConfigTable:
     """Compose the values of a scenario, its robot and its scene, and apply the flags. The values are not checked yet.
 
     Args:
@@ -141,7 +141,7 @@ def _replace_name_by_file(table: ConfigTable, part: str, kind: str, base_dir: Pa
     table.origin_by_key |= {f"{part}.{key}": origin for key, origin in included.origin_by_key.items()}
 
 
-def _apply_override(table: ConfigTable, override: Override) -> None:
+def _apply_override(table: ConfigTable, override: KeyOverride) -> None:
     """Put a value from the command line into the table."""
     key = _expand_chosen_key(table, override.key)
     table.set_value(key, override.value, override.flag)

@@ -8,7 +8,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Heading, Point, Size
 
 
-class Start(FileStruct, frozen=True, kw_only=True):
+class StartPlacement(FileStruct, frozen=True, kw_only=True):
     """Start pose of the snake: along the scene's route, or straight at a pose."""
 
     on_route: bool = True

@@ -12,10 +12,10 @@ from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.files import FileStruct, decode_table, read_table
 from snakesim_hal.model.robot import RobotFile, describe_robot
-from snakesim_hal.model.scenario.mission import Mission, Start
+from snakesim_hal.model.scenario.mission import Mission, StartPlacement
 from snakesim_hal.model.scene import SceneFile
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ClockMode, Description
+from snakesim_hal.wire.messages import ClockMode, RobotDescription
 from snakesim_hal.wire.quantities import above
 
 # Name of the service that publishes cameras, motion capture and other sensors which the backend does not have.
@@ -140,7 +140,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     """Wall time within which all services must be ready to arm."""
 
     # What the parts of the run do.
-    start: Start = Start()
+    start: StartPlacement = StartPlacement()
     """Start pose of the snake."""
 
     mission: Mission = Mission()
@@ -204,7 +204,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
                 return f"{POLICY}{model}"
         return self.controller
 
-    def uses_dead_reckoning(self, robot: Description) -> bool:
+    def uses_dead_reckoning(self, robot: RobotDescription) -> bool:
         """Return whether guidance estimates the pose by dead reckoning.
 
         It does if the mission demands it, and also if neither the robot nor a service measures the pose.
@@ -253,7 +253,7 @@ def read_config(path: Path) -> RunConfig:
     return decode_table(read_table(path), RunConfig)
 
 
-def describe_run_robot(config: RunConfig, backend: str = "", *, emulated: bool = False) -> Description:
+def describe_run_robot(config: RunConfig, backend: str = "", *, emulated: bool = False) -> RobotDescription:
     """Return the description that the HAL publishes of the configured robot.
 
     Args:

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
-from snakesim_hal.model.outlines import Capsule
+from snakesim_hal.model.outlines import CapsuleOutline
 from snakesim_hal.model.placement import PlacedObstacle, place_scene_obstacles, validate_start_clearance
 from snakesim_hal.model.route import compute_yaw_segments_m, expand_yaw_angles, place_chain_on_route
 from snakesim_hal.model.scenario.run_config import RunConfig
 from snakesim_hal.model.scene import make_route
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 
 # Second part of the seed of the map errors, so that they differ from other random numbers of the run's seed.
 MAP_ERROR_SEED = 0x5EED
@@ -79,7 +79,7 @@ def compute_start_pose(config: RunConfig) -> StartPose:
     return StartPose(chain.tail_w, chain.heading_rad, expand_yaw_angles(robot.axes, chain.angles_rad))
 
 
-def make_start_capsules(config: RunConfig) -> list[Capsule]:
+def make_start_capsules(config: RunConfig) -> list[CapsuleOutline]:
     """Return the outlines of the links at tick 0 as seen from above, tail to head."""
     robot = config.robot
     pose = compute_start_pose(config)
@@ -87,13 +87,13 @@ def make_start_capsules(config: RunConfig) -> list[Capsule]:
     base_w = (*pose.position_w, radius_m)
     base_rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
     origins, rotations = compute_link_frames(base_w, base_rotation, pose.angles_rad, robot.axes, robot.link_lengths_m)
-    capsules: list[Capsule] = []
+    capsules: list[CapsuleOutline] = []
     for i, length_m in enumerate(robot.link_lengths_m):
         front_w = origins[i] + length_m * rotations[i][:, 0]
         rear_x, rear_y, _ = origins[i].tolist()
         front_x, front_y, _ = front_w.tolist()
         capsules.append(
-            Capsule(name=f"link_{i}", rear_m=(rear_x, rear_y), front_m=(front_x, front_y), radius_m=radius_m)
+            CapsuleOutline(name=f"link_{i}", rear_m=(rear_x, rear_y), front_m=(front_x, front_y), radius_m=radius_m)
         )
     return capsules
 
@@ -110,7 +110,7 @@ def place_obstacles(config: RunConfig) -> list[PlacedObstacle]:
     return placed
 
 
-def get_noisy_obstacle_map(config: RunConfig, *, walkable: bool = False) -> list[Obstacle]:
+def get_noisy_obstacle_map(config: RunConfig, *, walkable: bool = False) -> list[KnownObstacle]:
     """Return the obstacles of the scene as the known map has them: at their true positions plus a random error.
 
     The standard deviation of the error is `mission.map_error_m`.
@@ -127,7 +127,7 @@ def get_noisy_obstacle_map(config: RunConfig, *, walkable: bool = False) -> list
     # Platforms and other obstacles have random streams of their own: the boolean counts as 0 or 1.
     rng = np.random.default_rng((config.seed, MAP_ERROR_SEED + walkable))
     errors_m = rng.normal(0.0, error_sigma_m, (len(obstacles), 2))
-    displaced: list[Obstacle] = []
+    displaced: list[KnownObstacle] = []
     for obstacle, (error_x, error_y) in zip(obstacles, errors_m.tolist(), strict=True):
         x, y, z = obstacle.position_w
         position_w = (x + error_x, y + error_y, z)

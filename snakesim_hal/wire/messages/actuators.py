@@ -15,7 +15,7 @@ class JointCommand(Message, frozen=True, kw_only=True):
     tick: Annotated[q.Tick, about("of the joint state that the command answers: its age is the command's age")]
     sequence: Annotated[q.Count, about("greater than that of any command accepted under this lease; gaps are allowed")]
     lease_epoch: Annotated[q.Count, about("`Answer.epoch` of the lease")]
-    layout: Annotated[q.Name, about("`Description.layout`")]
+    layout: Annotated[q.Name, about("`RobotDescription.layout`")]
     valid_for_ns: Annotated[
         q.Nanoseconds,
         about("rejected as stale this long after the state was published; at most a lease term"),

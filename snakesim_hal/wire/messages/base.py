@@ -26,7 +26,7 @@ ABOUT_LIFECYCLE = about("motors follow commands only in armed; fault and estop s
 ABOUT_HOST = about("random id of the host process, new at each start; null: unknown")
 
 
-class Mode(IntEnum):
+class JointMode(IntEnum):
     """How a joint uses its target.
 
     0 passive: motor off, the target is ignored
@@ -41,7 +41,7 @@ class Mode(IntEnum):
     TORQUE = 3
 
 
-Modes = Annotated[list[Mode], Meta(max_length=q.MAX_JOINTS), about(ONE_PER_JOINT)]
+Modes = Annotated[list[JointMode], Meta(max_length=q.MAX_JOINTS), about(ONE_PER_JOINT)]
 
 
 class Message(msgspec.Struct, frozen=True):

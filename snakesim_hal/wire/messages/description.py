@@ -6,7 +6,7 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
-from snakesim_hal.wire.messages.base import ABOUT_HOST, Axis, Measurement, Message, Mode, StopMode
+from snakesim_hal.wire.messages.base import ABOUT_HOST, Axis, JointMode, Measurement, Message, StopMode
 from snakesim_hal.wire.quantities import about
 
 MAX_CONFIG = 500_000  # characters
@@ -35,8 +35,10 @@ class JointDescription(Message, frozen=True, kw_only=True):
     stop_at_c: Annotated[q.Temperature, about("of the winding: at it the robot is stopped")] = 105.0
     min_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
     modes: Annotated[
-        list[Mode], Meta(min_length=1, max_length=4), about("in which it may be commanded; passive it always can be")
-    ] = msgspec.field(default_factory=lambda: list(Mode))
+        list[JointMode],
+        Meta(min_length=1, max_length=4),
+        about("in which it may be commanded; passive it always can be"),
+    ] = msgspec.field(default_factory=lambda: list(JointMode))
     measures: Annotated[
         list[Measurement],
         Meta(max_length=8),
@@ -48,9 +50,9 @@ class JointDescription(Message, frozen=True, kw_only=True):
     serial: Annotated[str, Meta(max_length=64), about("serial number that its drive reports; empty: none")] = ""
     firmware: Annotated[str, Meta(max_length=64), about("firmware version that its drive reports; empty: none")] = ""
 
-    def supports_mode(self, mode: Mode) -> bool:
+    def supports_mode(self, mode: JointMode) -> bool:
         """Return whether the joint may be commanded in a mode. It can always be passive."""
-        return mode is Mode.PASSIVE or mode in self.modes
+        return mode is JointMode.PASSIVE or mode in self.modes
 
 
 class LinkDescription(Message, frozen=True, kw_only=True):
@@ -70,7 +72,7 @@ class SensorDescription(Message, frozen=True, kw_only=True):
     delay_s: Annotated[float, Meta(ge=0, le=10)]
 
 
-class Description(Message, frozen=True, kw_only=True):
+class RobotDescription(Message, frozen=True, kw_only=True):
     """`hal/description`, latched: the robot, as described by its backend. Only this defines the order of joints."""
 
     robot: q.Name
@@ -118,7 +120,7 @@ class Description(Message, frozen=True, kw_only=True):
     ] = {}
 
 
-class Configuration(Message, frozen=True, kw_only=True):
+class RunConfiguration(Message, frozen=True, kw_only=True):
     """`hal/config`, latched: the effective configuration of the run, which explains a recording."""
 
     config_hash: Annotated[q.Name, about("as in the description")]

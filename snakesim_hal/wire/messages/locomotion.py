@@ -9,7 +9,7 @@ from snakesim_hal.wire.messages.base import LocomotionState, Message
 from snakesim_hal.wire.quantities import about
 
 
-class Obstacle(Message, frozen=True, kw_only=True):
+class KnownObstacle(Message, frozen=True, kw_only=True):
     """A known obstacle in the world: an upright shape with its outline."""
 
     name: q.Name
@@ -41,7 +41,7 @@ class WorldContact(Message, frozen=True, kw_only=True):
     confidence: Annotated[q.Fraction, about("1: measured (less: estimated)")] = 1.0
 
 
-class World(Message, frozen=True, kw_only=True):
+class WorldModel(Message, frozen=True, kw_only=True):
     """`guidance/world`: pose of the body, contacts, obstacles nearby. Each part has its own stamp."""
 
     tick: Annotated[q.Tick, about("of the clock that guidance acted on")]
@@ -50,7 +50,7 @@ class World(Message, frozen=True, kw_only=True):
     base_orientation_wxyz: Annotated[q.Quaternion, about("of the tail link")]
     base_confidence: Annotated[q.Fraction, about("of the base's pose")]
     contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS), about("of the body with obstacles")]
-    obstacles: Annotated[list[Obstacle], Meta(max_length=4096), about("in the neighborhood of the body")]
+    obstacles: Annotated[list[KnownObstacle], Meta(max_length=4096), about("in the neighborhood of the body")]
     pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it (null: unknown)")] = None
     contacts_timestamp_ns: Annotated[
         q.Stamp | None, about("of the contacts in it (null: no sample yet, and no estimate)")
@@ -79,7 +79,7 @@ class World(Message, frozen=True, kw_only=True):
     ] = None
 
 
-class Rise(Message, frozen=True, kw_only=True):
+class PathRise(Message, frozen=True, kw_only=True):
     """A stretch of a path that lies on a platform."""
 
     from_s_m: Annotated[q.Distance, about("where it begins, arc length from the begin of the path")]
@@ -111,7 +111,7 @@ class Trajectory(Message, frozen=True, kw_only=True):
         tuple[q.Length, q.Length] | None, about("x and y to which the mission leads the head (null: along the path)")
     ] = None
     rises: Annotated[
-        list[Rise],
+        list[PathRise],
         Meta(max_length=64),
         about("where the path leads over platforms of a map (elsewhere ground is level)"),
     ] = []
@@ -183,7 +183,7 @@ class ControlParameters(Message, frozen=True, kw_only=True):
     changes: Annotated[q.Count, about("how often they have been changed since control started")] = 0
 
 
-class Intent(Message, frozen=True, kw_only=True):
+class LocomotionIntent(Message, frozen=True, kw_only=True):
     """`operator/intent`: speed and direction that a person or a mission requests. Send it repeatedly: it expires.
 
     When one that was followed has expired, the robot stops and waits for the next one; it does not return to its

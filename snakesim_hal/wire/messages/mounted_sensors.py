@@ -73,7 +73,7 @@ class ColorImage(CameraImage, frozen=True, kw_only=True):
     ]
 
 
-class Ranges(MountedSample, frozen=True, kw_only=True):
+class RangeScan(MountedSample, frozen=True, kw_only=True):
     """`sensor/range/<name>`: distances along the beams of a 2-D lidar, or along the one of a range finder.
 
     Beams lie in the xy plane of the sensor's frame; beam i is turned by `angle_min_rad` + i x `angle_step_rad` from x,
@@ -107,10 +107,10 @@ def _describe_beyond_range(min_m: float, max_m: float, distances_m: list[float])
 
 
 class CustomSample(MountedSample, frozen=True, kw_only=True):
-    """`sensor/custom/<name>`: of a custom sensor, whose message has further fields: those in `Description.custom`."""
+    """`sensor/custom/<name>`: a sample of a custom sensor, with the further fields in `RobotDescription.custom`."""
 
 
-class Preview(Message, frozen=True, kw_only=True):
+class ImagePreview(Message, frozen=True, kw_only=True):
     """`preview/depth/<camera>` or `preview/color/<camera>`: a small, compressed copy of an image."""
 
     tick: q.Tick

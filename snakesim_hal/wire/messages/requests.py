@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.messages.base import ABOUT_HOST, ABOUT_LIFECYCLE, LifecycleState, Message
-from snakesim_hal.wire.messages.description import Description
+from snakesim_hal.wire.messages.description import RobotDescription
 from snakesim_hal.wire.quantities import about
 
 
@@ -35,17 +35,19 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     ]
     requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
     host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
-    robot: Annotated[q.Name | None, about("`Description.robot`; arm needs it, others may leave it null")] = None
-    backend: Annotated[q.Name | None, about("`Description.backend`; arm needs it, others may leave it null")] = None
+    robot: Annotated[q.Name | None, about("`RobotDescription.robot`; arm needs it, others may leave it null")] = None
+    backend: Annotated[q.Name | None, about("`RobotDescription.backend`; arm needs it, others may leave it null")] = (
+        None
+    )
     config_hash: Annotated[
-        q.Name | None, about("`Description.config_hash`; arm needs it, others may leave it null")
+        q.Name | None, about("`RobotDescription.config_hash`; arm needs it, others may leave it null")
     ] = None
     unchecked: Annotated[
-        bool, about("arm also if `Status.unchecked` gives a reason why the joints do not count as checked")
+        bool, about("arm also if `RobotStatus.unchecked` gives a reason why the joints do not count as checked")
     ] = False
 
 
-def make_arm_request(robot: Description, requester: str, *, unchecked: bool = False) -> LifecycleRequest:
+def make_arm_request(robot: RobotDescription, requester: str, *, unchecked: bool = False) -> LifecycleRequest:
     """Make a request to arm exactly the robot, backend, configuration and host process that are described.
 
     Args:
@@ -71,7 +73,7 @@ class EstopRequest(Message, frozen=True, kw_only=True):
 
 
 class SimulatorRequest(Message, frozen=True, kw_only=True):
-    """Query payload on `hal/simulator`: its time. Only for a robot with `Description.simulated_time`."""
+    """Query payload on `hal/simulator`: its time. Only for a robot with `RobotDescription.simulated_time`."""
 
     action: Annotated[
         Literal["pause", "resume", "step", "speed", "reset"],

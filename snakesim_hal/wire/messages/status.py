@@ -55,7 +55,7 @@ class Fault(Message, frozen=True, kw_only=True):
     ] = "robot"
 
 
-class Timing(Message, frozen=True, kw_only=True):
+class TimingStatistics(Message, frozen=True, kw_only=True):
     """How long something took, many times: percentiles to 5 %, and a histogram on a logarithmic scale."""
 
     count: Annotated[q.Count, about("how many were measured")]
@@ -67,7 +67,7 @@ class Timing(Message, frozen=True, kw_only=True):
     bins: Annotated[list[q.Count], Meta(max_length=64)]
 
 
-TICK_TIMES = {  # of `Status.tick_times`
+TICK_TIMES = {  # of `RobotStatus.tick_times`
     "cycle": "from tick to tick",
     "late": "begin of a tick after its deadline",
     "read": "the backend reads its sensors",
@@ -75,7 +75,7 @@ TICK_TIMES = {  # of `Status.tick_times`
 }
 
 
-class Status(Message, frozen=True, kw_only=True):
+class RobotStatus(Message, frozen=True, kw_only=True):
     """`hal/status`, latched: the state of the robot, and its reason."""
 
     tick: q.Tick
@@ -116,7 +116,7 @@ class Status(Message, frozen=True, kw_only=True):
         about("robot time per wall time over the last second (null: not measured, such as in a pause)"),
     ] = None
     tick_times: Annotated[
-        dict[q.Name, Timing],
+        dict[q.Name, TimingStatistics],
         Meta(max_length=8),
         about(
             "while armed. cycle: from the begin of a tick to the next one's; late: begin of a tick after its deadline, "
@@ -134,13 +134,13 @@ class Status(Message, frozen=True, kw_only=True):
     ] = ""
 
 
-class Done(Message, frozen=True, kw_only=True):
+class TickDone(Message, frozen=True, kw_only=True):
     """`hal/done/<service>`: a lockstep participant has published all its output for a tick."""
 
     tick: q.Tick
 
 
-class Process(Message, frozen=True, kw_only=True):
+class ProcessInfo(Message, frozen=True, kw_only=True):
     """`process/<name>-<id>`, latched: one process of the robot's network; valid while a token at the same key lives."""
 
     name: Annotated[q.Name, about("its role: host, a service of the scenario, recorder, ...")]

@@ -9,7 +9,7 @@ from snakesim_hal.programs.arguments import (
     add_output_argument,
     make_number_parser,
 )
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
@@ -157,7 +157,7 @@ def _run_identify(arguments: argparse.Namespace) -> int:
 
 
 COMMANDS: Commands = (
-    Noun(
+    CommandGroup(
         name="robot calibrate",
         help="Find zeros, directions, limits and gears of joints by hand, and write them down. The motors stay off.",
     ),

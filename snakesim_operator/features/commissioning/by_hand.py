@@ -19,11 +19,11 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, RefusedError
 from snakesim_hal.base.terminal import overwrite_lines, print_line
-from snakesim_hal.model.joints import Drive, Joint
+from snakesim_hal.model.joints import Joint, JointDrive
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Configuration, JointState, Status
+from snakesim_hal.wire.messages import JointState, RobotStatus, RunConfiguration
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.features.commissioning.capture import (
     HandTurn,
@@ -66,7 +66,7 @@ def load_running_joints(session: Session, path: Path) -> Sequence[Joint]:
         ConfigError: The joints of the file differ from those that the host was started with.
         RefusedError: The host did not publish its configuration in time.
     """
-    configuration = session.wait_for_latched(keys.CONFIG, Configuration, HOST_TIMEOUT_S)
+    configuration = session.wait_for_latched(keys.CONFIG, RunConfiguration, HOST_TIMEOUT_S)
     if configuration is None:
         raise RefusedError(HOST_TIMEOUT_MESSAGE, code="network/no-answer")
     running = msgspec.json.decode(configuration.content, type=RunConfig).robot.joint_table
@@ -80,7 +80,7 @@ def load_running_joints(session: Session, path: Path) -> Sequence[Joint]:
     return joints
 
 
-def _get_drive_identity(joint: Joint) -> tuple[str, int, Drive]:
+def _get_drive_identity(joint: Joint) -> tuple[str, int, JointDrive]:
     return joint.name, joint.id, joint.drive
 
 
@@ -95,9 +95,9 @@ class HandMovedRobot:
             RefusedError: The host does not answer.
         """
         self._joint_state_reader = session.declare_reader(keys.JOINTS, JointState)
-        self._status_reader = session.declare_latched_reader(keys.STATUS, Status)
+        self._status_reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
         self.joints = load_running_joints(session, path)
-        status = session.wait_for_latched(keys.STATUS, Status, HOST_TIMEOUT_S)
+        status = session.wait_for_latched(keys.STATUS, RobotStatus, HOST_TIMEOUT_S)
         if status is None:
             raise RefusedError(HOST_TIMEOUT_MESSAGE, code="network/no-answer")
         self._status = status

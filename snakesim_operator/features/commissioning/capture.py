@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_drivers.mounting import Mounting
+from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 
@@ -43,7 +43,7 @@ def compute_zero_offsets_rad(joints: Sequence[Joint], angles_rad: Floats) -> lis
     joint_index = int(np.argmax(peak_to_peak_rad))  # the joint that moved most
     if peak_to_peak_rad[joint_index] > STILLNESS_TOLERANCE_RAD:
         raise RobotMovedError(f"{joints[joint_index].name} moved by {peak_to_peak_rad[joint_index]:.3f} rad")
-    return Mounting(joints).to_drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
+    return DriveMounting(joints).to_drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
 
 
 @dataclass(frozen=True)

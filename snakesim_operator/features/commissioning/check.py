@@ -16,7 +16,7 @@ from snakesim_hal.model.checked import (
     StartCheckRecord,
     compute_mounting_digest,
 )
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import (
     SIGNAL_NAMES,
@@ -207,7 +207,7 @@ def _write_check_record(
     )
 
 
-def _list_serial_numbers(robot: Description) -> list[str]:
+def _list_serial_numbers(robot: RobotDescription) -> list[str]:
     """Return the serial number of every drive; none if no drive has one."""
     serials = [joint.serial for joint in robot.joints]
     return serials if any(serials) else []

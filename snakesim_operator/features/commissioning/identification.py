@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Drive, Joint
+from snakesim_hal.model.joints import Joint, JointDrive
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.features.commissioning.followed_links import find_link_mismatch
-from snakesim_operator.features.commissioning.least_squares import Estimate
+from snakesim_operator.features.commissioning.least_squares import IntervalEstimate
 from snakesim_operator.features.commissioning.servo_response import ServoResponse, estimate_bandwidth_hz, fit_servo
 from snakesim_operator.features.commissioning.smoothing import smooth, smooth_derivative, smooth_second_derivative
 from snakesim_operator.features.commissioning.suspended_load import compute_link_loads_nm
@@ -34,9 +34,9 @@ class JointIdentification:
     """What was identified of one joint."""
 
     joint: str
-    fields: Mapping[str, Estimate]  # fields of the robot file; those that could not be identified are missing
+    fields: Mapping[str, IntervalEstimate]  # fields of the robot file; those that could not be identified are missing
     unknown: Sequence[str]  # why fields are missing
-    latency_s: Estimate | None = None
+    latency_s: IntervalEstimate | None = None
     bandwidth_hz: float | None = None
     balance: TorqueBalance | None = None
     servo: ServoResponse | None = None
@@ -136,7 +136,7 @@ def _try_identify_joint(
         return JointIdentification(joint.name, {}, [f"everything: {error}"], complete=False)
 
 
-def _has_model_misfit(result: JointIdentification, drive: Drive) -> bool:
+def _has_model_misfit(result: JointIdentification, drive: JointDrive) -> bool:
     return "torque" in drive.measures and result.fails
 
 
@@ -211,7 +211,7 @@ def _identify_joint(
 
 def _collect_robot_file_fields(
     balance: TorqueBalance, servo: ServoResponse, torque_constant_nm_per_a: float | None
-) -> dict[str, Estimate]:
+) -> dict[str, IntervalEstimate]:
     """Return the fields of the robot file, in real torque: the measured torque times the fitted scale."""
     scale = balance.torque_scale
     fields = {

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_operator.features.commissioning.identification import JointIdentification
-from snakesim_operator.features.commissioning.least_squares import Estimate
+from snakesim_operator.features.commissioning.least_squares import IntervalEstimate
 from snakesim_operator.features.commissioning.smoothing import HALF_WINDOW_TICKS
-from snakesim_operator.results.page.charts import Line, PlotlyDict, make_line_chart
+from snakesim_operator.results.page.charts import ChartLine, PlotlyDict, make_line_chart
 from snakesim_operator.results.page.html import format_number, render_page
 from snakesim_operator.results.run_log import RunRecord
 
@@ -53,15 +53,15 @@ def _draw_torques(result: JointIdentification, period_s: float) -> list[PlotlyDi
     figures: list[PlotlyDict] = []
     for model, model_nm in torque_by_model.items():
         curves = [
-            Line("measured", time_s, measured_nm[:tick_count], MEASURED_COLOR, width=3.0),
-            Line(f"by {model}", time_s, model_nm, MODEL_COLOR),
+            ChartLine("measured", time_s, measured_nm[:tick_count], MEASURED_COLOR, width=3.0),
+            ChartLine(f"by {model}", time_s, model_nm, MODEL_COLOR),
         ]
         title = f"Torque of {result.joint}, measured and by {model}"
         figures.append(make_line_chart(title, "torque, N·m", curves, float(time_s[-1])))
     return figures
 
 
-def _format_interval(estimate: Estimate | None) -> str:
+def _format_interval(estimate: IntervalEstimate | None) -> str:
     if estimate is None:
         return "–"
     return f"{format_number(estimate.value, 4)} ± {format_number(estimate.half_width, 2)}"

@@ -10,14 +10,14 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.files import resolve_file_path
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.features.commissioning.identification import (
     MIN_EXPLAINED,
     JointIdentification,
     identify_joints,
 )
 from snakesim_operator.features.commissioning.identified_page import render_identification_page
-from snakesim_operator.features.commissioning.least_squares import Estimate
+from snakesim_operator.features.commissioning.least_squares import IntervalEstimate
 from snakesim_operator.features.commissioning.measured import arrange_imus_by_tick, compute_tick_numbers, read_imus
 from snakesim_operator.results.run_log import RunRecord
 
@@ -93,7 +93,7 @@ def _find_usable_ticks(record: RunRecord) -> slice:
         )
     columns = [getattr(record, name) for name in SIGNAL_NAMES]
     is_usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
-    is_usable &= (record.mode == Mode.POSITION).all(axis=1)
+    is_usable &= (record.mode == JointMode.POSITION).all(axis=1)
     ticks_since_last_row = np.diff(record.time_s) * record.config.rate_hz
     is_usable[1:] &= np.abs(ticks_since_last_row - 1) < 0.5
     padded_is_usable = np.concatenate(([False], is_usable, [False])).astype(int)
@@ -134,7 +134,7 @@ def _print_joint(result: JointIdentification) -> None:
         print_line("  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash")
 
 
-def _format_interval(estimate: Estimate) -> str:
+def _format_interval(estimate: IntervalEstimate) -> str:
     low = estimate.value - estimate.half_width
     high = estimate.value + estimate.half_width
     return f"{estimate.value:.4g}, {low:.4g} to {high:.4g}"

@@ -18,23 +18,23 @@ from snakesim_hal.base.errors import ConfigError, RefusedError
 from snakesim_hal.base.process import SERVICE_PRIORITY, call_on_stop_signals, get_user_name, set_realtime_priority
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.commanding import CommandingClient
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Clock,
-    Description,
     JointDescription,
+    JointMode,
     JointState,
     LifecycleRequest,
-    Mode,
-    Status,
+    RobotDescription,
+    RobotStatus,
     make_arm_request,
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.features.commissioning.by_hand import load_running_joints, select_joints
 from snakesim_operator.robot_commands.command import request_while_commanding
-from snakesim_operator.robot_commands.teleop.keyboard import Keyboard
+from snakesim_operator.robot_commands.teleop.keyboard import KeyReader
 
 KEY_HOLD_S = 0.15  # a key repeats 20 to 30 times a second
 MAX_LEAD_RAD = 0.1  # of the target before the measured angle; a blocked joint must not jump once it is free
@@ -118,14 +118,14 @@ def jog_joint(path: Path, selection: RobotSelection, request: JogRequest) -> int
     Raises:
         SnakesimError: The robot is not disarmed, does not answer or runs with another file, or stdin is no terminal.
     """
-    keyboard = Keyboard("robot jog reads keys, and stdin is no terminal; start it in one")
+    keyboard = KeyReader("robot jog reads keys, and stdin is no terminal; start it in one")
     connection = find_single_robot(selection, "robot jog")
     set_realtime_priority(SERVICE_PRIORITY)  # where it is allowed: a late command ends the lease
     with open_session(connection, CONNECT_TIMEOUT_S) as session:
         joints = load_running_joints(session, path)
         (joint,) = select_joints(joints, [request.joint], path)
-        robot = session.wait_for_latched(keys.DESCRIPTION, Description, CONNECT_TIMEOUT_S)
-        status = session.wait_for_latched(keys.STATUS, Status, CONNECT_TIMEOUT_S)
+        robot = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, CONNECT_TIMEOUT_S)
+        status = session.wait_for_latched(keys.STATUS, RobotStatus, CONNECT_TIMEOUT_S)
         if robot is None or status is None:
             raise RefusedError(
                 "the robot's host did not publish its description; see `snakesim status`", code="network/no-answer"
@@ -146,9 +146,9 @@ class _JogSession:
     def __init__(
         self,
         session: Session,
-        connection: Link,
-        robot: Description,
-        status: Status,
+        connection: ConnectionSettings,
+        robot: RobotDescription,
+        status: RobotStatus,
         request: JogRequest,
         joint_index: int,
     ) -> None:
@@ -166,7 +166,7 @@ class _JogSession:
         self._session = session
         self._connection = connection
         self._robot = robot
-        self._status_reader = session.declare_latched_reader(keys.STATUS, Status)
+        self._status_reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
         self._command_client = CommandingClient(session, robot, status.clock_mode)
         # Request.
         self._request = request
@@ -176,7 +176,7 @@ class _JogSession:
         self._jog_target: JogTarget | None = None  # None: the robot is not armed yet
         self._stop_requested = False
 
-    def run(self, keyboard: Keyboard) -> None:
+    def run(self, keyboard: KeyReader) -> None:
         """Arm the robot, move the joint by the keys until the user quits, and disarm the robot whatever happened."""
         call_on_stop_signals(self._request_stop)
         signal.signal(signal.SIGHUP, lambda *_: self._request_stop())
@@ -193,7 +193,7 @@ class _JogSession:
                 disarm = LifecycleRequest(action="disarm", requester=requester, host=self._robot.host)
                 self._send_request(disarm, "disarmed")
 
-    def _follow_keys(self, keyboard: Keyboard) -> None:
+    def _follow_keys(self, keyboard: KeyReader) -> None:
         """Move the joint by the keys until the user quits, and print the angle at which it stops.
 
         Args:
@@ -231,9 +231,9 @@ class _JogSession:
         clock = self._command_client.wait_for_tick()
         if self._command_client.holds_lease:
             joints = self._robot.joints
-            modes = [Mode.PASSIVE] * len(joints)
+            modes = [JointMode.PASSIVE] * len(joints)
             targets = [0.0] * len(joints)
-            modes[self._joint_index] = Mode.POSITION
+            modes[self._joint_index] = JointMode.POSITION
             targets[self._joint_index] = self._advance_target_rad()
             limits_nm = [self._request.torque_fraction * joint.torque_limit_nm for joint in joints]
             self._command_client.send_setpoints(RequestedSetpoints(modes, targets, limits_nm))

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from snakesim_hal.model.checked import PROPERTIES, JointProperty
-from snakesim_hal.model.joints import Drive
+from snakesim_hal.model.joints import JointDrive
 from snakesim_operator.features.commissioning.link_shares import (
     MIN_RATE_RAD_S,
     LinkMotionFractions,
@@ -269,7 +269,7 @@ def _judge_order(motion_ratio: float, candidates: Sequence[str]) -> PropertyFind
     return CONFIRMED
 
 
-def _judge_sign(motion_ratio: float, drive: Drive) -> PropertyFinding:
+def _judge_sign(motion_ratio: float, drive: JointDrive) -> PropertyFinding:
     """Judge whether a joint's links turn in the direction in which its encoder counts."""
     if np.isnan(motion_ratio):
         return PropertyFinding("unknown", CONFIRM_DIRECTION_BY_HAND)
@@ -281,7 +281,7 @@ def _judge_sign(motion_ratio: float, drive: Drive) -> PropertyFinding:
 
 
 def _judge_gear(
-    motion_ratio: float, lost_motion: LostMotion | None, drive: Drive, allowed_backlash_rad: float
+    motion_ratio: float, lost_motion: LostMotion | None, drive: JointDrive, allowed_backlash_rad: float
 ) -> PropertyFinding:
     """Judge whether a joint's links turn as far as its encoder measures.
 

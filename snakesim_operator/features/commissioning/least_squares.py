@@ -28,7 +28,7 @@ MIN_BLOCKS_PER_VALUE = 2
 
 
 @dataclass(frozen=True)
-class Estimate:
+class IntervalEstimate:
     """An estimated value with its 95 % interval."""
 
     value: float
@@ -38,18 +38,18 @@ class Estimate:
         """Return whether the interval contains a value."""
         return abs(truth - self.value) <= self.half_width
 
-    def scale_by(self, factor: float) -> "Estimate":
+    def scale_by(self, factor: float) -> "IntervalEstimate":
         """Return this estimate multiplied by a known factor."""
-        return Estimate(self.value * factor, self.half_width * abs(factor))
+        return IntervalEstimate(self.value * factor, self.half_width * abs(factor))
 
-    def multiply_by(self, other: "Estimate") -> "Estimate":
+    def multiply_by(self, other: "IntervalEstimate") -> "IntervalEstimate":
         """Return the product with an independent estimate; its interval is right to first order."""
         half_width = ((self.half_width * other.value) ** 2 + (self.value * other.half_width) ** 2) ** 0.5
-        return Estimate(self.value * other.value, half_width)
+        return IntervalEstimate(self.value * other.value, half_width)
 
-    def widen_by(self, uncertainty: float) -> "Estimate":
+    def widen_by(self, uncertainty: float) -> "IntervalEstimate":
         """Return this estimate with an independent uncertainty added to its interval."""
-        return Estimate(self.value, float(np.hypot(self.half_width, uncertainty)))
+        return IntervalEstimate(self.value, float(np.hypot(self.half_width, uncertainty)))
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,10 @@ class LeastSquaresFit:
         return by_scatter + self.bias
 
     @property
-    def estimates(self) -> Sequence[Estimate]:
+    def estimates(self) -> Sequence[IntervalEstimate]:
         """Each value with its interval."""
         pairs = zip(self.values, self.half_widths, strict=True)
-        return [Estimate(float(value), float(half_width)) for value, half_width in pairs]
+        return [IntervalEstimate(float(value), float(half_width)) for value, half_width in pairs]
 
     def with_bias(self, bias: Floats) -> "LeastSquaresFit":
         """Return the same fit with intervals that are wider by a bias, (k,), to either side."""

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Drive
+from snakesim_hal.model.joints import JointDrive
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import Description, Imu
+from snakesim_hal.wire.codec import MessageDecoder
+from snakesim_hal.wire.messages import Imu, RobotDescription
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
 
@@ -31,7 +31,7 @@ class CheckMeasurements:
     period_s: float
     joint_names: Sequence[str]
     axes: Sequence[str]  # "yaw" or "pitch"
-    drives: Sequence[Drive]  # from the robot file
+    drives: Sequence[JointDrive]  # from the robot file
     angle_rad: Floats  # (n, joints)
     velocity_rad_s: Floats  # (n, joints)
     torque_nm: Floats  # (n, joints)
@@ -70,7 +70,7 @@ def read_imus(record: RunRecord) -> Iterable[Imu]:
     """Yield every IMU message of a run. Raises ConfigError."""
     if record.recording_path is None:
         return
-    decoder = Decoder(Imu)
+    decoder = MessageDecoder(Imu)
     for message in RecordingReader(record.recording_path).read_messages([keys.IMU]):
         yield decoder.decode(message.payload, message.encoding)
 
@@ -94,7 +94,7 @@ def arrange_imus_by_tick(imus: Iterable[Imu], ticks: Sequence[int], link_count: 
 
 
 def collect_measurements(
-    config: RunConfig, robot: Description, ticks: Sequence[int], columns: Mapping[str, Floats], imus: Iterable[Imu]
+    config: RunConfig, robot: RobotDescription, ticks: Sequence[int], columns: Mapping[str, Floats], imus: Iterable[Imu]
 ) -> CheckMeasurements:
     """Collect what joints, IMUs and motion capture measured in a run of the joint check, one row for each tick.
 

@@ -14,7 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.commissioning.least_squares import Estimate, LeastSquaresFit, solve_with_instruments
+from snakesim_operator.features.commissioning.least_squares import (
+    IntervalEstimate,
+    LeastSquaresFit,
+    solve_with_instruments,
+)
 from snakesim_operator.features.commissioning.smoothing import filter_columns
 from snakesim_operator.features.commissioning.torque_balance import JointRecord, number_jackknife_blocks
 
@@ -30,10 +34,10 @@ Gains = NDArray[np.floating[Any]]  # stiffness, damping, offset
 class ServoResponse:
     """The fitted response of a position servo, in torque as it is measured."""
 
-    stiffness_nm_per_rad: Estimate
-    damping_nm_s_per_rad: Estimate
-    response_time_s: Estimate
-    latency_s: Estimate
+    stiffness_nm_per_rad: IntervalEstimate
+    damping_nm_s_per_rad: IntervalEstimate
+    response_time_s: IntervalEstimate
+    latency_s: IntervalEstimate
     explained: float  # fraction of the variance of the torque
     torque_nm: Floats  # (ticks,), by this servo
     between_nm: Floats  # (ticks,), mean torque around each sample minus the sample: a target's step bends it in a tick

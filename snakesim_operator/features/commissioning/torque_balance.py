@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.commissioning.least_squares import (
-    Estimate,
+    IntervalEstimate,
     compute_independent_rms,
     solve_with_instruments,
 )
@@ -62,10 +62,10 @@ class JointRecord:
 class TorqueBalance:
     """The fitted torque balance."""
 
-    dry_nm: Estimate
-    viscous_nm_s_per_rad: Estimate
-    armature_kg_m2: Estimate
-    torque_scale: Estimate  # real torque divided by measured torque
+    dry_nm: IntervalEstimate
+    viscous_nm_s_per_rad: IntervalEstimate
+    armature_kg_m2: IntervalEstimate
+    torque_scale: IntervalEstimate  # real torque divided by measured torque
     explained: float  # fraction of the variance of the torque
     misfit: float  # rms fraction of the torque that neither the model nor its usual shortcomings explain; 0: none
     torque_nm: Floats  # (ticks - 2 HALF_WINDOW_TICKS, 2): smoothed, and by the balance; NaN where it was not judged
@@ -104,10 +104,10 @@ def fit_torque_balance(
     fit = fit.with_bias(
         ABSORBED_MISFIT * misfit * float(np.std(torque_nm[is_used])) / compute_independent_rms(regressors[is_used])
     )
-    scale = Estimate(1.0, 0.0)
+    scale = IntervalEstimate(1.0, 0.0)
     if fit_scale:
         load_coefficient = fit.values[-1]  # measured torque divided by real torque
-        scale = Estimate(float(1 / load_coefficient), float(fit.half_widths[-1] / load_coefficient**2))
+        scale = IntervalEstimate(float(1 / load_coefficient), float(fit.half_widths[-1] / load_coefficient**2))
         fit = fit.divide_by_value(len(fit.values) - 1)
     dry_nm, viscous_nm_s_per_rad, armature_kg_m2, *_ = fit.estimates
     measured_and_fitted = np.column_stack((torque_nm, np.full(len(torque_nm), np.nan)))

@@ -16,7 +16,7 @@ from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import read_config
 from snakesim_hal.network.local_registry import list_local_robots
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, add_scenario_arguments
 from snakesim_hal.programs.service_program import read_process_options
 from snakesim_operator.base import extras
@@ -103,11 +103,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     _prepare_process()
     from snakesim_operator.features.console.display_loop import run_live_display
     from snakesim_operator.features.console.robot_data.snapshot import make_expected_snapshot
-    from snakesim_operator.features.console.scene.drawing import Surroundings
+    from snakesim_operator.features.console.scene.drawing import TrueSurroundings
 
     listening_socket = socket.socket(fileno=options.arguments.listening)
     expected = make_expected_snapshot(options.config)
-    run_live_display(options.link, Surroundings(options.config), listening_socket, _make_stop_event(), expected)
+    run_live_display(options.link, TrueSurroundings(options.config), listening_socket, _make_stop_event(), expected)
     return 0
 
 
@@ -121,7 +121,9 @@ def _prepare_process() -> None:
 
 
 @contextlib.contextmanager
-def _run_front_server(port: int | None, link: Link | None, stop_event: threading.Event) -> Iterator[ConsolePorts]:
+def _run_front_server(
+    port: int | None, link: ConnectionSettings | None, stop_event: threading.Event
+) -> Iterator[ConsolePorts]:
     """Run the front server as a child process for the duration of a `with` block, and print the page's address.
 
     Args:
@@ -148,21 +150,21 @@ def _run_front_server(port: int | None, link: Link | None, stop_event: threading
         raise NotConnectedError(f"no browser can connect any more: {end_reason}")
 
 
-def _set_after_exit(child: children.Child, event: threading.Event) -> None:
+def _set_after_exit(child: children.ChildProcess, event: threading.Event) -> None:
     """Set an event once a child has ended."""
     child.process.wait()
     event.set()
 
 
-def _find_surroundings(link: Link):
+def _find_surroundings(link: ConnectionSettings):
     """Return the true surroundings of a robot that runs on this computer, from its configuration; None for others."""
-    from snakesim_operator.features.console.scene.drawing import Surroundings
+    from snakesim_operator.features.console.scene.drawing import TrueSurroundings
 
     for robot in list_local_robots():
         is_same_robot = (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace)
         if is_same_robot and robot.config is not None:
             try:
-                return Surroundings(read_config(Path(robot.config)))
+                return TrueSurroundings(read_config(Path(robot.config)))
             except (ConfigError, OSError):
                 return None
     return None

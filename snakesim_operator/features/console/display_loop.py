@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.features.console.operations import PageLog, RobotOperations
-from snakesim_operator.features.console.page.page import Page
-from snakesim_operator.features.console.page.player import Player
+from snakesim_operator.features.console.page.page import ConsolePage
+from snakesim_operator.features.console.page.player import RecordingPlayer
 from snakesim_operator.features.console.page.signals_page import SignalsPage
 from snakesim_operator.features.console.page_log import StateChangeLog
 from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
 from snakesim_operator.features.console.robot_data.signals import LiveSignals
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.scene.drawing import Surroundings
+from snakesim_operator.features.console.scene.drawing import TrueSurroundings
 from snakesim_operator.features.console.web.added_html import SECOND_STOP
 from snakesim_operator.features.console.web.serve import serve_pages
 
@@ -32,8 +32,8 @@ FRAME_RATE_HZ = 30.0
 
 
 def run_live_display(
-    connection: Link,
-    surroundings: Surroundings | None,
+    connection: ConnectionSettings,
+    surroundings: TrueSurroundings | None,
     listening_socket: socket.socket,
     stop_event: threading.Event,
     expected: RobotSnapshot | None = None,
@@ -64,7 +64,7 @@ def run_live_display(
     signals_page.now_s = signals.now_s
 
     with serve_pages(listening_socket, report, signals_page.answer_request, has_stop=True) as server:
-        page = Page(server, surroundings, operations, log, robot_file=robot_file)
+        page = ConsolePage(server, surroundings, operations, log, robot_file=robot_file)
         page.show_snapshot(expected)
         link_with_images = replace(connection, max_bytes=MAX_IMAGE_BYTES)
         deadline_s = time.monotonic() + SERVICE_START_LIMIT_S
@@ -113,8 +113,8 @@ def run_recording_display(
     run_exit_code = report_missing_data(folder, run.record.missing)
     signals_page = SignalsPage(PlaybackSignals(run))
     with serve_pages(listening_socket, print_line, signals_page.answer_request, has_stop=False) as server:
-        page = Page(server, Surroundings(run.record.config), None, log, recorded=folder.name)
-        player = Player(server, run.span_s, start_s)
+        page = ConsolePage(server, TrueSurroundings(run.record.config), None, log, recorded=folder.name)
+        player = RecordingPlayer(server, run.span_s, start_s)
         signals_page.now_s = lambda: player.elapsed_s
         signals_page.jump_to = player.jump_to
         shown_s = None

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from datetime import datetime
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimError
-from snakesim_hal.network.session import Link, Session
+from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Intent, Message, ParametersRequest
+from snakesim_hal.wire.messages import LocomotionIntent, Message, ParametersRequest, RobotDescription
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.robot_commands.command import (
     ANSWER_TIMEOUT_S,
@@ -63,14 +63,14 @@ class RobotOperations:
     SnakesimError when the robot refuses, or does not answer.
     """
 
-    def __init__(self, link: Link, log: PageLog) -> None:
+    def __init__(self, link: ConnectionSettings, log: PageLog) -> None:
         self.link = link
         self._selection = RobotSelection(link.endpoint, link.namespace, link.session)
         self._log = log
         self.stop = PreparedStop(self._selection, link, self._log_stop)
         # Known once the console is connected.
         self._session: Session | None = None
-        self._intent_publisher: Publisher[Intent] | None = None
+        self._intent_publisher: Publisher[LocomotionIntent] | None = None
 
     def _log_stop(self, requester: str, outcome: str) -> None:
         self._log.write(f"{requester}: EMERGENCY STOP: {outcome}")
@@ -78,10 +78,10 @@ class RobotOperations:
     def connect(self, session: Session) -> None:
         """Use this session for intents, parameters and the stop."""
         self._session = session
-        self._intent_publisher = session.declare_publisher(keys.INTENT, Intent)
+        self._intent_publisher = session.declare_publisher(keys.INTENT, LocomotionIntent)
         self.stop.use_session(session)
 
-    def arm(self, requester: str, robot: Description, *, unchecked: bool = False) -> str:
+    def arm(self, requester: str, robot: RobotDescription, *, unchecked: bool = False) -> str:
         """Arm the robot that the page shows; with `unchecked` also if its joints were not checked."""
         title = f"{requester}: arm"
         if unchecked:
@@ -128,7 +128,7 @@ class RobotOperations:
         """
         if self._intent_publisher is None:
             return
-        intent = Intent(
+        intent = LocomotionIntent(
             timestamp_ns=acted_ns,
             requester=requester,
             speed_m_s=speed_m_s,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from snakesim_hal.wire.messages import ControlParameters, ControlState, Status
+from snakesim_hal.wire.messages import ControlParameters, ControlState, RobotStatus
 
 
 class StateChangeLog:
@@ -11,14 +11,14 @@ class StateChangeLog:
     def __init__(self, write: Callable[[str], None]) -> None:
         """Start without messages. `write` is called with each line."""
         self._write = write
-        self._status: Status | None = None
+        self._status: RobotStatus | None = None
         self._control: ControlState | None = None
         self._parameters: ControlParameters | None = None
 
-    def log_change(self, message: Status | ControlState | ControlParameters | None) -> None:
+    def log_change(self, message: RobotStatus | ControlState | ControlParameters | None) -> None:
         """Compare a message with the one before it of its type. The same message may be given again."""
         match message:
-            case Status() if message is not self._status:
+            case RobotStatus() if message is not self._status:
                 self._note_status(message)
             case ControlState() if message is not self._control:
                 self._note_control(message)
@@ -27,7 +27,7 @@ class StateChangeLog:
             case _:
                 pass
 
-    def _note_status(self, status: Status) -> None:
+    def _note_status(self, status: RobotStatus) -> None:
         previous = self._status
         self._status = status
         if previous is None or (status.lifecycle, status.reason) != (previous.lifecycle, previous.reason):

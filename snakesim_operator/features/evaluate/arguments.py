@@ -179,11 +179,11 @@ def _evaluate_sweep(arguments: argparse.Namespace, step_times: "SharedStepTimes 
         step_times: Shared memory that shows another process that a run makes progress; None if no process watches.
     """
     from snakesim_operator.features.evaluate.evaluation import EvaluationRequest, run_evaluation
-    from snakesim_operator.features.evaluate.suite import Suite, parse_vary
+    from snakesim_operator.features.evaluate.suite import EvaluationSuite, parse_vary
 
     title = f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"
     vary = dict(map(parse_vary, arguments.vary))
-    suite = Suite(
+    suite = EvaluationSuite(
         title=title[:MAX_TITLE_CHARACTERS],
         scenario=arguments.scenario,
         set=_parse_set_options(arguments.set),

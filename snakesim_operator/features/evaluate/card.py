@@ -17,7 +17,7 @@ import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig, compute_config_hash
-from snakesim_operator.features.evaluate.case import Case, compute_code_digest
+from snakesim_operator.features.evaluate.case import EvaluationCase, compute_code_digest
 from snakesim_operator.features.evaluate.store import Results
 from snakesim_operator.features.evaluate.table import ResultRow, compute_wilson_interval, group_results_by_row
 
@@ -25,7 +25,7 @@ CARD_FILENAME = "card.json"
 
 
 @dataclass(frozen=True)
-class Metric:
+class CardMetric:
     """A number of the summary whose median is on the card."""
 
     label: str
@@ -34,29 +34,29 @@ class Metric:
 
 
 METRICS = {
-    "advance_m_s": Metric("speed, m/s", 3, only_crossed=True),
-    "body_lengths_s": Metric("speed, body lengths/s", 3, only_crossed=True),
-    "energy_j_per_m": Metric("energy, J/m", 1, only_crossed=True),
-    "cost_of_transport": Metric("cost of transport", 3, only_crossed=True),
-    "propulsive_efficiency": Metric("propulsive efficiency", 3, only_crossed=True),
-    "displacement_m_s": Metric("net displacement: speed, m/s", 3),
-    "displacement_energy_j_per_m": Metric("net displacement: energy, J/m", 1),
-    "displacement_cost_of_transport": Metric("net displacement: cost of transport", 3),
-    "displacement_efficiency": Metric("net displacement: efficiency", 3),
-    "displacement_slip": Metric("slip along the path", 3),
-    "lateral_slip": Metric("lateral slip", 3),
-    "jam_ratio": Metric("jam ratio", 3),
-    "impulse_n_s_per_m": Metric("contact impulse, N·s/m", 1, only_crossed=True),
-    "torque_headroom": Metric("torque headroom", 2),
-    "form_closure": Metric("form closure, share of time", 3),
-    "planning_fraction": Metric("planning, share of turns", 2),
-    "desired_force_correlation": Metric("solved forces: correlation with measured", 2),
-    "desired_force_error": Metric("solved forces: median error", 2),
-    "empty_push_points": Metric("solved forces: push-points that carried nothing", 2),
+    "advance_m_s": CardMetric("speed, m/s", 3, only_crossed=True),
+    "body_lengths_s": CardMetric("speed, body lengths/s", 3, only_crossed=True),
+    "energy_j_per_m": CardMetric("energy, J/m", 1, only_crossed=True),
+    "cost_of_transport": CardMetric("cost of transport", 3, only_crossed=True),
+    "propulsive_efficiency": CardMetric("propulsive efficiency", 3, only_crossed=True),
+    "displacement_m_s": CardMetric("net displacement: speed, m/s", 3),
+    "displacement_energy_j_per_m": CardMetric("net displacement: energy, J/m", 1),
+    "displacement_cost_of_transport": CardMetric("net displacement: cost of transport", 3),
+    "displacement_efficiency": CardMetric("net displacement: efficiency", 3),
+    "displacement_slip": CardMetric("slip along the path", 3),
+    "lateral_slip": CardMetric("lateral slip", 3),
+    "jam_ratio": CardMetric("jam ratio", 3),
+    "impulse_n_s_per_m": CardMetric("contact impulse, N·s/m", 1, only_crossed=True),
+    "torque_headroom": CardMetric("torque headroom", 2),
+    "form_closure": CardMetric("form closure, share of time", 3),
+    "planning_fraction": CardMetric("planning, share of turns", 2),
+    "desired_force_correlation": CardMetric("solved forces: correlation with measured", 2),
+    "desired_force_error": CardMetric("solved forces: median error", 2),
+    "empty_push_points": CardMetric("solved forces: push-points that carried nothing", 2),
 }
 
 
-class Crossing(msgspec.Struct, frozen=True):
+class GoalResult(msgspec.Struct, frozen=True):
     """One run: whether it reached its goal."""
 
     controller: str
@@ -66,7 +66,7 @@ class Crossing(msgspec.Struct, frozen=True):
     crossed: bool
 
 
-class Score(msgspec.Struct, frozen=True):
+class ControllerScore(msgspec.Struct, frozen=True):
     """One row with one controller."""
 
     controller: str
@@ -77,7 +77,7 @@ class Score(msgspec.Struct, frozen=True):
     medians: dict[str, float | None]  # by the metric; null: no run knows it
 
 
-class Card(msgspec.Struct, frozen=True):
+class EvaluationCard(msgspec.Struct, frozen=True):
     """The file `card.json`."""
 
     suite: str
@@ -85,11 +85,11 @@ class Card(msgspec.Struct, frozen=True):
     code: str  # digest of SnakeSIM's code; a controller's file outside of it does not count
     machine: str
     fields: list[int]
-    scores: list[Score]
-    crossings: list[Crossing]
+    scores: list[ControllerScore]
+    crossings: list[GoalResult]
 
 
-class Comparison(msgspec.Struct, frozen=True):
+class ControllerComparison(msgspec.Struct, frozen=True):
     """Two controllers on the fields of one row that both were tried on."""
 
     row: str
@@ -101,7 +101,7 @@ class Comparison(msgspec.Struct, frozen=True):
     p: float  # corrected for the number of comparisons
 
 
-def make_card(suite: str, cases: Sequence[Case], outcome_by_id: Results) -> Card:
+def make_card(suite: str, cases: Sequence[EvaluationCase], outcome_by_id: Results) -> EvaluationCard:
     """Make the score card of all cases that have an outcome.
 
     Args:
@@ -109,15 +109,15 @@ def make_card(suite: str, cases: Sequence[Case], outcome_by_id: Results) -> Card
         cases: All cases, in the order of the table.
         outcome_by_id: The outcome of each finished case by its id.
     """
-    crossings: list[Crossing] = []
+    crossings: list[GoalResult] = []
     for case in cases:
         if case.id in outcome_by_id:
             crossed = outcome_by_id[case.id].numbers.get("crossed") is True
             crossings.append(
-                Crossing(case.controller, case.setting, case.field, _hash_without_controller(case), crossed)
+                GoalResult(case.controller, case.setting, case.field, _hash_without_controller(case), crossed)
             )
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
-    return Card(
+    return EvaluationCard(
         suite=suite,
         version=version("snakesim"),
         code=compute_code_digest(),
@@ -128,18 +128,18 @@ def make_card(suite: str, cases: Sequence[Case], outcome_by_id: Results) -> Card
     )
 
 
-def read_card(path: Path) -> Card:
+def read_card(path: Path) -> EvaluationCard:
     """Return the card in a file, or in the folder that holds it. Raises ConfigError."""
     file = path / CARD_FILENAME if path.is_dir() else path
     try:
-        return msgspec.json.decode(file.read_bytes(), type=Card)
+        return msgspec.json.decode(file.read_bytes(), type=EvaluationCard)
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
             f"--against {path}: no score card ({error}); give the folder of an evaluation", code="file/not-readable"
         ) from None
 
 
-def compare_cards(card: Card, others: Sequence[Card]) -> list[Comparison]:
+def compare_cards(card: EvaluationCard, others: Sequence[EvaluationCard]) -> list[ControllerComparison]:
     """Compare controllers row by row, with p values corrected for the number of comparisons.
 
     The first controller of the card is compared with each of its other controllers. Then each of its controllers is
@@ -150,7 +150,7 @@ def compare_cards(card: Card, others: Sequence[Card]) -> list[Comparison]:
         others: Score cards of other evaluations.
     """
     names = _list_controllers(card)
-    comparisons: list[Comparison] = []
+    comparisons: list[ControllerComparison] = []
     for name in names[1:]:
         comparisons += _compare_controllers(card, names[0], card, name, label=name)
     for other in others:
@@ -191,7 +191,7 @@ def correct_p_values_by_holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-def format_card(card: Card, comparisons: Sequence[Comparison]) -> list[str]:
+def format_card(card: EvaluationCard, comparisons: Sequence[ControllerComparison]) -> list[str]:
     """Return the card for a terminal: the numbers that the table does not have, and the comparisons."""
     lines = [f"score card: {card.suite}, snakesim {card.version}, code {card.code}, {card.machine}"]
     lines.append(f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that crossed")
@@ -210,7 +210,7 @@ def format_card(card: Card, comparisons: Sequence[Comparison]) -> list[str]:
     return lines
 
 
-def _format_score(score: Score) -> list[str]:
+def _format_score(score: ControllerScore) -> list[str]:
     crossed = "no goal"
     if score.crossed is not None:
         low, high = score.interval
@@ -225,11 +225,11 @@ def _format_score(score: Score) -> list[str]:
     return lines
 
 
-def _make_score(row: ResultRow) -> Score:
+def _make_score(row: ResultRow) -> ControllerScore:
     medians = {
         key: _compute_median(row.list_values(key, of_crossed=metric.only_crossed)) for key, metric in METRICS.items()
     }
-    return Score(
+    return ControllerScore(
         controller=row.controller,
         row=row.setting,
         runs=row.runs,
@@ -245,20 +245,20 @@ def _compute_median(values: Sequence[float]) -> float | None:
     return float(np.median(values))
 
 
-def _hash_without_controller(case: Case) -> str:
+def _hash_without_controller(case: EvaluationCase) -> str:
     """Return a hash of a case's configuration without its controller: it names the field and all that it sets."""
     config = msgspec.json.decode(case.config, type=RunConfig)
     return compute_config_hash(msgspec.structs.replace(config, controller="any", controllers={}))
 
 
-def _list_controllers(card: Card) -> list[str]:
+def _list_controllers(card: EvaluationCard) -> list[str]:
     """Return the controllers of a card, in the order in which they were tried."""
     return list(dict.fromkeys(crossing.controller for crossing in card.crossings))
 
 
 def _compare_controllers(
-    card: Card, controller: str, other: Card, other_controller: str, *, label: str
-) -> list[Comparison]:
+    card: EvaluationCard, controller: str, other: EvaluationCard, other_controller: str, *, label: str
+) -> list[ControllerComparison]:
     """Compare the success of two controllers in each row in which both were tried on the same fields.
 
     McNemar's test of paired outcomes: only fields count in which exactly one of the controllers reached the goal. The
@@ -287,7 +287,7 @@ def _compare_controllers(
             pair = (crossing.crossed, has_reached_goal_by_config[crossing.same])
             pairs_by_row.setdefault(crossing.row, []).append(pair)
 
-    comparisons: list[Comparison] = []
+    comparisons: list[ControllerComparison] = []
     rows_in_order = dict.fromkeys(crossing.row for crossing in card.crossings)
     for row in rows_in_order:
         if row not in pairs_by_row:
@@ -296,5 +296,5 @@ def _compare_controllers(
         only_first = pairs.count((True, False))
         only_second = pairs.count((False, True))
         p = compute_mcnemar_p(only_first, only_second)
-        comparisons.append(Comparison(row, controller, label, len(pairs), only_first, only_second, p))
+        comparisons.append(ControllerComparison(row, controller, label, len(pairs), only_first, only_second, p))
     return comparisons

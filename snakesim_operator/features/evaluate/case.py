@@ -22,7 +22,7 @@ _run_lock = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Case:
+class EvaluationCase:
     """One run of an evaluation."""
 
     id: str

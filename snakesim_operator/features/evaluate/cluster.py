@@ -13,8 +13,8 @@ from snakesim_operator.base.worker_pool import (
 )
 from snakesim_operator.base.worker_pool import Outcome as CallOutcome
 from snakesim_operator.features.evaluate.case import (
-    Case,
     CaseOutcome,
+    EvaluationCase,
     compute_code_digest,
     make_timeout_outcome,
     run_case,
@@ -27,14 +27,14 @@ MAX_RETRIES = 2  # of a case that raised in a worker of a cluster
 KILL_GRACE_PERIOD_S = 30.0  # after a case's own timeout, which only Python code obeys; workers take time to start
 
 
-class Workers(Protocol):
+class CaseWorkers(Protocol):
     """Runs cases, several at a time."""
 
     def count_workers(self) -> int:
         """Return how many workers there are now, that is how many cases run at a time."""
         ...
 
-    def run_cases(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
+    def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
         """Run all cases, and yield each with its outcome as soon as it is done.
 
         Args:
@@ -44,7 +44,7 @@ class Workers(Protocol):
 
 
 @contextmanager
-def start_workers(cluster: str | None, process_count: int | None = None) -> Iterator[Workers]:
+def start_workers(cluster: str | None, process_count: int | None = None) -> Iterator[CaseWorkers]:
     """Provide processes that run cases: those of a Dask cluster, or new ones here that end with the context.
 
     Args:
@@ -74,7 +74,7 @@ class LocalWorkers:
     def count_workers(self) -> int:
         return self._pool.size
 
-    def run_cases(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
+    def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
         if not cases:
             return
         calls = [_make_call_arguments(case) for case in cases]
@@ -92,10 +92,10 @@ class ClusterWorkers:
     def count_workers(self) -> int:
         return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
 
-    def run_cases(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
+    def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
         from distributed import as_completed
 
-        submitted: dict[Future, Case] = {}
+        submitted: dict[Future, EvaluationCase] = {}
         for index, case in enumerate(cases):
             future = self._client.submit(
                 run_case,
@@ -110,11 +110,11 @@ class ClusterWorkers:
             future.release()
 
 
-def _make_call_arguments(case: Case) -> tuple[bytes, str, float, float]:
+def _make_call_arguments(case: EvaluationCase) -> tuple[bytes, str, float, float]:
     return case.config, compute_code_digest(), case.stall_timeout_s, case.timeout_s
 
 
-def _make_outcome_of_call(case: Case, outcome: CallOutcome) -> CaseOutcome:
+def _make_outcome_of_call(case: EvaluationCase, outcome: CallOutcome) -> CaseOutcome:
     if not isinstance(outcome, CallFailure):
         return outcome.value
     match outcome.error:

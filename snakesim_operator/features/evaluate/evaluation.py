@@ -19,17 +19,17 @@ from snakesim_operator.base.dask_cluster import validate_address
 from snakesim_operator.features.evaluate import store
 from snakesim_operator.features.evaluate.card import (
     CARD_FILENAME,
-    Card,
+    EvaluationCard,
     compare_cards,
     format_card,
     make_card,
     read_card,
 )
-from snakesim_operator.features.evaluate.case import Case
+from snakesim_operator.features.evaluate.case import EvaluationCase
 from snakesim_operator.features.evaluate.cluster import start_workers
 from snakesim_operator.features.evaluate.page import render_evaluation_page
 from snakesim_operator.features.evaluate.progress import CaseProgress
-from snakesim_operator.features.evaluate.suite import Suite, make_cases, select_cases_of_rows
+from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases, select_cases_of_rows
 from snakesim_operator.features.evaluate.table import (
     find_best_controller,
     find_worst_failures,
@@ -50,7 +50,7 @@ class EvaluationRequest:
     """The request of the command line."""
 
     # Cases.
-    suite: Suite
+    suite: EvaluationSuite
     source: str  # the suite's file, or the command that stands for one
     name: str
     controllers: Sequence[str]  # none: that of the scenario
@@ -168,7 +168,7 @@ def _run_one_case(request: EvaluationRequest, only: str, step_times: SharedStepT
     )
 
 
-def find_case(suite: Suite, source: str, only: str) -> Case:
+def find_case(suite: EvaluationSuite, source: str, only: str) -> EvaluationCase:
     """Return the case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
     match = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
     if match is None:
@@ -187,13 +187,13 @@ def find_case(suite: Suite, source: str, only: str) -> Case:
     )
 
 
-def format_case_name(case: Case) -> str:
+def format_case_name(case: EvaluationCase) -> str:
     """Return the name of a case as `--only` accepts it."""
     return f"{case.controller}:{case.field}:{case.row}"
 
 
 def _run_and_store_cases(
-    request: EvaluationRequest, cases: Sequence[Case], results: store.ResultStore, output_folder: Path
+    request: EvaluationRequest, cases: Sequence[EvaluationCase], results: store.ResultStore, output_folder: Path
 ) -> None:
     """Run cases on workers, and store each as it is done."""
     with start_workers(request.cluster, request.workers) as pool, CaseProgress(len(cases)) as progress:
@@ -207,10 +207,10 @@ def _run_and_store_cases(
 
 def _report_results(
     request: EvaluationRequest,
-    cases: Sequence[Case],
+    cases: Sequence[EvaluationCase],
     outcome_by_id: store.Results,
     output_folder: Path,
-    other_cards: Sequence[Card],
+    other_cards: Sequence[EvaluationCard],
 ) -> None:
     """Print the table of results and the worst failures, and write tables, score card and page.
 
@@ -247,7 +247,7 @@ def _report_results(
         print_line(f"written: {path}")
 
 
-def _print_errors(cases: Sequence[Case], outcome_by_id: store.Results) -> None:
+def _print_errors(cases: Sequence[EvaluationCase], outcome_by_id: store.Results) -> None:
     """Print how many cases could not run, and why the first of them could not."""
     cases_with_error = [case for case in cases if outcome_by_id[case.id].error is not None]
     if cases_with_error:
@@ -259,7 +259,7 @@ def _print_errors(cases: Sequence[Case], outcome_by_id: store.Results) -> None:
 
 
 def _list_worst_failures(
-    request: EvaluationRequest, cases: Sequence[Case], done: store.Results
+    request: EvaluationRequest, cases: Sequence[EvaluationCase], done: store.Results
 ) -> list[tuple[str, str, str]]:
     """Return the worst failures, each as name, reason, and the command that runs it again."""
     failures: list[tuple[str, str, str]] = []

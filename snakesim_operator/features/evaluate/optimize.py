@@ -18,8 +18,8 @@ from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import compose_config_table, parse_set_option
 from snakesim_operator.base.dask_cluster import validate_address
-from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, Case, CaseOutcome, compute_code_digest
-from snakesim_operator.features.evaluate.cluster import Workers, start_workers
+from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, CaseOutcome, EvaluationCase, compute_code_digest
+from snakesim_operator.features.evaluate.cluster import CaseWorkers, start_workers
 from snakesim_operator.features.evaluate.search_file import (
     IS_STUCK_ATTRIBUTE,
     TRIAL_NUMBER_ATTRIBUTE,
@@ -30,7 +30,7 @@ from snakesim_operator.features.evaluate.search_file import (
     open_study,
 )
 from snakesim_operator.features.evaluate.suite import (
-    Suite,
+    EvaluationSuite,
     list_seed_keys,
     make_cases,
     read_suite,
@@ -130,7 +130,7 @@ def _run_search(
 
 
 def _make_search_command(
-    request: SearchRequest, range_by_key: Mapping[str, ParameterRange], cases_at_ends: Sequence[Case]
+    request: SearchRequest, range_by_key: Mapping[str, ParameterRange], cases_at_ends: Sequence[EvaluationCase]
 ) -> SearchCommand:
     """Collect everything on which the results of trials depend; workers and the number of trials are not included."""
     return SearchCommand(
@@ -148,7 +148,7 @@ def _make_search_command(
     )
 
 
-def _run_trials(request: SearchRequest, study: Study, trials: Sequence[Trial], pool: Workers) -> None:
+def _run_trials(request: SearchRequest, study: Study, trials: Sequence[Trial], pool: CaseWorkers) -> None:
     """Run all cases of these trials, store the result of each trial in the study, and print it."""
     cases_by_trial = {trial.number: _make_trial_cases(request, trial.params) for trial in trials}
     unique_cases = {case.id: case for cases in cases_by_trial.values() for case in cases}
@@ -228,12 +228,12 @@ def _parse_set_options(request: SearchRequest) -> dict[str, Any]:
     return {override.key: override.value for override in overrides}
 
 
-def _make_trial_cases(request: SearchRequest, parameter_values: dict[str, Any]) -> list[Case]:
+def _make_trial_cases(request: SearchRequest, parameter_values: dict[str, Any]) -> list[EvaluationCase]:
     """Return the cases of a trial: each seed, in each requested row of a suite. Raises ConfigError."""
     if request.rows:
         suite, _ = read_suite(request.scenario)
     else:
-        suite = Suite(scenario=request.scenario)
+        suite = EvaluationSuite(scenario=request.scenario)
     suite = set_suite_values(suite, {**_parse_set_options(request), **parameter_values})
     cases = make_cases(suite, "optimize", [], request.seeds, request.seed)
     return select_cases_of_rows(cases, request.rows, request.scenario)

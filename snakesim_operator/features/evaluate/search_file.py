@@ -21,7 +21,7 @@ from sqlalchemy import QueuePool
 from sqlalchemy.exc import SQLAlchemyError
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.evaluate.case import Case
+from snakesim_operator.features.evaluate.case import EvaluationCase
 
 SEARCH_COMMAND_ATTRIBUTE = "snakesim_command"  # attribute of the study: the `SearchCommand` as JSON types
 TRIAL_NUMBER_ATTRIBUTE = "snakesim_number"  # attribute of a trial: as it was printed, from 1
@@ -63,7 +63,7 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
         return shlex.join(words)
 
 
-def hash_configurations(cases: Sequence[Case]) -> str:
+def hash_configurations(cases: Sequence[EvaluationCase]) -> str:
     """Return a hash of the whole configurations of these cases."""
     digest = hashlib.sha256()
     for case in cases:

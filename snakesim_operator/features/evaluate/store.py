@@ -16,7 +16,13 @@ import pyarrow.parquet as pq
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import export_atomically
-from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, WALL_CLOCK_FIELDS, Case, CaseOutcome, Number
+from snakesim_operator.features.evaluate.case import (
+    GAVE_UP_FIELD,
+    WALL_CLOCK_FIELDS,
+    CaseOutcome,
+    EvaluationCase,
+    Number,
+)
 from snakesim_operator.results.signals import PARQUET_UNIT
 from snakesim_operator.results.summary import RunSummary
 
@@ -42,7 +48,7 @@ class ResultStore:
         self._file_descriptor = handle
         self.done = done
 
-    def append(self, case: Case, outcome: CaseOutcome) -> None:
+    def append(self, case: EvaluationCase, outcome: CaseOutcome) -> None:
         """Store a finished case; it is on the disk when this returns."""
         line = _StoredCase(case.id, outcome, case.identifying_columns)
         os.write(self._file_descriptor, msgspec.json.encode(line) + b"\n")
@@ -102,7 +108,7 @@ def _read_results(path: Path, file_descriptor: int) -> Results:
     return outcome_by_id
 
 
-def write_tables(folder: Path, cases: Sequence[Case], outcome_by_id: Results) -> list[Path]:
+def write_tables(folder: Path, cases: Sequence[EvaluationCase], outcome_by_id: Results) -> list[Path]:
     """Write the results in the order of the cases, as Parquet and as CSV.
 
     No value depends on the wall clock, so two evaluations of the same cases give the same files.

@@ -40,10 +40,10 @@ from msgspec import Meta
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.files import ConfigTable, FileStruct, decode_table, read_table, resolve_file_path
 from snakesim_hal.model.randomization import Randomization
-from snakesim_hal.model.scenario import Override, RunConfig, compose_config_table, encode_config, validate_start_pose
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, compose_config_table, encode_config, validate_start_pose
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.programs.preflight import validate_and_complete_config
-from snakesim_operator.features.evaluate.case import Case, make_case_id
+from snakesim_operator.features.evaluate.case import EvaluationCase, make_case_id
 
 MAX_CASES = 200_000
 Count = Annotated[int, Meta(ge=1, le=100_000)]
@@ -65,7 +65,7 @@ class SuiteRow(FileStruct, frozen=True, kw_only=True):
     """Keys that no [[randomize]] of the suite sets in this row."""
 
 
-class Suite(FileStruct, frozen=True, kw_only=True):
+class EvaluationSuite(FileStruct, frozen=True, kw_only=True):
     """A whole suite file."""
 
     title: str = ""
@@ -116,24 +116,24 @@ class SuiteSetting:
     """One row of the table: its name, and the values that it sets."""
 
     name: str
-    overrides: list[Override]
+    overrides: list[KeyOverride]
     value: float | None = None  # of what is varied, if that is one number
     randomizations: Sequence[Randomization] = ()
 
 
-def read_suite(name: str) -> tuple[Suite, str]:
+def read_suite(name: str) -> tuple[EvaluationSuite, str]:
     """Return a shipped suite or a suite file, and its path. Raises ConfigError."""
     path = resolve_file_path(name, "suites")
-    return decode_table(read_table(path), Suite), str(path)
+    return decode_table(read_table(path), EvaluationSuite), str(path)
 
 
-def set_suite_values(suite: Suite, values: dict[str, Any]) -> Suite:
+def set_suite_values(suite: EvaluationSuite, values: dict[str, Any]) -> EvaluationSuite:
     """Return the suite with these keys set in every row, over what suite and row set."""
     rows = [msgspec.structs.replace(row, set={**row.set, **values}) for row in suite.row]
     return msgspec.structs.replace(suite, set={**suite.set, **values}, row=rows)
 
 
-def select_cases_of_rows(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Case]:
+def select_cases_of_rows(cases: Sequence[EvaluationCase], rows: Sequence[int], source: str) -> list[EvaluationCase]:
     """Return the cases of some rows, by number; all cases without a row. Raises ConfigError for a missing row."""
     known = {case.row for case in cases}
     for row in rows:
@@ -144,7 +144,7 @@ def select_cases_of_rows(cases: Sequence[Case], rows: Sequence[int], source: str
     return [case for case in cases if case.row in rows]
 
 
-def make_suite_settings(suite: Suite, source: str) -> list[SuiteSetting]:
+def make_suite_settings(suite: EvaluationSuite, source: str) -> list[SuiteSetting]:
     """Make the rows of the table of results, each with the values that it sets in the scenario.
 
     Each named row of the suite is combined with each combination of the varied values.
@@ -157,21 +157,21 @@ def make_suite_settings(suite: Suite, source: str) -> list[SuiteSetting]:
         ConfigError: A value is invalid, or two rows have the same name.
     """
     common_overrides = list(_flatten_overrides(suite.set, f"{source}: [set]"))
-    common_overrides += [Override(key, None, f"{source}: `unset`") for key in suite.unset]
+    common_overrides += [KeyOverride(key, None, f"{source}: `unset`") for key in suite.unset]
     values_by_key = {key: _list_values(key, values, source) for key, values in suite.vary.items()}
     label_by_key = _shorten_keys(list(values_by_key))
     settings: list[SuiteSetting] = []
     for row in suite.row or [SuiteRow(name="")]:
         context = f"{source}: row {row.name!r}" if row.name else source
         row_overrides = list(_flatten_overrides(row.set, context))
-        row_overrides += [Override(key, None, context) for key in row.unset]
+        row_overrides += [KeyOverride(key, None, context) for key in row.unset]
         randomizations = _select_randomizations(suite, row.without, context)
         for combination in itertools.product(*values_by_key.values()):
             name_parts = [row.name] if row.name else []
-            varied_overrides: list[Override] = []
+            varied_overrides: list[KeyOverride] = []
             for key, value in zip(values_by_key, combination, strict=True):
                 name_parts.append(f"{label_by_key[key]} {_format_short_value(value)}")
-                varied_overrides.append(Override(key, value, f"{source}: [vary]"))
+                varied_overrides.append(KeyOverride(key, value, f"{source}: [vary]"))
             name = ", ".join(name_parts) or "as it is"
             varied_number = None  # the place of the row on the horizontal axis, if a single number is varied
             if len(combination) == 1 and not row.name and _is_number(combination[0]):
@@ -189,7 +189,9 @@ def _validate_unique_names(settings: Sequence[SuiteSetting], source: str) -> Non
         raise ConfigError(f"{source}: two rows are called {min(repeated)!r}; rename one", code="config/duplicate-name")
 
 
-def make_cases(suite: Suite, source: str, controllers: Sequence[str], field_count: int, first_field: int) -> list[Case]:
+def make_cases(
+    suite: EvaluationSuite, source: str, controllers: Sequence[str], field_count: int, first_field: int
+) -> list[EvaluationCase]:
     """Make every case of a suite in the order of the table, each with its whole configuration.
 
     The values that the suite sets are checked here on the first field of each row. A later field that cannot be laid
@@ -211,7 +213,7 @@ def make_cases(suite: Suite, source: str, controllers: Sequence[str], field_coun
         raise ConfigError(
             f"{source}: {case_count} cases; at most {MAX_CASES} are allowed", code="command/invalid-option"
         )
-    cases: list[Case] = []
+    cases: list[EvaluationCase] = []
     for row_number, setting in enumerate(settings, 1):
         for controller in controllers or [None]:
             table = _compose_scenario(suite, setting, controller)
@@ -220,7 +222,7 @@ def make_cases(suite: Suite, source: str, controllers: Sequence[str], field_coun
                 if field == first_field:
                     _validate_config(config, table, f"{source}, row {row_number} ({setting.name}), field {field}")
                 cases.append(
-                    Case(
+                    EvaluationCase(
                         id=make_case_id(config, suite.give_up_s),
                         row=row_number,
                         setting=setting.name,
@@ -235,11 +237,11 @@ def make_cases(suite: Suite, source: str, controllers: Sequence[str], field_coun
     return cases
 
 
-def _compose_scenario(suite: Suite, setting: SuiteSetting, controller: str | None) -> ConfigTable:
+def _compose_scenario(suite: EvaluationSuite, setting: SuiteSetting, controller: str | None) -> ConfigTable:
     """Return the scenario with the values of a setting, and with another controller unless `controller` is None."""
-    overrides = [Override("clock_mode", "lockstep", "--clock-mode lockstep")]
+    overrides = [KeyOverride("clock_mode", "lockstep", "--clock-mode lockstep")]
     if controller:
-        overrides.append(Override("controller", controller, f"--controllers {controller}"))
+        overrides.append(KeyOverride("controller", controller, f"--controllers {controller}"))
     return compose_config_table(suite.scenario, [*overrides, *setting.overrides])
 
 
@@ -289,7 +291,7 @@ def _configure_field(table: ConfigTable, field: int, randomizations: Sequence[Ra
     return decode_table(table, RunConfig)
 
 
-def _select_randomizations(suite: Suite, excluded_keys: Sequence[str], context: str) -> list[Randomization]:
+def _select_randomizations(suite: EvaluationSuite, excluded_keys: Sequence[str], context: str) -> list[Randomization]:
     """Return the suite's randomizations without the keys that a row leaves out.
 
     Args:
@@ -314,13 +316,13 @@ def _select_randomizations(suite: Suite, excluded_keys: Sequence[str], context: 
     return randomizations
 
 
-def _flatten_overrides(values: dict[str, Any], origin: str, prefix: str = "") -> Iterator[Override]:
+def _flatten_overrides(values: dict[str, Any], origin: str, prefix: str = "") -> Iterator[KeyOverride]:
     """Yield an override for each value; nested tables become dotted keys, and a list replaces the whole list."""
     for key, value in values.items():
         if isinstance(value, dict) and value:
             yield from _flatten_overrides(value, origin, f"{prefix}{key}.")
         else:
-            yield Override(prefix + key, value, origin)
+            yield KeyOverride(prefix + key, value, origin)
 
 
 def _list_values(key: str, values: list[Any] | str, source: str) -> list[Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, Case, CaseOutcome
+from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, CaseOutcome, EvaluationCase
 from snakesim_operator.features.evaluate.store import Results
 from snakesim_operator.results.metrics.intervals import Z95, compute_mean_interval
 
@@ -152,7 +152,7 @@ class ResultRow:
         return f"{low:.2f} to {high:.2f}"
 
 
-def group_results_by_row(cases: Sequence[Case], outcome_by_id: Results) -> list[ResultRow]:
+def group_results_by_row(cases: Sequence[EvaluationCase], outcome_by_id: Results) -> list[ResultRow]:
     """Return a row for each setting and controller that has results, in the order of the cases."""
     rows: dict[tuple[int, str], ResultRow] = {}
     for case in cases:
@@ -196,7 +196,7 @@ def find_best_controller(rows: Sequence[ResultRow]) -> str:
     return max(crossed, key=lambda name: crossed[name], default="")
 
 
-def find_worst_failures(cases: Sequence[Case], outcome_by_id: Results) -> list[tuple[Case, str]]:
+def find_worst_failures(cases: Sequence[EvaluationCase], outcome_by_id: Results) -> list[tuple[EvaluationCase, str]]:
     """Return the cases that failed and advanced least, each with how it ended, as far as that is known."""
     failed = [case for case in cases if case.id in outcome_by_id and not _has_succeeded(outcome_by_id[case.id])]
     failed.sort(key=lambda case: _compute_advance_fraction(outcome_by_id[case.id]))

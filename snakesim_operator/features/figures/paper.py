@@ -20,7 +20,7 @@ from snakesim_operator.features.figures.from_above import OBSTACLE_COLOR, plot_b
 from snakesim_operator.features.figures.legends import place_legend_beside_title
 from snakesim_operator.features.figures.lines import Floats, plot_over_time
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval, find_propulsion_intervals
-from snakesim_operator.results.report.snapshots import ForceBalance, Snapshot, find_snapshots_with_force_balance
+from snakesim_operator.results.report.snapshots import ForceBalance, RunSnapshot, find_snapshots_with_force_balance
 from snakesim_operator.results.report.timeline import (
     compute_reference_rad,
     find_most_propelling_joints,
@@ -85,7 +85,7 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
     }
 
 
-def _draw_obstacle_triplet(record: RunRecord, snapshot: Snapshot, width_in: float) -> Figure:
+def _draw_obstacle_triplet(record: RunRecord, snapshot: RunSnapshot, width_in: float) -> Figure:
     """Draw body, obstacles and forces from above at the time of a snapshot."""
     figure = Figure((width_in, width_in))
     axes = figure.subplots()
@@ -97,7 +97,7 @@ def _draw_obstacle_triplet(record: RunRecord, snapshot: Snapshot, width_in: floa
     return figure
 
 
-def _draw_propelling_joint(record: RunRecord, snapshot: Snapshot, width_in: float) -> Figure:
+def _draw_propelling_joint(record: RunRecord, snapshot: RunSnapshot, width_in: float) -> Figure:
     """Draw figure 9: the joint whose torque presses on the last contact and so propels the robot, with its lever.
 
     Args:
@@ -127,7 +127,7 @@ def _draw_propelling_joint(record: RunRecord, snapshot: Snapshot, width_in: floa
     return figure
 
 
-def _draw_snapshots(record: RunRecord, snapshots: Sequence[Snapshot], width_in: float) -> Figure:
+def _draw_snapshots(record: RunRecord, snapshots: Sequence[RunSnapshot], width_in: float) -> Figure:
     """Draw a row for each moment: the scene from above, and the force polygon beside it."""
     figure = Figure((2 * width_in, 0.62 * width_in * len(snapshots)))
     rows = figure.subplots(len(snapshots), 2, width_ratios=(2, 1), squeeze=False)
@@ -212,7 +212,7 @@ def _plot_torque(axes: Axes, record: RunRecord, joint: int) -> None:
     axes.set_ylabel("torque [N·m]")
 
 
-def _plot_scene(axes: Axes, record: RunRecord, snapshot: Snapshot) -> None:
+def _plot_scene(axes: Axes, record: RunRecord, snapshot: RunSnapshot) -> None:
     """Plot obstacles and body to scale, and limit the axes to the surroundings of the body."""
     nodes_w = find_body_points_xy_w(record, snapshot.row)
     plot_obstacles(axes, record)
@@ -284,7 +284,7 @@ def _plot_arrow(axes: Axes, start: Floats | Sequence[float], end: Floats | Seque
     axes.annotate("", xy=(end[0], end[1]), xytext=(start[0], start[1]), arrowprops=style)
 
 
-def _require_balance(snapshot: Snapshot) -> ForceBalance:
+def _require_balance(snapshot: RunSnapshot) -> ForceBalance:
     """Return the forces of a snapshot for which the controller solved."""
     assert snapshot.force_balance is not None, "balanced snapshots have one"
     return snapshot.force_balance

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.features.figures.legends import place_legends
 from snakesim_operator.features.figures.run_groups import RunGroup
 from snakesim_operator.results.metrics.intervals import find_mean_and_half_width
@@ -22,7 +22,7 @@ from snakesim_operator.results.time_axis import get_time_origin_s
 
 AXES_HEIGHT_IN = 1.5  # height of a pair of axes
 DEFAULT_SIGNALS = ("angle_rad", "torque_nm")
-MODE_BY_UNIT = {"rad": Mode.POSITION, "rad/s": Mode.VELOCITY, "N·m": Mode.TORQUE}  # of a joint's target
+MODE_BY_UNIT = {"rad": JointMode.POSITION, "rad/s": JointMode.VELOCITY, "N·m": JointMode.TORQUE}  # of a joint's target
 LINE_STYLES = ("-", "--", ":", "-.")  # of the columns of one run
 RUN_COLORS = ("#2c6fbb", "#c0392b", "#3a923a", "#8452a3", "#d98c1f", "#2aa0a4", "#9c5a3c", "#d45c9b")
 MAX_TITLE_LENGTH = 18  # characters of an axis label; its unit needs room in AXES_HEIGHT_IN as well
@@ -30,7 +30,7 @@ INTERVAL_OPACITY = 0.25
 
 
 @dataclass(frozen=True)
-class Curve:
+class SignalCurve:
     """One line of a figure, with the interval around it if it is a mean."""
 
     label: str
@@ -113,7 +113,7 @@ def _plot_signals(
     for name in names:
         _validate_signal_name(name, signals_by_group)
     unit = _find_common_unit(names, signals_by_group[0][0])
-    curves: list[Curve] = []
+    curves: list[SignalCurve] = []
     # Several groups have a color each. In a single group, each curve gets the next color of the cycle below.
     for i, (group, runs) in enumerate(zip(groups, signals_by_group, strict=True)):
         color = RUN_COLORS[i % len(RUN_COLORS)] if len(groups) > 1 else None
@@ -132,7 +132,7 @@ def _plot_signals(
 
 def _make_curves(
     group: RunGroup, runs: Sequence[RunSignals], names: Sequence[str], unit: str, color: str | None
-) -> list[Curve]:
+) -> list[SignalCurve]:
     """Return a curve for each column of the signals.
 
     Args:
@@ -147,7 +147,7 @@ def _make_curves(
         for name in names:
             for column, values in run.select_columns_of_unit(name, unit).items():
                 values_by_column.setdefault(column, []).append((run, np.asarray(values, dtype=float)))
-    curves: list[Curve] = []
+    curves: list[SignalCurve] = []
     for i, (column, runs_with_values) in enumerate(values_by_column.items()):
         label = _label_column(column, names)
         line_style = "-"
@@ -167,15 +167,15 @@ def _make_curve(
     label: str,
     color: str | None,
     line_style: str,
-) -> Curve:
+) -> SignalCurve:
     """Return the curve of one column: of a run, or the mean over the runs of a group at the times of the first run."""
     first_run, values = runs_with_values[0]
     if len(runs_with_values) == 1:
-        return Curve(label, first_run.time_s, values, color=color, line_style=line_style)
+        return SignalCurve(label, first_run.time_s, values, color=color, line_style=line_style)
     time_s = first_run.time_s[first_run.time_s <= group.end_s + 1e-9]
     samples = [_sample_nearest(time_s, run.time_s, run_values) for run, run_values in runs_with_values]
     mean, half_width = find_mean_and_half_width(np.array(samples))
-    return Curve(label, time_s, mean, half_width, color, line_style)
+    return SignalCurve(label, time_s, mean, half_width, color, line_style)
 
 
 def _sample_nearest(time_s: Floats, own_time_s: Floats, values: Floats) -> Floats:
@@ -186,7 +186,7 @@ def _sample_nearest(time_s: Floats, own_time_s: Floats, values: Floats) -> Float
     return values[np.where(is_nearer_before, before, after)]
 
 
-def _plot_curve(axes: Axes, curve: Curve) -> None:
+def _plot_curve(axes: Axes, curve: SignalCurve) -> None:
     (line,) = axes.plot(curve.time_s, curve.values, label=curve.label, color=curve.color, linestyle=curve.line_style)
     if curve.half_width is not None:
         axes.fill_between(

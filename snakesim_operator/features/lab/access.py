@@ -6,9 +6,9 @@ from typing import Any
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, MAX_IMAGE_BYTES, MAX_PAYLOAD_BYTES
-from snakesim_hal.wire.roles import Permission, Role, iterate_permissions
-from snakesim_operator.features.lab.identities import Identity, iterate_identities
-from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, Lab
+from snakesim_hal.wire.roles import KeyPermission, Role, iterate_permissions
+from snakesim_operator.features.lab.identities import CertificateIdentity, iterate_identities
+from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, LabPlan
 
 ANY_KEY = "**"
 # Tools look for robots with a wildcard in the place of the namespace, as in `**/alive/hal`.
@@ -29,7 +29,7 @@ MAX_COMMAND_BYTES = 64 * 1024  # of a command to 256 joints, or what a person as
 MAX_ENVELOPE_BYTES = 4096  # key and encoding beside a payload
 
 
-def make_access_control(lab: Lab) -> dict[str, Any]:
+def make_access_control(lab: LabPlan) -> dict[str, Any]:
     """Return Zenoh's `access_control` section for the routers of a lab.
 
     Everything that no rule allows is denied.
@@ -60,7 +60,7 @@ def make_access_control(lab: Lab) -> dict[str, Any]:
     }
 
 
-def _make_rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
+def _make_rules(identity: CertificateIdentity, lab: LabPlan) -> list[dict[str, Any]]:
     """Return the rules of Zenoh's access control for one identity.
 
     All keys at which the same messages may pass in the same direction (flow) share one rule.
@@ -95,7 +95,7 @@ def _make_rules(identity: Identity, lab: Lab) -> list[dict[str, Any]]:
     return rules
 
 
-def _iterate_permissions(identity: Identity, lab: Lab) -> Iterator[Permission]:
+def _iterate_permissions(identity: CertificateIdentity, lab: LabPlan) -> Iterator[KeyPermission]:
     """Yield every kind of message that may pass between a router and an identity.
 
     Keys begin with the robot's namespace, unlike those of the table of roles.
@@ -113,25 +113,25 @@ def _iterate_permissions(identity: Identity, lab: Lab) -> Iterator[Permission]:
     for robot in identity.list_robots(lab):
         faults = lab.file.robots[robot].faults
         for flow, message, key in iterate_permissions(identity.role, identity.services, allow_fault_injection=faults):
-            yield Permission(flow, message, f"{robot}/{key}")
+            yield KeyPermission(flow, message, f"{robot}/{key}")
             if key == ANY_KEY or message not in SEARCH_MESSAGES:
                 continue
             # Tools search for robots with a wildcard instead of the namespace. A process of one robot may search only
             # within its namespace, because a query with a wildcard reaches every queryable.
             searches_one_robot = flow == "ingress" and identity.subject != ALL_ROBOTS
             namespace = f"{robot}/{ANY_KEY}" if searches_one_robot else ANY_KEY
-            yield Permission(flow, message, f"{namespace}/{key}")
+            yield KeyPermission(flow, message, f"{namespace}/{key}")
     if identity.role is Role.ADMINISTRATOR:
-        yield Permission("ingress", "query", f"@/{ANY_KEY}")
-        yield Permission("egress", "reply", f"@/{ANY_KEY}")
+        yield KeyPermission("ingress", "query", f"@/{ANY_KEY}")
+        yield KeyPermission("egress", "reply", f"@/{ANY_KEY}")
 
 
-def _iterate_router_permissions() -> Iterator[Permission]:
+def _iterate_router_permissions() -> Iterator[KeyPermission]:
     """Yield everything, because another router has already checked what it forwards."""
     for flow in ("ingress", "egress"):
         for message in ALL_MESSAGES:
-            yield Permission(flow, message, ANY_KEY)
-            yield Permission(flow, message, f"{ANY_KEY}/@adv/{ANY_KEY}")
+            yield KeyPermission(flow, message, ANY_KEY)
+            yield KeyPermission(flow, message, f"{ANY_KEY}/@adv/{ANY_KEY}")
 
 
 def make_size_limits() -> list[dict[str, Any]]:

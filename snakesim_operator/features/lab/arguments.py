@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 from snakesim_hal.base.process import raise_on_stop_signals
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.programs.arguments import add_json_argument, add_output_argument
-from snakesim_hal.programs.commands import Command, Commands, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 
 if TYPE_CHECKING:
-    from snakesim_operator.features.lab.lab_file import Lab
+    from snakesim_operator.features.lab.lab_file import LabPlan
 
 AUTHORITY = "authority"
 
@@ -76,7 +76,7 @@ def _run_check(arguments: argparse.Namespace) -> int:
             return 130
 
 
-def _load_lab(arguments: argparse.Namespace) -> "Lab":
+def _load_lab(arguments: argparse.Namespace) -> "LabPlan":
     from snakesim_operator.base import extras
     from snakesim_operator.features.lab.lab_file import load_lab
 
@@ -85,7 +85,7 @@ def _load_lab(arguments: argparse.Namespace) -> "Lab":
 
 
 COMMANDS: Commands = (
-    Noun(
+    CommandGroup(
         name="lab",
         heading="files and computers",
         help="Make a lab's configuration, access rules and certificates from a file, and check the lab.",

@@ -22,8 +22,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.network.private_keys import check_permissions
-from snakesim_operator.features.lab.identities import Identity, iterate_identities
-from snakesim_operator.features.lab.lab_file import Lab
+from snakesim_operator.features.lab.identities import CertificateIdentity, iterate_identities
+from snakesim_operator.features.lab.lab_file import LabPlan
 
 AUTHORITY_NAME = "authority"
 CLOCK_SLACK = timedelta(minutes=10)  # a robot's clock may be behind
@@ -31,14 +31,14 @@ RENEWAL_FRACTION = 1 / 3  # a certificate is renewed when less than this part of
 
 
 @dataclass(frozen=True)
-class Issuer:
+class CertificateIssuer:
     """The certificate authority: what signs certificates."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
 
-def load_or_create_authority(folder: Path, lab: Lab) -> Issuer:
+def load_or_create_authority(folder: Path, lab: LabPlan) -> CertificateIssuer:
     """Load the lab's certificate authority from a folder, or create a new one if the folder has none.
 
     The private key of the authority stays in this folder: it is copied to no machine.
@@ -59,10 +59,10 @@ def load_or_create_authority(folder: Path, lab: Lab) -> Issuer:
     certificate = _make_authority_certificate(key, lab)
     _write_file_with_mode(key_path, _encode_key(key), 0o600)
     _write_file_with_mode(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
-    return Issuer(certificate, key)
+    return CertificateIssuer(certificate, key)
 
 
-def _make_authority_certificate(key: ec.EllipticCurvePrivateKey, lab: Lab) -> x509.Certificate:
+def _make_authority_certificate(key: ec.EllipticCurvePrivateKey, lab: LabPlan) -> x509.Certificate:
     """Make the authority's own certificate, signed by itself. It may only sign certificates and revocation lists.
 
     Args:
@@ -109,7 +109,7 @@ def _make_private_folder(folder: Path) -> None:
             ) from None
 
 
-def _read_authority(certificate_path: Path, key_path: Path) -> Issuer:
+def _read_authority(certificate_path: Path, key_path: Path) -> CertificateIssuer:
     """Read the certificate authority, and check that certificate and key belong together.
 
     Args:
@@ -144,11 +144,11 @@ def _read_authority(certificate_path: Path, key_path: Path) -> Issuer:
             "`snakesim lab certs` again, and install the new files on every machine",
             code="certificate/expired",
         )
-    return Issuer(certificate, key)
+    return CertificateIssuer(certificate, key)
 
 
 def issue_certificate(
-    issuer: Issuer, identity: Identity, lab: Lab, lifetime: timedelta | None = None
+    issuer: CertificateIssuer, identity: CertificateIdentity, lab: LabPlan, lifetime: timedelta | None = None
 ) -> tuple[bytes, bytes]:
     """Create a private key and a certificate that identifies one machine of a lab with its role.
 
@@ -179,7 +179,7 @@ def issue_certificate(
     return certificate.public_bytes(serialization.Encoding.PEM), _encode_key(key)
 
 
-def _list_alternative_names(identity: Identity, lab: Lab) -> list[x509.GeneralName]:
+def _list_alternative_names(identity: CertificateIdentity, lab: LabPlan) -> list[x509.GeneralName]:
     """Return the address of a router, which its clients compare; a role has no address, only its name."""
     address = lab.file.machines[identity.machine].address if identity.role is None else None
     if address is None:
@@ -191,8 +191,8 @@ def _list_alternative_names(identity: Identity, lab: Lab) -> list[x509.GeneralNa
 
 
 def write_certificates(
-    lab: Lab, folder: Path, authority_folder: Path, *, rotate: bool = False
-) -> list[tuple[Identity, str, datetime]]:
+    lab: LabPlan, folder: Path, authority_folder: Path, *, rotate: bool = False
+) -> list[tuple[CertificateIdentity, str, datetime]]:
     """Write the certificates of all identities into `folder/MACHINE/tls`.
 
     Args:
@@ -207,7 +207,7 @@ def write_certificates(
     """
     issuer = load_or_create_authority(authority_folder, lab)
     authority_pem = issuer.certificate.public_bytes(serialization.Encoding.PEM)
-    results: list[tuple[Identity, str, datetime]] = []
+    results: list[tuple[CertificateIdentity, str, datetime]] = []
     for identity in iterate_identities(lab):
         tls_folder = folder / identity.machine / "tls"
         tls_folder.mkdir(parents=True, exist_ok=True)
@@ -239,7 +239,7 @@ def read_certificate(path: Path) -> x509.Certificate:
         ) from None
 
 
-def _is_still_valid(path: Path, issuer: Issuer, identity: Identity, lab: Lab) -> bool:
+def _is_still_valid(path: Path, issuer: CertificateIssuer, identity: CertificateIdentity, lab: LabPlan) -> bool:
     """Return whether the certificate at a path is there, and need not be renewed."""
     if not path.exists() or not path.with_suffix(".key").exists():
         return False

@@ -23,15 +23,15 @@ from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.private_keys import check_permissions
 from snakesim_hal.network.probe import open_probe
 from snakesim_hal.network.process_entries import HOST, describe_differences
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Process, Status
+from snakesim_hal.wire.messages import ProcessInfo, RobotDescription, RobotStatus
 from snakesim_hal.wire.roles import ACCESS_RULES, RECORDER, Role
 from snakesim_operator.features.lab.certificates import RENEWAL_FRACTION, read_certificate
 from snakesim_operator.features.lab.drive_buses import SIMULATOR_BACKEND, has_real_drives
-from snakesim_operator.features.lab.identities import Identity, iterate_identities
-from snakesim_operator.features.lab.lab_file import Lab
+from snakesim_operator.features.lab.identities import CertificateIdentity, iterate_identities
+from snakesim_operator.features.lab.lab_file import LabPlan
 from snakesim_operator.features.lab.lab_robot import LabRobot
 from snakesim_operator.features.lab.zenoh_files import make_session_settings, make_tls_paths
 
@@ -67,7 +67,7 @@ class CheckResults:
         self.print_text(f"! {text}")
 
 
-def check_running_lab(lab: Lab, folder: Path, print_text: PrintLine = print_line, *, as_json: bool = False) -> int:
+def check_running_lab(lab: LabPlan, folder: Path, print_text: PrintLine = print_line, *, as_json: bool = False) -> int:
     """Check certificates, routers, robots and roles of a running lab, and print the results.
 
     Args:
@@ -87,7 +87,7 @@ def check_running_lab(lab: Lab, folder: Path, print_text: PrintLine = print_line
     return _run_all_checks(lab, folder, CheckResults(print_text))
 
 
-def _run_all_checks(lab: Lab, folder: Path, results: CheckResults) -> int:
+def _run_all_checks(lab: LabPlan, folder: Path, results: CheckResults) -> int:
     """Check certificates, then routers, then robots and roles, which are reached through the routers.
 
     Args:
@@ -122,7 +122,7 @@ def _run_all_checks(lab: Lab, folder: Path, results: CheckResults) -> int:
     return 0
 
 
-def _check_certificate(identity: Identity, folder: Path, results: CheckResults) -> None:
+def _check_certificate(identity: CertificateIdentity, folder: Path, results: CheckResults) -> None:
     """Check that the certificate of an identity is there and valid, and that only its owner can read its key."""
     path = _get_certificate_path(identity, folder)
     try:
@@ -148,7 +148,7 @@ def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, results
         results.report_failed(f"{text}; {remedy}")
 
 
-def _check_router(name: str, lab: Lab, folder: Path, results: CheckResults) -> bool:
+def _check_router(name: str, lab: LabPlan, folder: Path, results: CheckResults) -> bool:
     """Check that a router accepts a client of the lab, shows its newest certificate, and refuses other clients.
 
     Args:
@@ -161,7 +161,7 @@ def _check_router(name: str, lab: Lab, folder: Path, results: CheckResults) -> b
         Whether the router's port can be reached.
     """
     endpoint = lab.make_endpoint(name)
-    router = Identity(lab.file.routers[name].machine, None, name)
+    router = CertificateIdentity(lab.file.routers[name].machine, None, name)
     try:
         _connect_without_tls(endpoint).close()
     except OSError as error:
@@ -219,17 +219,17 @@ def _read_presented_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Cert
 
 
 @dataclass(frozen=True)
-class _RobotState:
+class _LabRobotState:
     """What the processes of a robot publish."""
 
-    status: Status | None
-    description: Description | None
+    status: RobotStatus | None
+    description: RobotDescription | None
     live_services: frozenset[str]  # names of the services with a liveliness token
-    processes: list[Process]
+    processes: list[ProcessInfo]
     clock_offsets_s: dict[str, float]  # by key: how far the publisher's clock is ahead of this computer's
 
 
-def _check_robot(robot: str, lab: Lab, folder: Path, results: CheckResults) -> None:
+def _check_robot(robot: str, lab: LabPlan, folder: Path, results: CheckResults) -> None:
     """Check the processes of a robot: where they run, their versions and settings, and their clocks.
 
     Args:
@@ -259,22 +259,24 @@ def _check_robot(robot: str, lab: Lab, folder: Path, results: CheckResults) -> N
             _check_process(process, host, state.clock_offsets_s, results)
 
 
-def _observe_robot(watcher: Identity, robot: str, lab: Lab, folder: Path) -> _RobotState:
+def _observe_robot(watcher: CertificateIdentity, robot: str, lab: LabPlan, folder: Path) -> _LabRobotState:
     """Connect as one identity and collect what a robot publishes. Raises NotConnectedError."""
     with _open_session(watcher, robot, lab, folder) as session:
-        status = session.wait_for_latched(keys.STATUS, Status, LISTEN_S)
-        description = session.wait_for_latched(keys.DESCRIPTION, Description, LISTEN_S) if status is not None else None
+        status = session.wait_for_latched(keys.STATUS, RobotStatus, LISTEN_S)
+        description = (
+            session.wait_for_latched(keys.DESCRIPTION, RobotDescription, LISTEN_S) if status is not None else None
+        )
         live_keys = session.list_tokens(keys.PROCESS_ALL)
-        reader = session.declare_latched_reader(keys.PROCESS_ALL, Process)
+        reader = session.declare_latched_reader(keys.PROCESS_ALL, ProcessInfo)
         settings = {**_make_probe_settings(watcher, lab, folder), "namespace": robot}
         with open_probe(json.dumps(settings)) as probe:
             clock_offsets_s = probe.measure_clock_offsets_s(list(WRITER_BY_KEY), LISTEN_S)
         processes = reader.drain()
     live_services = frozenset(keys.parse_service(key).rpartition("-")[0] for key in live_keys)
-    return _RobotState(status, description, live_services, processes, clock_offsets_s)
+    return _LabRobotState(status, description, live_services, processes, clock_offsets_s)
 
 
-def _find_expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> dict[str, str]:
+def _find_expected_processes(robot: str, lab: LabPlan, involved: list[CertificateIdentity]) -> dict[str, str]:
     """Return the machine of each process that the lab file gives a robot."""
     expected = {HOST: lab.file.robots[robot].machine}
     for identity in involved:
@@ -285,7 +287,7 @@ def _find_expected_processes(robot: str, lab: Lab, involved: list[Identity]) -> 
     return expected
 
 
-def check_emulation(robot: LabRobot, description: Description | None, results: CheckResults) -> None:
+def check_emulation(robot: LabRobot, description: RobotDescription | None, results: CheckResults) -> None:
     """Check that a robot whose bus the lab file names has real drives, and that a simulated or emulated one has none.
 
     A robot of another kind passes, because the lab file does not tell what moves.
@@ -307,7 +309,7 @@ def check_emulation(robot: LabRobot, description: Description | None, results: C
 
 
 def _check_process(
-    process: Process, host: Process | None, clock_offsets_s: dict[str, float], results: CheckResults
+    process: ProcessInfo, host: ProcessInfo | None, clock_offsets_s: dict[str, float], results: CheckResults
 ) -> None:
     """Check version and settings of a process against those of the host, and its clock against this computer's.
 
@@ -334,7 +336,9 @@ def _check_process(
             results.report_failed(text)
 
 
-def _check_role_permissions(identity: Identity, role: Role, lab: Lab, folder: Path, results: CheckResults) -> None:
+def _check_role_permissions(
+    identity: CertificateIdentity, role: Role, lab: LabPlan, folder: Path, results: CheckResults
+) -> None:
     """Check that an identity can connect, and that the routers forward exactly those queries that its role allows.
 
     Args:
@@ -370,18 +374,18 @@ def _check_role_permissions(identity: Identity, role: Role, lab: Lab, folder: Pa
 
 
 @contextmanager
-def _open_session(identity: Identity, robot: str, lab: Lab, folder: Path) -> Iterator[Session]:
+def _open_session(identity: CertificateIdentity, robot: str, lab: LabPlan, folder: Path) -> Iterator[Session]:
     """Open a session to a robot as one identity. Raises NotConnectedError."""
     with TemporaryDirectory() as scratch:
         path = Path(scratch) / "session.json5"
         path.write_text(json.dumps(_make_probe_settings(identity, lab, folder)), encoding="utf-8")
-        link = Link.from_session_file(read_session(path), robot)
+        link = ConnectionSettings.from_session_file(read_session(path), robot)
         with open_session(link, CONNECT_TIMEOUT_MS / 1000) as session:
             yield session
 
 
 def _make_probe_settings(
-    identity: Identity, lab: Lab, folder: Path, endpoints: list[str] | None = None
+    identity: CertificateIdentity, lab: LabPlan, folder: Path, endpoints: list[str] | None = None
 ) -> dict[str, Any]:
     """Return Zenoh's settings for a session as one identity, with whole keys and the certificate in `folder`.
 
@@ -399,9 +403,9 @@ def _make_probe_settings(
     return settings
 
 
-def _get_tls_folder(identity: Identity, folder: Path) -> Path:
+def _get_tls_folder(identity: CertificateIdentity, folder: Path) -> Path:
     return folder.absolute() / identity.machine / "tls"
 
 
-def _get_certificate_path(identity: Identity, folder: Path) -> Path:
+def _get_certificate_path(identity: CertificateIdentity, folder: Path) -> Path:
     return _get_tls_folder(identity, folder) / f"{identity.label}.pem"

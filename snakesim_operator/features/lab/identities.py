@@ -4,13 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, Lab
+from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, LabPlan
 
 ROUTER = "router"
 
 
 @dataclass(frozen=True)
-class Identity:
+class CertificateIdentity:
     """What one certificate stands for."""
 
     machine: str
@@ -28,7 +28,7 @@ class Identity:
         """The name in the certificate, in the access rules and in the routers' logs: `gnc.planar13.ws1`."""
         return f"{self.label}.{self.machine}"
 
-    def list_robots(self, lab: Lab) -> list[str]:
+    def list_robots(self, lab: LabPlan) -> list[str]:
         """Return the robots whose keys the identity may use; none for a router."""
         if self.subject == ALL_ROBOTS:
             return list(lab.file.robots)
@@ -37,13 +37,13 @@ class Identity:
         return [self.subject]
 
 
-def iterate_identities(lab: Lab) -> Iterator[Identity]:
+def iterate_identities(lab: LabPlan) -> Iterator[CertificateIdentity]:
     """Yield all identities of a lab: routers, robots, then the roles in the file's order."""
     for name, router in lab.file.routers.items():
-        yield Identity(router.machine, None, name)
+        yield CertificateIdentity(router.machine, None, name)
     for name, robot in lab.file.robots.items():
-        yield Identity(robot.machine, Role.ROBOT, name)
+        yield CertificateIdentity(robot.machine, Role.ROBOT, name)
     for grant in lab.file.roles:
         role = Role(grant.role)
         services = tuple(grant.services) if role is Role.GNC else ()
-        yield Identity(grant.machine, role, grant.robot, services)
+        yield CertificateIdentity(grant.machine, role, grant.robot, services)

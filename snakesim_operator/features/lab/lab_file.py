@@ -25,7 +25,7 @@ PortNumber = Annotated[int, Meta(ge=1, le=65535)]
 Days = Annotated[float, Meta(gt=0, le=825, extra_json_schema={"unit": "days"})]
 
 
-class Machine(FileStruct, frozen=True, kw_only=True):
+class LabMachine(FileStruct, frozen=True, kw_only=True):
     """A computer of the lab."""
 
     address: Address | None = None
@@ -44,7 +44,7 @@ class Machine(FileStruct, frozen=True, kw_only=True):
     """Groups of the system that may open its serial ports."""
 
 
-class Router(FileStruct, frozen=True, kw_only=True):
+class LabRouter(FileStruct, frozen=True, kw_only=True):
     """A Zenoh router."""
 
     machine: Name
@@ -54,7 +54,7 @@ class Router(FileStruct, frozen=True, kw_only=True):
     """TCP port at which the router listens."""
 
 
-class Grant(FileStruct, frozen=True, kw_only=True):
+class RobotGrant(FileStruct, frozen=True, kw_only=True):
     """What a machine is to a robot: one certificate, one session file."""
 
     machine: Name
@@ -82,21 +82,21 @@ class LabFile(FileStruct, frozen=True, kw_only=True):
     authority_days: Annotated[float, from_zero(7300, "days")] = 1825
     """Lifetime of the lab's certificate authority."""
 
-    machines: dict[Name, Machine]
+    machines: dict[Name, LabMachine]
     """Computers by name, as sections such as `[machines.bench]`."""
 
-    routers: dict[Name, Router]
+    routers: dict[Name, LabRouter]
     """Zenoh routers by name, as sections such as `[routers.main]`. A lab has at least one."""
 
     robots: dict[Name, LabRobot]
     """Robots by name, as sections such as `[robots.snake]`."""
 
-    roles: list[Grant] = []
+    roles: list[RobotGrant] = []
     """Roles of the machines, each an entry `[[roles]]`."""
 
 
 @dataclass(frozen=True)
-class Lab:
+class LabPlan:
     """A lab file that fits together."""
 
     file: LabFile
@@ -113,13 +113,13 @@ class Lab:
         return f"tls/[{address}]:{entry.port}" if ":" in address else f"tls/{address}:{entry.port}"
 
 
-def load_lab(path: Path) -> Lab:
+def load_lab(path: Path) -> LabPlan:
     """Read and check a lab file. Raises ConfigError that names field, value and what is allowed."""
     table = read_table(path)
     file = decode_table(table, LabFile)
     _validate_references(file, table)
     validate_robot_buses(file.robots, table.source)
-    return Lab(file, path)
+    return LabPlan(file, path)
 
 
 def _validate_references(file: LabFile, table: ConfigTable) -> None:
@@ -201,7 +201,7 @@ def _validate_roles(file: LabFile, table: ConfigTable) -> None:
 
 
 def _require_known_name(
-    table: ConfigTable, field: str, name: str, known_names: Sequence[str] | dict[str, Machine]
+    table: ConfigTable, field: str, name: str, known_names: Sequence[str] | dict[str, LabMachine]
 ) -> None:
     if name not in known_names:
         raise ConfigError(

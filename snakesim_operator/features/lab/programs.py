@@ -10,18 +10,18 @@ from snakesim_operator.features.lab.drive_buses import (
     list_device_files,
     make_host_settings,
 )
-from snakesim_operator.features.lab.identities import Identity, iterate_identities
-from snakesim_operator.features.lab.lab_file import Lab
+from snakesim_operator.features.lab.identities import CertificateIdentity, iterate_identities
+from snakesim_operator.features.lab.lab_file import LabPlan
 from snakesim_operator.features.lab.lab_robot import LabRobot
 
 STATE_FOLDER = "/var/lib/snakesim"
 
 
 @dataclass(frozen=True)
-class Program:
+class MachineProgram:
     """A program that a machine starts by itself. Operators, viewers and administrators start theirs by hand."""
 
-    identity: Identity
+    identity: CertificateIdentity
     description: str
     arguments: tuple[str, ...]  # of the `snakesim` command
     service: str = ""  # of a gnc
@@ -43,7 +43,7 @@ class Program:
         return self.identity.label.partition(".")[0]
 
 
-def iterate_programs(lab: Lab, machine: str) -> Iterator[Program]:
+def iterate_programs(lab: LabPlan, machine: str) -> Iterator[MachineProgram]:
     """Yield all programs that a machine of the lab runs all the time.
 
     Args:
@@ -57,28 +57,28 @@ def iterate_programs(lab: Lab, machine: str) -> Iterator[Program]:
         session_file = f"{folder}/{identity.label}.json5"
         match identity.role:
             case None:
-                yield Program(identity, f"Zenoh router {identity.subject}", ("start", "router", session_file))
+                yield MachineProgram(identity, f"Zenoh router {identity.subject}", ("start", "router", session_file))
             case Role.ROBOT:
                 yield _make_host_program(identity, lab, session_file)
             case Role.GNC:
                 scenario = _make_scenario_options(lab.file.robots[identity.subject])
                 for service in identity.services:
                     arguments = ("start", "service", service, *scenario, "--session", session_file)
-                    yield Program(identity, f"{service} of {identity.subject}", arguments, service)
+                    yield MachineProgram(identity, f"{service} of {identity.subject}", arguments, service)
             case Role.RECORDER:
                 for robot_name in identity.list_robots(lab):
                     # Without `--out`, the recording gets a name with the time.
                     arguments = ("record", "--session", session_file, "--namespace", robot_name)
-                    yield Program(identity, f"recorder of {robot_name}", arguments, recorded_robot=robot_name)
+                    yield MachineProgram(identity, f"recorder of {robot_name}", arguments, recorded_robot=robot_name)
             case _:
                 pass  # operators, viewers and administrators start their programs by hand
 
 
-def _make_host_program(identity: Identity, lab: Lab, session_file: str) -> Program:
+def _make_host_program(identity: CertificateIdentity, lab: LabPlan, session_file: str) -> MachineProgram:
     """Return the program that runs the HAL host of a robot."""
     robot = lab.file.robots[identity.subject]
     out = f"{STATE_FOLDER}/{identity.subject}"
-    return Program(
+    return MachineProgram(
         identity,
         f"HAL host of {identity.subject}",
         ("start", "host", *_make_scenario_options(robot), "--session", session_file, "--out", out),

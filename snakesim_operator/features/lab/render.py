@@ -7,7 +7,7 @@ from pathlib import Path
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import read_text, write_text
 from snakesim_operator.features.lab.identities import iterate_identities
-from snakesim_operator.features.lab.lab_file import Lab
+from snakesim_operator.features.lab.lab_file import LabPlan
 from snakesim_operator.features.lab.units import render_unit_files
 from snakesim_operator.features.lab.zenoh_files import make_router_settings, make_session_settings
 
@@ -16,7 +16,7 @@ WRITTEN_FILES_LIST = (
 )
 
 
-def write_lab_files(lab: Lab, folder: Path) -> list[Path]:
+def write_lab_files(lab: LabPlan, folder: Path) -> list[Path]:
     """Write the files of all machines; return their paths. Files of an earlier lab are removed."""
     files = dict(render_files(lab))
     written: list[Path] = []
@@ -43,7 +43,7 @@ def _read_written_files(folder: Path) -> list[str]:
     return [name for name in names if not name.startswith("/") and ".." not in name]
 
 
-def render_files(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
+def render_files(lab: LabPlan) -> Iterator[tuple[tuple[str, str], str]]:
     """Yield every file as ((machine, path in the machine's folder), text)."""
     for identity in iterate_identities(lab):
         settings = (
@@ -56,5 +56,5 @@ def render_files(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
             yield (machine, name), text
 
 
-def _describe_origin(lab: Lab, what: str) -> str:
+def _describe_origin(lab: LabPlan, what: str) -> str:
     return f"{what}, of {lab.file.name}: made from {lab.path.name} by `snakesim lab render`; change it there."

@@ -9,14 +9,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from snakesim_hal.base.process import SERVICE_PRIORITY
 from snakesim_operator.features.lab.drive_buses import list_can_interfaces
-from snakesim_operator.features.lab.lab_file import Lab
-from snakesim_operator.features.lab.programs import STATE_FOLDER, Program, iterate_programs
+from snakesim_operator.features.lab.lab_file import LabPlan
+from snakesim_operator.features.lab.programs import STATE_FOLDER, MachineProgram, iterate_programs
 
 CONTAINER_USER = "10001:10001"
 NEEDS_QUOTES = re.compile(r"[\s';]")
 
 
-def render_unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
+def render_unit_files(lab: LabPlan, machine: str, origin: str) -> Iterator[tuple[str, str]]:
     """Render the service files of a machine: systemd units, and a Compose file with the same programs.
 
     Args:
@@ -62,13 +62,13 @@ def render_unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str
         yield "compose.yaml", templates.get_template("compose.j2").render(**template_variables, programs=commands)
 
 
-def _format_command_line(lab: Lab, program: Program) -> str:
+def _format_command_line(lab: LabPlan, program: MachineProgram) -> str:
     """Return the command as systemd splits it. The file's types allow no double quotes, `%`, `$` or backslashes."""
     words = (lab.file.machines[program.identity.machine].program, *program.arguments)
     return " ".join(f'"{word}"' if NEEDS_QUOTES.search(word) else word for word in words)
 
 
-def _list_router_addresses(lab: Lab) -> list[str]:
+def _list_router_addresses(lab: LabPlan) -> list[str]:
     """Return the addresses of the routers, or none if one of them is a name."""
     addresses = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
     try:

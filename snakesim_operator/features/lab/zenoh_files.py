@@ -4,15 +4,15 @@ from typing import Any
 
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.features.lab.access import MAX_ENVELOPE_BYTES, make_access_control, make_size_limits
-from snakesim_operator.features.lab.identities import Identity
-from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, Lab
+from snakesim_operator.features.lab.identities import CertificateIdentity
+from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, LabPlan
 
 NO_SCOUTING = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
 TIMESTAMPS = {"enabled": {"router": True, "peer": True, "client": True}}
 LINK_LEASE_MS = 2000  # after which a silent link is closed
 
 
-def make_router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
+def make_router_settings(identity: CertificateIdentity, lab: LabPlan) -> dict[str, Any]:
     """Return the Zenoh configuration of a router, with certificates, access rules and limits of message sizes.
 
     The router listens with TLS on its machine's address, requires a certificate of every client, and enforces the
@@ -49,7 +49,7 @@ def make_router_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
     }
 
 
-def make_session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
+def make_session_settings(identity: CertificateIdentity, lab: LabPlan) -> dict[str, Any]:
     """Return the settings of a session of one role: a client of the routers that does not listen."""
     folder = f"{lab.file.machines[identity.machine].folder}/tls"
     settings: dict[str, Any] = {
@@ -78,7 +78,7 @@ def _make_link_settings(tls: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def make_tls_paths(identity: Identity, folder: str, side: str) -> dict[str, Any]:
+def make_tls_paths(identity: CertificateIdentity, folder: str, side: str) -> dict[str, Any]:
     """Return the paths of an identity's certificate files for Zenoh. `side` is `listen` or `connect`."""
     return {
         "root_ca_certificate": f"{folder}/authority.pem",

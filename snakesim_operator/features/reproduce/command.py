@@ -7,9 +7,9 @@ from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_operator.base.worker_pool import WorkerPool
 from snakesim_operator.features.reproduce.comparison_text import describe_lines, list_lines, make_entry, make_record
-from snakesim_operator.features.reproduce.experiment import Experiment, Findings
+from snakesim_operator.features.reproduce.experiment import Experiment, ExperimentFindings
 from snakesim_operator.features.reproduce.experiments import EXPERIMENTS
-from snakesim_operator.features.reproduce.trials import Trials
+from snakesim_operator.features.reproduce.trials import ExperimentTrials
 
 ALL = "all"
 
@@ -63,15 +63,15 @@ def reproduce(
 
 def run_experiments(
     experiments: Sequence[Experiment], *, seeds: int, workers: int | None, is_quick: bool = False
-) -> Iterator[tuple[Experiment, Findings]]:
+) -> Iterator[tuple[Experiment, ExperimentFindings]]:
     """Run experiments one after the other, and yield what each found."""
     with WorkerPool(workers) as pool:
-        trials = Trials(pool, seeds, is_quick=is_quick)
+        trials = ExperimentTrials(pool, seeds, is_quick=is_quick)
         for experiment in experiments:
             yield experiment, experiment.run(trials)
 
 
-def write_experiment_picture(experiment: Experiment, findings: Findings, folder: Path) -> Path:
+def write_experiment_picture(experiment: Experiment, findings: ExperimentFindings, folder: Path) -> Path:
     """Write the picture of an experiment into a folder, and return its path. Raises ConfigError if that fails."""
     from snakesim_operator.features.reproduce.picture import write_picture
 

@@ -6,7 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_operator.features.reproduce.experiment import Comparison, Experiment, Findings, Reason
+from snakesim_operator.features.reproduce.experiment import (
+    DifferenceReason,
+    Experiment,
+    ExperimentFindings,
+    PublishedComparison,
+)
 
 WIDTH = 100
 LABEL_WIDTH = 12
@@ -24,7 +29,7 @@ def list_lines(experiments: Sequence[Experiment]) -> Iterator[str]:
         yield f"{experiment.name:<{width}}  {experiment.source.year}  {experiment.source.short_text}"
 
 
-def describe_lines(experiment: Experiment, findings: Findings) -> Iterator[str]:
+def describe_lines(experiment: Experiment, findings: ExperimentFindings) -> Iterator[str]:
     """Yield what an experiment states and found, line by line."""
     source = experiment.source
     yield experiment.name
@@ -59,7 +64,7 @@ def _labeled(label: str, text: str, indent: int = 0) -> list[str]:
     return textwrap.wrap(text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first))
 
 
-def describe_ours(comparison: Comparison) -> str:
+def describe_ours(comparison: PublishedComparison) -> str:
     """Return our value, with its interval and the number of runs."""
     text = format_value(comparison.ours)
     if comparison.interval is not None:
@@ -68,7 +73,7 @@ def describe_ours(comparison: Comparison) -> str:
     return f"{text} ({comparison.runs} run{'s' if comparison.runs > 1 else ''})"
 
 
-def describe_difference(comparison: Comparison) -> str:
+def describe_difference(comparison: PublishedComparison) -> str:
     """Return ours minus the published value, also in percent; for texts whether they are the same."""
     difference = comparison.difference
     if difference is None:
@@ -79,7 +84,7 @@ def describe_difference(comparison: Comparison) -> str:
     return text
 
 
-def format_effect(reason: Reason) -> str:
+def format_effect(reason: DifferenceReason) -> str:
     """Return the effect of a reason on our value."""
     if reason.effect is None:
         return "unknown"
@@ -101,7 +106,7 @@ def format_unit(unit: str) -> str:
     return "" if unit in ("", "1") else f" [{unit}]"
 
 
-def make_record(experiment: Experiment, findings: Findings) -> dict[str, Any]:
+def make_record(experiment: Experiment, findings: ExperimentFindings) -> dict[str, Any]:
     """Return what an experiment states and found, for JSON."""
     comparisons = [
         {

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from snakesim_operator.features.reproduce.trials import Trials
+from snakesim_operator.features.reproduce.trials import ExperimentTrials
 
 Basis = Literal["printed", "formula", "model"]
 """What a published value is: a value that the source prints, a formula of the source that we evaluate, or equations of
@@ -16,7 +16,7 @@ the source that we solve.
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class PublishedSource:
     """Where a published value is from."""
 
     authors: str
@@ -33,7 +33,7 @@ class Source:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class PublishedComparison:
     """A published value and ours."""
 
     quantity: str
@@ -60,7 +60,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reason:
+class DifferenceReason:
     """A reason for a difference between the published value and ours."""
 
     cause: str
@@ -69,7 +69,7 @@ class Reason:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Curve:
+class PictureCurve:
     """A curve of the picture of an experiment."""
 
     label: str
@@ -79,22 +79,22 @@ class Curve:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
+class ExperimentPicture:
     """The picture of an experiment: curves over one quantity."""
 
     x_label: str
     y_label: str
-    curves: Sequence[Curve]
+    curves: Sequence[PictureCurve]
     is_logarithmic: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class Findings:
+class ExperimentFindings:
     """What one experiment found."""
 
-    comparisons: Sequence[Comparison]
-    reasons: Sequence[Reason]
-    picture: Picture
+    comparisons: Sequence[PublishedComparison]
+    reasons: Sequence[DifferenceReason]
+    picture: ExperimentPicture
     notes: Sequence[str] = field(default=())
 
 
@@ -104,7 +104,7 @@ class Experiment(ABC):
     name: ClassVar[str]
     """What the command calls it."""
 
-    source: ClassVar[Source]
+    source: ClassVar[PublishedSource]
     """Where the published value is from."""
 
     claim: ClassVar[str]
@@ -123,7 +123,7 @@ class Experiment(ABC):
     """Whether noise of the sensors changes the motion. Gaits without feedback move alike with every seed."""
 
     @abstractmethod
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Repeat the experiment.
 
         Args:
@@ -131,7 +131,7 @@ class Experiment(ABC):
         """
 
 
-def explain_by_steps(values: Sequence[tuple[str, float]], unit: str, rest: str) -> list[Reason]:
+def explain_by_steps(values: Sequence[tuple[str, float]], unit: str, rest: str) -> list[DifferenceReason]:
     """Return the reasons of a difference from values that come closer to the simulator step by step.
 
     Args:
@@ -140,13 +140,13 @@ def explain_by_steps(values: Sequence[tuple[str, float]], unit: str, rest: str) 
         unit: Unit of the values.
         rest: What may be the cause of the last difference.
     """
-    reasons: list[Reason] = []
+    reasons: list[DifferenceReason] = []
     previous = values[0][1]
     for cause, value in values[1:-1]:
-        reasons.append(Reason(cause=cause, effect=value - previous, unit=unit))
+        reasons.append(DifferenceReason(cause=cause, effect=value - previous, unit=unit))
         previous = value
     last = values[-1][1] - previous
-    reasons.append(Reason(cause=f"Unknown, possibly {rest}.", effect=last, unit=unit))
+    reasons.append(DifferenceReason(cause=f"Unknown, possibly {rest}.", effect=last, unit=unit))
     return reasons
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.friction import DirectionalFriction, Viscous, compute_surface_friction
+from snakesim_hal.model.friction import DirectionalFriction, ViscousFriction, compute_surface_friction
 from snakesim_hal.model.kinematics import ForwardKinematics
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.solids import GRAVITY_M_S2
@@ -33,7 +33,7 @@ class GroundFriction:
         ground = config.scene.ground
         robot = config.robot
         dry = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels)
-        viscous = ground.viscous or Viscous(along_s_per_m=0.0, across_s_per_m=0.0)
+        viscous = ground.viscous or ViscousFriction(along_s_per_m=0.0, across_s_per_m=0.0)
         return GroundFriction(dry, viscous.along_s_per_m, viscous.across_s_per_m)
 
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from snakesim_hal.model.textfiles import export_atomically
-from snakesim_operator.features.reproduce.experiment import Picture
+from snakesim_operator.features.reproduce.experiment import ExperimentPicture
 
 SIZE_IN = (5.0, 3.2)
 DPI = 110
@@ -25,7 +25,7 @@ OUR_COLORS = ("#c0392b", "#d98c1f", "#2aa0a4")
 OUR_MARKERS = ("o", "s", "^")
 
 
-def write_picture(picture: Picture, title: str, path: Path) -> None:
+def write_picture(picture: ExperimentPicture, title: str, path: Path) -> None:
     """Write a picture as PNG.
 
     Args:

@@ -107,7 +107,7 @@ def measure_gait_run(run: GaitRun) -> GaitMotion:
     return measure_gait(simulate(run.config).record, run.period_s, SKIPPED_PERIODS)
 
 
-class Trials:
+class ExperimentTrials:
     """Runs the trials of experiments on workers of this computer."""
 
     def __init__(self, pool: WorkerPool, seeds: int, *, is_quick: bool = False) -> None:

@@ -13,8 +13,8 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable
 from snakesim_hal.model.links import compute_capsule_inertia
 from snakesim_operator.features.robots.imported import VECTOR_BY_UP_AXIS, ImportOptions, ImportResult
-from snakesim_operator.features.robots.urdf_tree import Body, BodyChain, UrdfJoint
-from snakesim_operator.features.robots.xml_tree import Element
+from snakesim_operator.features.robots.urdf_tree import BodyChain, UrdfBody, UrdfJoint
+from snakesim_operator.features.robots.xml_tree import XmlElement
 
 LENGTH_DIGITS = 9  # lengths are rounded to a nanometer, which removes the noise of adding transforms
 VALUE_DIGITS = 10  # significant digits of masses and inertias
@@ -29,7 +29,7 @@ MIN_MASS_KG = 0.001
 MOMENT_INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
 
 
-def convert_body(result: ImportResult, chain: BodyChain, options: ImportOptions, urdf: Element) -> list[Floats]:
+def convert_body(result: ImportResult, chain: BodyChain, options: ImportOptions, urdf: XmlElement) -> list[Floats]:
     """Convert the bodies of a URDF into chain, module and links of a robot file.
 
     Args:
@@ -80,7 +80,7 @@ def convert_body(result: ImportResult, chain: BodyChain, options: ImportOptions,
     return link_frames
 
 
-def _find_body_axes(chain: BodyChain, options: ImportOptions, urdf: Element) -> Floats:
+def _find_body_axes(chain: BodyChain, options: ImportOptions, urdf: XmlElement) -> Floats:
     """Return body_from_root, (3, 3): x from tail to head, z up. Raises ConfigError."""
     along = chain.joints[-1].origin - chain.joints[0].origin
     if np.linalg.norm(along) < 1e-9:
@@ -99,7 +99,7 @@ def _find_body_axes(chain: BodyChain, options: ImportOptions, urdf: Element) -> 
     return np.vstack([x, np.cross(z, x), z])
 
 
-def _validate_joint_distance(chain: BodyChain, joints_x: Floats, gap_m: float, urdf: Element) -> None:
+def _validate_joint_distance(chain: BodyChain, joints_x: Floats, gap_m: float, urdf: XmlElement) -> None:
     """Raise ConfigError when the joints are so far apart that the unit of length must be wrong."""
     if gap_m <= MAX_JOINT_DISTANCE_M:
         return
@@ -192,7 +192,7 @@ def _validate_joint_on_line(
         )
 
 
-def _transform_outline(body: Body, body_from_root: Floats, line_b: Floats, scale: float) -> Floats | None:
+def _transform_outline(body: UrdfBody, body_from_root: Floats, line_b: Floats, scale: float) -> Floats | None:
     """Return the outline of a body, (n, 3): x along the robot, y and z from the line through the joints.
 
     None means that the body has no geometry.
@@ -215,7 +215,7 @@ def _report_shapes(result: ImportResult, chain: BodyChain, radius_m: float, scal
             )
 
 
-def _is_capsule(body: Body, radius: float) -> bool:
+def _is_capsule(body: UrdfBody, radius: float) -> bool:
     """Return whether the shapes of a body are an exported capsule of this radius: a cylinder and two spheres."""
     if sorted(shape.tag for shape in body.shapes) != ["cylinder", "sphere", "sphere"]:
         return False
@@ -338,7 +338,7 @@ def _measure_end_link_length(
 
 
 def _convert_link(
-    result: ImportResult, index: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
+    result: ImportResult, index: int, body: UrdfBody, frame: Floats, length_m: float, radius_m: float, scale: float
 ) -> dict[str, Any]:
     """Convert a body into the entry of a link in [[links]] of the robot file.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.files import ConfigTable, decode_table
 from snakesim_hal.model.robot import RobotFile
-from snakesim_operator.features.robots.xml_tree import Element
+from snakesim_operator.features.robots.xml_tree import XmlElement
 
 VECTOR_BY_UP_AXIS = {
     "x": (1, 0, 0),
@@ -109,7 +109,7 @@ class ImportResult:
         """
         return decode_table(self.table, RobotFile)
 
-    def make_plain_name(self, name: str, default: str, element: Element) -> str:
+    def make_plain_name(self, name: str, default: str, element: XmlElement) -> str:
         """Return a name as a robot file may have it. A change is reported.
 
         Args:

@@ -6,8 +6,8 @@ and friction come from the URDF. What URDF cannot express comes from the <snakes
 export` writes, or else from another robot file.
 
 No value of the file is dropped and none is taken from elsewhere without a line in the report. That holds by
-construction: elements and attributes that no function has read are reported (`Element.iterate_unused`), and so is every
-default that stands in for something absent (`Element.note_absent`).
+construction: elements and attributes that no function has read are reported (`XmlElement.iterate_unused`), and so is
+every default that stands in for something absent (`XmlElement.note_absent`).
 """
 
 import json
@@ -26,7 +26,7 @@ from snakesim_operator.features.robots.joint_limits import convert_joint_limits
 from snakesim_operator.features.robots.unused_parts import report_unused
 from snakesim_operator.features.robots.urdf_sensors import convert_sensors, format_gazebo_elements
 from snakesim_operator.features.robots.urdf_tree import read_body_chain
-from snakesim_operator.features.robots.xml_tree import Element, parse_xml
+from snakesim_operator.features.robots.xml_tree import XmlElement, parse_xml
 
 SECTION_ORDER = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
 UNSHARED_SECTIONS = ("links", "joints", "checked")  # of `--like`: they do not describe this one
@@ -86,7 +86,7 @@ def _sort_sections(table: ConfigTable) -> None:
     table.values = {name: table.values[name] for name in names}
 
 
-def _set_robot_name(result: ImportResult, urdf: Element, file: Path) -> None:
+def _set_robot_name(result: ImportResult, urdf: XmlElement, file: Path) -> None:
     """Put the name of the robot; without one, that of the file."""
     name = urdf.read_optional_attribute("name")
     if name is None:
@@ -105,7 +105,7 @@ def _report_shipped_name(result: ImportResult) -> None:
         )
 
 
-def _read_values_of_similar_robot(urdf: Element, options: ImportOptions) -> ConfigTable:
+def _read_values_of_similar_robot(urdf: XmlElement, options: ImportOptions) -> ConfigTable:
     """Return the values of the robot file `--like`, without those that describe that robot only."""
     table = read_table_with_base(options.like, "robots")
     for section in UNSHARED_SECTIONS:
@@ -116,7 +116,7 @@ def _read_values_of_similar_robot(urdf: Element, options: ImportOptions) -> Conf
     return table
 
 
-def _read_exported_values(urdf: Element) -> ConfigTable:
+def _read_exported_values(urdf: XmlElement) -> ConfigTable:
     """Return the values in <snakesim> elements, as an export has written them. Raises ConfigError."""
     table = ConfigTable({}, urdf.source)
     read_keys: set[str] = set()
@@ -160,7 +160,7 @@ def _report_values_of_similar_robot(result: ImportResult, options: ImportOptions
         result.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")
 
 
-def _mark_exported_as_read(urdf: Element, robot: RobotFile) -> None:
+def _mark_exported_as_read(urdf: XmlElement, robot: RobotFile) -> None:
     """Mark as read what `snakesim robot export` derives from the same values, so that only edits are reported."""
     text = "".join(["<robot>", MATERIAL_ELEMENT, *format_gazebo_elements(robot), "</robot>"])
     exported = parse_xml(text.encode(), urdf.source)
@@ -175,7 +175,7 @@ def _mark_exported_as_read(urdf: Element, robot: RobotFile) -> None:
             _mark_material_as_read(visual_or_collision, exported_material)
 
 
-def _mark_material_as_read(parent: Element, exported: Element) -> None:
+def _mark_material_as_read(parent: XmlElement, exported: XmlElement) -> None:
     """Mark a reference to the exported material as read."""
     for child in parent.children:
         if child.tag == "material" and child.attributes == exported.attributes and not child.children:

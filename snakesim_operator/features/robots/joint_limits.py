@@ -14,7 +14,7 @@ from snakesim_hal.model.joints import Joint as BuiltJoint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.urdf_tree import UrdfJoint
-from snakesim_operator.features.robots.xml_tree import Element
+from snakesim_operator.features.robots.xml_tree import XmlElement
 
 MAX_LIMIT_RAD = 6.2832  # one revolution; a larger number must be in degrees
 
@@ -124,7 +124,7 @@ def _read_angle_range(result: ImportResult, joint: UrdfJoint, is_negated: bool) 
     return AngleRange(lower_rad, upper_rad)
 
 
-def _read_limit_rad(result: ImportResult, joint: UrdfJoint, limit: Element, attribute: str) -> float:
+def _read_limit_rad(result: ImportResult, joint: UrdfJoint, limit: XmlElement, attribute: str) -> float:
     """Read one end of a joint's angle range in rad, cut to half a revolution.
 
     Args:

@@ -10,13 +10,13 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_operator.features.robots.imported import ReportNotes
 from snakesim_operator.features.robots.meshes import find_mesh_file, read_mesh_vertices
-from snakesim_operator.features.robots.xml_tree import Element
+from snakesim_operator.features.robots.xml_tree import XmlElement
 
 RIM_POINTS = 32  # of a cylinder
 
 
 @dataclass(frozen=True)
-class Shape:
+class UrdfShape:
     """A shape with its sizes, in the file's unit of length."""
 
     kind: str
@@ -24,7 +24,7 @@ class Shape:
     mesh: str = ""  # the name of its file
 
 
-def read_shape(element: Element) -> Shape:
+def read_shape(element: XmlElement) -> UrdfShape:
     """Read the shape in a <geometry> element: a box, cylinder, capsule, sphere or mesh with its sizes.
 
     Args:
@@ -35,25 +35,25 @@ def read_shape(element: Element) -> Shape:
     """
     match element.tag:
         case "box":
-            return Shape("box", _require_positive(element, "size", element.read_numbers("size", 3)))
+            return UrdfShape("box", _require_positive(element, "size", element.read_numbers("size", 3)))
         case "cylinder" | "capsule":
             radius = _require_positive(element, "radius", [element.read_number("radius")])
             length = _require_positive(element, "length", [element.read_number("length")])
-            return Shape(element.tag, radius + length)
+            return UrdfShape(element.tag, radius + length)
         case "sphere":
-            return Shape("sphere", _require_positive(element, "radius", [element.read_number("radius")]))
+            return UrdfShape("sphere", _require_positive(element, "radius", [element.read_number("radius")]))
         case "mesh":
             scale = element.read_numbers("scale", 3, "1 1 1")
             if not all(1e-12 < abs(factor) < 1e12 for factor in scale):
                 raise element.make_error(
                     f"has `scale` = {element.read_attribute('scale')!r}; expected factors that are not 0"
                 )
-            return Shape("mesh", scale, element.read_attribute("filename"))
+            return UrdfShape("mesh", scale, element.read_attribute("filename"))
         case _:
             raise element.make_error("is no shape of URDF: box, cylinder, sphere or mesh")
 
 
-def sample_outline(shape: Shape, element: Element, file: Path, omissions: ReportNotes) -> Floats | None:
+def sample_outline(shape: UrdfShape, element: XmlElement, file: Path, omissions: ReportNotes) -> Floats | None:
     """Sample points whose convex hull encloses a shape.
 
     Args:
@@ -78,7 +78,7 @@ def sample_outline(shape: Shape, element: Element, file: Path, omissions: Report
             return _read_mesh_points(shape, element, file, omissions)
 
 
-def _require_positive(element: Element, attribute: str, sizes: list[float]) -> list[float]:
+def _require_positive(element: XmlElement, attribute: str, sizes: list[float]) -> list[float]:
     """Return the sizes. Raises ConfigError unless all of them are above 0."""
     if not all(0 < size < 1e9 for size in sizes):
         raise element.make_error(f"has `{attribute}` = {element.read_attribute(attribute)!r}; expected sizes above 0")
@@ -111,7 +111,7 @@ def _sample_sphere(radius: float) -> Floats:
     return radius * np.vstack([in_xy, in_xz, in_yz])
 
 
-def _read_mesh_points(shape: Shape, element: Element, file: Path, omissions: ReportNotes) -> Floats | None:
+def _read_mesh_points(shape: UrdfShape, element: XmlElement, file: Path, omissions: ReportNotes) -> Floats | None:
     """Return the vertices of a mesh file, or None, with a note, if it cannot be read."""
     path = find_mesh_file(shape.mesh, file)
     try:

@@ -2,14 +2,14 @@
 
 from snakesim_hal.base.errors import shorten
 from snakesim_operator.features.robots.imported import ReportNotes, join_places
-from snakesim_operator.features.robots.xml_tree import Element, UnusedPart
+from snakesim_operator.features.robots.xml_tree import UnusedPart, XmlElement
 
 MAX_VALUE = 200  # characters that are shown of one value
 LOOKS_HEADING = "looks, which change nothing in a run: "
 LOOK_PREFIXES = ("<visual", "<material")  # how a path continues that changes nothing in a run
 
 
-def report_unused(omissions: ReportNotes, urdf: Element) -> None:
+def report_unused(omissions: ReportNotes, urdf: XmlElement) -> None:
     """Report every value that no function has read: first what may matter, then how the robot looks."""
     unused = list(urdf.iterate_unused())
     looks = [part for part in unused if _is_only_appearance(part)]

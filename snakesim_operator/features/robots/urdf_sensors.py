@@ -16,7 +16,7 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import DepthCamera, RangeSensor
 from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.urdf_tree import BodyChain, make_rotation_from_rpy
-from snakesim_operator.features.robots.xml_tree import Element
+from snakesim_operator.features.robots.xml_tree import XmlElement
 
 SECTION_BY_SENSOR_TYPE = {"imu": "imu", "contact": "contacts"}  # Gazebo's type -> its section in [sensors]
 DEPTH_SENSOR_TYPES = ("depth", "depth_camera", "rgbd_camera")
@@ -34,7 +34,7 @@ DEFAULT_RATE_HZ_BY_SECTION = {
 
 
 def convert_sensors(
-    result: ImportResult, urdf: Element, chain: BodyChain, link_frames: list[Floats], scale: float
+    result: ImportResult, urdf: XmlElement, chain: BodyChain, link_frames: list[Floats], scale: float
 ) -> None:
     """Convert the sensors of a URDF into values of a robot file, and report those that a robot file cannot hold.
 
@@ -68,7 +68,7 @@ def convert_sensors(
 
 
 def _report_unsupported_sensor(
-    result: ImportResult, gazebo: Element, sensor: Element, kind: str, reference: str
+    result: ImportResult, gazebo: XmlElement, sensor: XmlElement, kind: str, reference: str
 ) -> None:
     known = ", ".join((*SECTION_BY_SENSOR_TYPE, *DEPTH_SENSOR_TYPES, *RANGE_SENSOR_TYPES))
     result.omissions.add(
@@ -79,7 +79,7 @@ def _report_unsupported_sensor(
     )
 
 
-def _add_sensor_of_all_links(result: ImportResult, sensor: Element, section: str, reference: str) -> None:
+def _add_sensor_of_all_links(result: ImportResult, sensor: XmlElement, section: str, reference: str) -> None:
     """Add an IMU or a contact sensor, which a robot file has on every link."""
     sensor.read_optional_attribute("type")
     name = sensor.read_optional_attribute("name") or ""
@@ -95,7 +95,7 @@ def _add_sensor_of_all_links(result: ImportResult, sensor: Element, section: str
 
 
 def _add_sensor_of_one_link(
-    result: ImportResult, sensor: Element, link_index: int, link_from_reference: Floats, scale: float
+    result: ImportResult, sensor: XmlElement, link_index: int, link_from_reference: Floats, scale: float
 ) -> None:
     """Convert a depth camera or a lidar with its pose on a link, and add it to the values of the robot file.
 
@@ -125,7 +125,7 @@ def _add_sensor_of_one_link(
     result.table.set_value(f"sensors.{section}", [*existing, values], sensor.source)
 
 
-def _read_rate(result: ImportResult, sensor: Element, section: str) -> dict[str, Any]:
+def _read_rate(result: ImportResult, sensor: XmlElement, section: str) -> dict[str, Any]:
     """Return `rate_hz` of a sensor; nothing if the file gives none or 0. Then the robot file's rate is reported."""
     element = sensor.find_child("update_rate")
     rate_hz = 0.0 if element is None else element.read_text_numbers(1)[0]
@@ -143,7 +143,7 @@ def _read_rate(result: ImportResult, sensor: Element, section: str) -> dict[str,
     return {}
 
 
-def _read_pose(sensor: Element) -> Floats:
+def _read_pose(sensor: XmlElement) -> Floats:
     """Return the pose of a sensor in the frame of its link, (4, 4), in the file's unit of length."""
     element = sensor.find_child("pose")
     frame = np.eye(4)
@@ -163,7 +163,7 @@ def _scale_translation(frame: Floats, scale: float) -> Floats:
     return scaled
 
 
-def _convert_pose(result: ImportResult, link_from_sensor: Floats, sensor: Element) -> dict[str, Any]:
+def _convert_pose(result: ImportResult, link_from_sensor: Floats, sensor: XmlElement) -> dict[str, Any]:
     """Convert the pose of a sensor on its link into position, yaw and pitch, as a robot file has it.
 
     A roll is reported, because a robot file has none.
@@ -197,7 +197,7 @@ def _convert_pose(result: ImportResult, link_from_sensor: Floats, sensor: Elemen
     }
 
 
-def _read_camera(result: ImportResult, sensor: Element) -> dict[str, Any]:
+def _read_camera(result: ImportResult, sensor: XmlElement) -> dict[str, Any]:
     """Return color, field of view, size, range and noise of a depth camera."""
     values: dict[str, Any] = {"color": sensor.attributes["type"] == "rgbd_camera"}
     camera = sensor.find_child("camera")
@@ -216,7 +216,7 @@ def _read_camera(result: ImportResult, sensor: Element) -> dict[str, Any]:
     return values
 
 
-def _read_lidar(result: ImportResult, sensor: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+def _read_lidar(result: ImportResult, sensor: XmlElement, mounted_yaw_rad: float) -> dict[str, Any]:
     """Read beams, field of view, range and noise of a lidar.
 
     The scan in a robot file is symmetric about the viewing direction. An asymmetric scan is converted to a symmetric
@@ -248,7 +248,7 @@ def _read_lidar(result: ImportResult, sensor: Element, mounted_yaw_rad: float) -
     return values
 
 
-def _read_scan(result: ImportResult, horizontal: Element, mounted_yaw_rad: float) -> dict[str, Any]:
+def _read_scan(result: ImportResult, horizontal: XmlElement, mounted_yaw_rad: float) -> dict[str, Any]:
     """Read beams and field of view of a scan; also the sensor's yaw if the scan is not symmetric.
 
     Args:
@@ -278,7 +278,7 @@ def _read_scan(result: ImportResult, horizontal: Element, mounted_yaw_rad: float
     return values
 
 
-def _read_whole_number(element: Element, tag: str, default: int) -> int:
+def _read_whole_number(element: XmlElement, tag: str, default: int) -> int:
     """Return the number in a child. Raises ConfigError for a fraction."""
     value = element.read_child_number(tag, default)
     if value != int(value):
@@ -286,7 +286,7 @@ def _read_whole_number(element: Element, tag: str, default: int) -> int:
     return int(value)
 
 
-def _read_distance_range(owner: Element, tag: str, min_tag: str, max_tag: str, default: str) -> dict[str, Any]:
+def _read_distance_range(owner: XmlElement, tag: str, min_tag: str, max_tag: str, default: str) -> dict[str, Any]:
     """Read the range of a sensor in m. `default` is the text for the range that is assumed if the file has none."""
     element = owner.find_child(tag)
     if element is None:
@@ -298,7 +298,7 @@ def _read_distance_range(owner: Element, tag: str, min_tag: str, max_tag: str, d
     }
 
 
-def _read_noise(result: ImportResult, element: Element) -> dict[str, Any]:
+def _read_noise(result: ImportResult, element: XmlElement) -> dict[str, Any]:
     """Read the standard deviation of a sensor's Gaussian noise in m.
 
     Args:

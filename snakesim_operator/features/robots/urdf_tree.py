@@ -14,7 +14,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.shapes import read_shape, sample_outline
-from snakesim_operator.features.robots.xml_tree import Element
+from snakesim_operator.features.robots.xml_tree import XmlElement
 
 ROTARY_JOINT_TYPES = ("revolute", "continuous")
 MAX_COORDINATE = 1e6  # of an origin, in the file's unit of length
@@ -24,7 +24,7 @@ MOMENT_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass
-class Body:
+class UrdfBody:
     """A rigid body: links that move as one. Lengths are in the file's unit."""
 
     # The links.
@@ -36,12 +36,12 @@ class Body:
     mass_kg: float = 0.0
     first_moment: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) sum of mass times center of mass
     inertia_about_root: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # (3, 3) about the root's origin
-    masses: list[Element] = field(default_factory=list[Element])  # the <mass> elements that were summed
-    inertias: list[Element] = field(default_factory=list[Element])  # the <inertia> elements that were summed
+    masses: list[XmlElement] = field(default_factory=list[XmlElement])  # the <mass> elements that were summed
+    inertias: list[XmlElement] = field(default_factory=list[XmlElement])  # the <inertia> elements that were summed
 
     # Outline.
     points: list[Floats] = field(default_factory=list[Floats])  # of each shape, (n, 3)
-    shapes: list[Element] = field(default_factory=list[Element])  # that have these points
+    shapes: list[XmlElement] = field(default_factory=list[XmlElement])  # that have these points
 
     def add_mass(self, mass_kg: float, center: Floats, inertia: Floats) -> None:
         """Add the mass of a link, by the parallel axis theorem: I += J + m (c·c E - c c^T).
@@ -71,7 +71,7 @@ class Body:
 class UrdfJoint:
     """A rotary joint between two neighboring bodies of the chain."""
 
-    element: Element
+    element: XmlElement
     name: str
     origin: Floats  # (3,)
     axis: Floats  # (3,), about which the front body turns against the rear one for a positive angle
@@ -90,12 +90,12 @@ class UrdfJoint:
 class BodyChain:
     """The rigid bodies of a snake from tail to head, and the joints between neighbors."""
 
-    bodies: list[Body]
+    bodies: list[UrdfBody]
     joints: list[UrdfJoint]
 
 
 @dataclass(frozen=True)
-class _Connection:
+class _JointConnection:
     """A rotary joint of the tree, and the links on both sides of it."""
 
     parent: str
@@ -109,10 +109,10 @@ class _LinkTree:
 
     frames: dict[str, Floats]  # root_from_link, (4, 4)
     body_of: dict[str, str]  # link -> the first link of its body
-    connections: list[_Connection] = field(default_factory=list[_Connection])
+    connections: list[_JointConnection] = field(default_factory=list[_JointConnection])
 
 
-def read_body_chain(result: ImportResult, urdf: Element, file: Path, *, tail: str | None) -> BodyChain:
+def read_body_chain(result: ImportResult, urdf: XmlElement, file: Path, *, tail: str | None) -> BodyChain:
     """Read the bodies and rotary joints of a URDF, and order them from tail to head.
 
     Links that fixed joints connect become one body, with the sum of their masses and all their outlines.
@@ -129,10 +129,10 @@ def read_body_chain(result: ImportResult, urdf: Element, file: Path, *, tail: st
     links = _index_elements_by_name(urdf, "link")
     joints = _index_elements_by_name(urdf, "joint")
     tree = _build_tree(result, urdf, links, joints)
-    bodies: dict[str, Body] = {}  # by the name of their first link
+    bodies: dict[str, UrdfBody] = {}  # by the name of their first link
     for name, element in links.items():
         root_from_link = tree.frames[name]
-        body = bodies.setdefault(tree.body_of[name], Body())
+        body = bodies.setdefault(tree.body_of[name], UrdfBody())
         body.links.append(name)
         body.link_places.append(element.place)
         body.frames[name] = root_from_link
@@ -141,9 +141,9 @@ def read_body_chain(result: ImportResult, urdf: Element, file: Path, *, tail: st
     return _order_bodies_from_tail(bodies, tree, tail, urdf)
 
 
-def _index_elements_by_name(urdf: Element, tag: str) -> dict[str, Element]:
+def _index_elements_by_name(urdf: XmlElement, tag: str) -> dict[str, XmlElement]:
     """Return the elements of a tag by their names. Raises ConfigError for a name that two of them have."""
-    elements: dict[str, Element] = {}
+    elements: dict[str, XmlElement] = {}
     for element in urdf.find_children(tag):
         name = element.read_attribute("name")
         if name in elements:
@@ -152,7 +152,7 @@ def _index_elements_by_name(urdf: Element, tag: str) -> dict[str, Element]:
     return elements
 
 
-def read_origin(owner: Element) -> Floats:
+def read_origin(owner: XmlElement) -> Floats:
     """Return parent_from_child, (4, 4), of the <origin> of an element; without one it is the identity.
 
     Raises:
@@ -188,7 +188,7 @@ def make_rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
 
 
 def _build_tree(
-    result: ImportResult, urdf: Element, links: dict[str, Element], joints: dict[str, Element]
+    result: ImportResult, urdf: XmlElement, links: dict[str, XmlElement], joints: dict[str, XmlElement]
 ) -> _LinkTree:
     """Build the tree of links: follow the joints from the root link, and compute the frame of every link.
 
@@ -202,7 +202,7 @@ def _build_tree(
         ConfigError: The links are no tree, or a joint has a type that no snake has.
     """
     parent_by_child: dict[str, str] = {}  # child link -> parent link
-    joints_by_parent: dict[str, list[tuple[str, Element]]] = {}  # parent link -> child links with their joints
+    joints_by_parent: dict[str, list[tuple[str, XmlElement]]] = {}  # parent link -> child links with their joints
     for joint in joints.values():
         parent = _read_joint_link(joint, "parent", links)
         child = _read_joint_link(joint, "child", links)
@@ -228,7 +228,7 @@ def _build_tree(
     return tree
 
 
-def _find_root(urdf: Element, links: dict[str, Element], parent_of: dict[str, str]) -> str:
+def _find_root(urdf: XmlElement, links: dict[str, XmlElement], parent_of: dict[str, str]) -> str:
     """Return the only link without a parent. Raises ConfigError when there is none, or several."""
     roots = [name for name in links if name not in parent_of]
     if len(roots) == 1:
@@ -237,7 +237,7 @@ def _find_root(urdf: Element, links: dict[str, Element], parent_of: dict[str, st
     raise urdf.make_error(f"needs one link without a parent, and has {len(roots)}{names}")
 
 
-def _read_joint_link(joint: Element, tag: str, links: dict[str, Element]) -> str:
+def _read_joint_link(joint: XmlElement, tag: str, links: dict[str, XmlElement]) -> str:
     """Return the link at one end of a joint. Raises ConfigError for a link that does not exist."""
     end = joint.find_child(tag)
     name = "" if end is None else end.read_attribute("link")
@@ -247,7 +247,7 @@ def _read_joint_link(joint: Element, tag: str, links: dict[str, Element]) -> str
 
 
 def _add_joint(
-    result: ImportResult, tree: _LinkTree, element: Element, parent: str, child: str, *, is_only_joint_of_root: bool
+    result: ImportResult, tree: _LinkTree, element: XmlElement, parent: str, child: str, *, is_only_joint_of_root: bool
 ) -> None:
     """Add the child link of a joint with its frame to the tree, and the joint itself if it rotates.
 
@@ -278,7 +278,7 @@ def _add_joint(
     tree.frames[child] = root_from_joint
     if joint_type in ROTARY_JOINT_TYPES:
         tree.body_of[child] = child
-        tree.connections.append(_Connection(parent, child, _read_joint(result, element, root_from_joint)))
+        tree.connections.append(_JointConnection(parent, child, _read_joint(result, element, root_from_joint)))
     elif joint_type == "fixed":
         tree.body_of[child] = tree.body_of[parent]
         result.changes.add("fixed joints: the links on both sides became one", element.place)
@@ -288,7 +288,7 @@ def _add_joint(
         )
 
 
-def _read_joint(result: ImportResult, element: Element, frame: Floats) -> UrdfJoint:
+def _read_joint(result: ImportResult, element: XmlElement, frame: Floats) -> UrdfJoint:
     """Read a rotary joint. Raises ConfigError for one that mimics another, and for an axis without direction.
 
     frame: root_from_joint, (4, 4).
@@ -299,7 +299,7 @@ def _read_joint(result: ImportResult, element: Element, frame: Floats) -> UrdfJo
     return UrdfJoint(element, element.read_attribute("name"), frame[:3, 3], frame[:3, :3] @ axis)
 
 
-def _read_unit_axis(result: ImportResult, joint: Element) -> Floats:
+def _read_unit_axis(result: ImportResult, joint: XmlElement) -> Floats:
     """Read the axis of a joint in the joint's frame, (3,), and normalize it to length 1.
 
     Args:
@@ -328,7 +328,7 @@ def _read_unit_axis(result: ImportResult, joint: Element) -> Floats:
     return axis / length
 
 
-def _add_mass(result: ImportResult, body: Body, link: Element, root_from_link: Floats) -> None:
+def _add_mass(result: ImportResult, body: UrdfBody, link: XmlElement, root_from_link: Floats) -> None:
     """Add mass and inertia of a link to its body, which is all links that fixed joints connect.
 
     Args:
@@ -361,7 +361,7 @@ def _add_mass(result: ImportResult, body: Body, link: Element, root_from_link: F
     body.add_mass(mass_kg, center, rotation_matrix @ inertia @ rotation_matrix.T)
 
 
-def _read_moment(moments: Element, name: str) -> float:
+def _read_moment(moments: XmlElement, name: str) -> float:
     """Return a moment of inertia in the file's unit of length. Raises ConfigError for one that is too large."""
     value = moments.read_number(name, "0")
     if abs(value) > 1e15:
@@ -369,7 +369,7 @@ def _read_moment(moments: Element, name: str) -> float:
     return value
 
 
-def _add_shapes(result: ImportResult, body: Body, link: Element, root_from_link: Floats, file: Path) -> None:
+def _add_shapes(result: ImportResult, body: UrdfBody, link: XmlElement, root_from_link: Floats, file: Path) -> None:
     """Add the outline of a link to its body: that of <collision> or, without one, that of <visual>.
 
     Args:
@@ -401,7 +401,7 @@ def _add_shapes(result: ImportResult, body: Body, link: Element, root_from_link:
             body.shapes.append(shape)
 
 
-def _mark_repeated_visuals(visuals: list[Element], collisions: list[Element]) -> None:
+def _mark_repeated_visuals(visuals: list[XmlElement], collisions: list[XmlElement]) -> None:
     """Mark a <visual> as read where a <collision> repeats it, so that only its other values are reported."""
     for visual in visuals:
         if any(_have_same_shape(visual, collision) for collision in collisions):
@@ -411,7 +411,7 @@ def _mark_repeated_visuals(visuals: list[Element], collisions: list[Element]) ->
                     child.mark_all_as_read()
 
 
-def _have_same_shape(visual: Element, collision: Element) -> bool:
+def _have_same_shape(visual: XmlElement, collision: XmlElement) -> bool:
     """Return whether both have the same <origin> and <geometry>."""
     for tag in ("origin", "geometry"):
         of_visual = [child for child in visual.children if child.tag == tag]
@@ -423,7 +423,9 @@ def _have_same_shape(visual: Element, collision: Element) -> bool:
     return True
 
 
-def _order_bodies_from_tail(bodies: dict[str, Body], tree: _LinkTree, tail: str | None, urdf: Element) -> BodyChain:
+def _order_bodies_from_tail(
+    bodies: dict[str, UrdfBody], tree: _LinkTree, tail: str | None, urdf: XmlElement
+) -> BodyChain:
     """Order bodies and joints from tail to head, after a check that they are a chain.
 
     Args:
@@ -457,7 +459,7 @@ def _order_bodies_from_tail(bodies: dict[str, Body], tree: _LinkTree, tail: str 
 
 
 def _follow_chain(
-    bodies: dict[str, Body], neighbors: dict[str, list[tuple[str, UrdfJoint]]], first_body: str
+    bodies: dict[str, UrdfBody], neighbors: dict[str, list[tuple[str, UrdfJoint]]], first_body: str
 ) -> BodyChain:
     """Follow a chain from one of its ends, and return its bodies and joints in this order.
 
@@ -478,7 +480,7 @@ def _follow_chain(
         joints.append(joint)
 
 
-def _find_neighbors(bodies: dict[str, Body], tree: _LinkTree) -> dict[str, list[tuple[str, UrdfJoint]]]:
+def _find_neighbors(bodies: dict[str, UrdfBody], tree: _LinkTree) -> dict[str, list[tuple[str, UrdfJoint]]]:
     """Return the neighbors of each body, and the joints to them, as if the neighbor were in front of the body.
 
     A joint whose parent is in front turns the other way round, so its axis is negated.

@@ -20,7 +20,7 @@ class AbsentPart:
     """Something that an element leaves out, and the value that was taken in its place."""
 
     sentence: str
-    element: "Element"
+    element: "XmlElement"
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class UnusedPart:
 
 
 @dataclass
-class Element:
+class XmlElement:
     """An element with its line in the file."""
 
     tag: str
@@ -43,7 +43,7 @@ class Element:
     line: int
     source: str
     absences: list[AbsentPart]  # of the whole file, in the order in which they were noticed
-    children: list["Element"] = field(default_factory=list["Element"])
+    children: list["XmlElement"] = field(default_factory=list["XmlElement"])
     text: str = ""
     read: bool = False
     read_text: bool = False
@@ -55,14 +55,14 @@ class Element:
         name = self.attributes.get("name")
         return f"{shorten(name)} (line {self.line})" if name else f"line {self.line}"
 
-    def find_children(self, tag: str) -> list["Element"]:
+    def find_children(self, tag: str) -> list["XmlElement"]:
         """Return the children of a tag, and mark them as read."""
         children = [child for child in self.children if child.tag == tag]
         for child in children:
             child.read = True
         return children
 
-    def find_child(self, tag: str) -> "Element | None":
+    def find_child(self, tag: str) -> "XmlElement | None":
         """Return the first child of a tag and mark it as read, or None. Other children of the tag are reported."""
         child = next((child for child in self.children if child.tag == tag), None)
         if child is not None:
@@ -141,7 +141,7 @@ class Element:
         for child in self.children:
             child.mark_all_as_read()
 
-    def is_equal_to(self, other: "Element") -> bool:
+    def is_equal_to(self, other: "XmlElement") -> bool:
         """Return whether tag, attributes, text and children of both are equal, whatever their lines."""
         if self.tag != other.tag or self.attributes != other.attributes:
             return False
@@ -182,7 +182,7 @@ class Element:
             yield from child._iterate_all_values(f"{path}<{child.tag}>", outermost, outermost_line)
 
 
-def parse_xml(data: bytes, source: str) -> Element:
+def parse_xml(data: bytes, source: str) -> XmlElement:
     """Parse a file.
 
     Args:
@@ -197,7 +197,7 @@ def parse_xml(data: bytes, source: str) -> Element:
     """
     parser = expat.ParserCreate()
     absences: list[AbsentPart] = []
-    top = Element("", {}, 0, source, absences)
+    top = XmlElement("", {}, 0, source, absences)
     open_elements = [top]
     count = 0
 
@@ -215,7 +215,7 @@ def parse_xml(data: bytes, source: str) -> Element:
                 f"{source}, line {line}: <{shorten(tag)}> is xacro; convert it first: xacro FILE > robot.urdf",
                 code="urdf/invalid",
             )
-        element = Element(tag, attributes, line, source, absences)
+        element = XmlElement(tag, attributes, line, source, absences)
         open_elements[-1].children.append(element)
         open_elements.append(element)
 

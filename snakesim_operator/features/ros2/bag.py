@@ -13,11 +13,11 @@ from snakesim_hal.model.textfiles import export_atomically
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.contact_wrenches import encode_wrenches
-from snakesim_operator.features.ros2.frames import Frames, make_ros_name
+from snakesim_operator.features.ros2.frames import RobotFrames, make_ros_name
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.urdf import make_urdf
 from snakesim_operator.recording.message import RecordedMessage
@@ -44,9 +44,9 @@ MESSAGE_TYPES: dict[str, type[Any]] = {
     keys.POSE: m.Pose,
     keys.CONTACTS: m.Contacts,
     keys.IMU: m.Imu,
-    keys.STATUS: m.Status,
+    keys.STATUS: m.RobotStatus,
     keys.CLOCK: m.Clock,
-    keys.DESCRIPTION: m.Description,
+    keys.DESCRIPTION: m.RobotDescription,
 }
 BagMessage = tuple[str, RosType, bytes]  # topic, type and message in CDR
 
@@ -93,7 +93,7 @@ def _write_bag(reader: RecordingReader, path: Path, *, wall_time: bool) -> int:
     """Convert all messages of a recording, and return the number of messages in the bag."""
     count = 0
     with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
-        bag = _Bag(writer)
+        bag = _BagTopics(writer)
         converter = MessageConverter(wall_time=wall_time)
         for recorded in reader.read_messages(MESSAGE_TYPES):
             time_ns = recorded.wall_time_ns if wall_time else recorded.robot_time_ns
@@ -103,7 +103,7 @@ def _write_bag(reader: RecordingReader, path: Path, *, wall_time: bool) -> int:
     return count
 
 
-class _Bag:
+class _BagTopics:
     """The topics of a bag that is being written."""
 
     def __init__(self, writer: Writer) -> None:
@@ -127,9 +127,9 @@ class MessageConverter:
     def __init__(self, *, wall_time: bool) -> None:
         """Start without a robot. `wall_time` is whether stamps are wall-clock time instead of robot time."""
         self._wall_time = wall_time
-        self._decoders = {key: Decoder(message_type) for key, message_type in MESSAGE_TYPES.items()}
-        self._robot: m.Description | None = None
-        self._frames: Frames | None = None
+        self._decoders = {key: MessageDecoder(message_type) for key, message_type in MESSAGE_TYPES.items()}
+        self._robot: m.RobotDescription | None = None
+        self._frames: RobotFrames | None = None
         self._known_imu_links: set[int] = set()  # whose frames are known
 
     def convert(self, recorded: RecordedMessage) -> Iterable[BagMessage]:
@@ -148,7 +148,7 @@ class MessageConverter:
         stamp_ns = (
             recorded.wall_time_ns if self._wall_time else getattr(message, "timestamp_ns", recorded.robot_time_ns)
         )
-        if isinstance(message, m.Description):
+        if isinstance(message, m.RobotDescription):
             return self._use_robot(message, stamp_ns)
         robot = self._robot
         frames = self._frames
@@ -164,26 +164,26 @@ class MessageConverter:
                 return _convert_contacts(message, robot, frames, stamp_ns)
             case m.Imu():
                 return self._convert_imus(message, frames, stamp_ns)
-            case m.Status():
+            case m.RobotStatus():
                 return [("/diagnostics", ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(stamp_ns, message))]
             case m.Clock() if not self._wall_time:
                 return [("/clock", ros.CLOCK, ros.encode_clock(stamp_ns))]
             case _:
                 return []
 
-    def _use_robot(self, robot: m.Description, stamp_ns: int) -> list[BagMessage]:
+    def _use_robot(self, robot: m.RobotDescription, stamp_ns: int) -> list[BagMessage]:
         """Use this description from now on, and return it as URDF with the fixed frames."""
         if len(robot.links) != len(robot.joints) + 1:
             return []
         self._robot = robot
-        self._frames = Frames(robot)
+        self._frames = RobotFrames(robot)
         return [
             ("/robot_description", ros.STRING, ros.encode_string(make_urdf(robot))),
             ("/tf_static", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, self._frames.fixed)),
         ]
 
     def _convert_joints(
-        self, joints: m.JointState, robot: m.Description, frames: Frames, stamp_ns: int
+        self, joints: m.JointState, robot: m.RobotDescription, frames: RobotFrames, stamp_ns: int
     ) -> list[BagMessage]:
         names = [joint.name for joint in robot.joints]
         transforms = frames.make_joint_transforms(joints)
@@ -192,7 +192,7 @@ class MessageConverter:
             ("/tf", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms)),
         ]
 
-    def _convert_imus(self, imus: m.Imu, frames: Frames, stamp_ns: int) -> list[BagMessage]:
+    def _convert_imus(self, imus: m.Imu, frames: RobotFrames, stamp_ns: int) -> list[BagMessage]:
         """Return a message for each IMU, and its frame with the first one."""
         outputs: list[BagMessage] = []
         for entry, link in enumerate(imus.link):
@@ -206,7 +206,9 @@ class MessageConverter:
         return outputs
 
 
-def _convert_contacts(contacts: m.Contacts, robot: m.Description, frames: Frames, stamp_ns: int) -> list[BagMessage]:
+def _convert_contacts(
+    contacts: m.Contacts, robot: m.RobotDescription, frames: RobotFrames, stamp_ns: int
+) -> list[BagMessage]:
     """Return a wrench for each link."""
     link_frames = [frames.get_link_frame(link) for link in range(len(robot.links))]
     wrenches = encode_wrenches(stamp_ns, link_frames, contacts)

@@ -22,10 +22,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
-from snakesim_operator.features.ros2.frames import Frames
-from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
-from snakesim_operator.features.ros2.messages import Transform
-from snakesim_operator.features.ros2.relay import NewestRelay, Relay, RosTime
+from snakesim_operator.features.ros2.frames import RobotFrames
+from snakesim_operator.features.ros2.graph import RosNode, RosPublisher, RosTopic, RosType
+from snakesim_operator.features.ros2.messages import RosTransform
+from snakesim_operator.features.ros2.relay import NewestRelay, RosTime, TopicRelay
 from snakesim_operator.features.ros2.sensor_topics import SensorTopics, StaticFrames
 from snakesim_operator.features.ros2.steering import CmdVelInput
 from snakesim_operator.features.ros2.urdf import make_urdf
@@ -46,7 +46,7 @@ class BridgeOptions:
     wall_time: bool = False  # timestamps are wall-clock time, and /clock is not published
 
 
-def is_consistent(robot: m.Description) -> bool:
+def is_consistent(robot: m.RobotDescription) -> bool:
     """Return whether a description has a link at both ends of every joint."""
     return len(robot.links) == len(robot.joints) + 1
 
@@ -55,10 +55,10 @@ def _accept_any_clock(_clock: m.Clock) -> bool:
     return True
 
 
-class Bridge:
+class RosBridge:
     """One robot as one ROS node."""
 
-    def __init__(self, session: Session, node: Node, robot: m.Description, options: BridgeOptions) -> None:
+    def __init__(self, session: Session, node: RosNode, robot: m.RobotDescription, options: BridgeOptions) -> None:
         """Declare the ROS topics, and publish the description of the robot.
 
         Args:
@@ -82,11 +82,11 @@ class Bridge:
         self._ros_time = RosTime(wall_time=options.wall_time)
 
         # The newest messages of the robot.
-        self._description_reader = session.declare_latched_reader(keys.DESCRIPTION, m.Description)
+        self._description_reader = session.declare_latched_reader(keys.DESCRIPTION, m.RobotDescription)
         self._joint_state: m.JointState | None = None
-        self._world: m.World | None = None
+        self._world: m.WorldModel | None = None
         self._world_arrival_s = 0.0
-        self._unpublished_world: m.World | None = None  # its markers are not published
+        self._unpublished_world: m.WorldModel | None = None  # its markers are not published
 
         # ROS topics.
         self._declare_topics()
@@ -116,48 +116,48 @@ class Bridge:
     def _declare_topics(self) -> None:
         """Declare the publishers of the topics that every robot has. /tf, /diagnostics and /clock have no namespace."""
         self._joint_state_publisher = self._declare_publisher("joint_states", ros.JOINT_STATE)
-        tf_topic = Topic("/tf", ros.TRANSFORMS, depth=100)
+        tf_topic = RosTopic("/tf", ros.TRANSFORMS, depth=100)
         self._transform_publisher = self._node.declare_publisher(tf_topic)
-        static_topic = Topic("/tf_static", ros.TRANSFORMS, depth=1, latched=True)
+        static_topic = RosTopic("/tf_static", ros.TRANSFORMS, depth=1, latched=True)
         static_publisher = self._node.declare_publisher(static_topic)
         self._static_frames = StaticFrames(static_publisher, self._ros_time)
         self._description_publisher = self._declare_publisher("robot_description", ros.STRING, depth=1, latched=True)
         self._contact_marker_publisher = self._declare_publisher("contacts", ros.MARKERS)
         self._obstacle_marker_publisher = self._declare_publisher("obstacles", ros.MARKERS)
-        diagnostics_topic = Topic("/diagnostics", ros.DIAGNOSTICS)
+        diagnostics_topic = RosTopic("/diagnostics", ros.DIAGNOSTICS)
         self._diagnostics_publisher = self._node.declare_publisher(diagnostics_topic)
         self._clock_publisher: RosPublisher | None = None
         if not self._options.wall_time:
-            clock_topic = Topic("/clock", ros.CLOCK, depth=1, best_effort=True)
+            clock_topic = RosTopic("/clock", ros.CLOCK, depth=1, best_effort=True)
             self._clock_publisher = self._node.declare_publisher(clock_topic)
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
-        return self._node.declare_publisher(Topic(f"/{self.prefix}{name}", ros_type, **quality))
+        return self._node.declare_publisher(RosTopic(f"/{self.prefix}{name}", ros_type, **quality))
 
     def _make_cmd_vel_input(self) -> CmdVelInput:
-        twists = self._node.declare_subscription(Topic(f"/{self.prefix}cmd_vel", ros.TWIST, depth=1))
+        twists = self._node.declare_subscription(RosTopic(f"/{self.prefix}cmd_vel", ros.TWIST, depth=1))
         return CmdVelInput(twists, self._session, print_line)
 
-    def _set_robot(self, robot: m.Description) -> None:
+    def _set_robot(self, robot: m.RobotDescription) -> None:
         """Use this description of the robot from now on, and publish it in ROS."""
         self._robot = robot
-        self._frames = Frames(robot, self.prefix)
+        self._frames = RobotFrames(robot, self.prefix)
         self._joint_names = [joint.name for joint in robot.joints]
         self._sensor_topics.set_robot(robot, self._frames)
         urdf = make_urdf(robot, self.prefix)
         self._description_publisher.publish(ros.encode_string(urdf))
         self._static_frames.reset(self._frames)
 
-    def _make_relays(self, robot: m.Description) -> list[Relay[Any]]:
+    def _make_relays(self, robot: m.RobotDescription) -> list[TopicRelay[Any]]:
         """Return the relays of all keys that this robot has."""
         session = self._session
         every_cycle = 1
         status_cycles = self._count_cycles_between(STATUS_RATE_HZ)
         image_cycles = self._count_cycles_between(self._options.images_hz)
-        relays: list[Relay[Any]] = [
+        relays: list[TopicRelay[Any]] = [
             NewestRelay(session, keys.JOINTS, m.JointState, every_cycle, self._forward_joints),
-            NewestRelay(session, keys.WORLD, m.World, every_cycle, self._forward_world),
-            NewestRelay(session, keys.STATUS, m.Status, status_cycles, self._forward_status),
+            NewestRelay(session, keys.WORLD, m.WorldModel, every_cycle, self._forward_world),
+            NewestRelay(session, keys.STATUS, m.RobotStatus, status_cycles, self._forward_status),
         ]
         has_pose_sensor = any(sensor.key == keys.POSE for sensor in robot.sensors)
         if has_pose_sensor:
@@ -207,7 +207,7 @@ class Bridge:
         self._joint_state_publisher.publish(message)
         self._publish_transforms(joints.timestamp_ns, self._frames.make_joint_transforms(joints))
 
-    def _forward_world(self, world: m.World) -> None:
+    def _forward_world(self, world: m.WorldModel) -> None:
         self._world = world
         self._unpublished_world = world
         self._world_arrival_s = time.monotonic()
@@ -218,15 +218,15 @@ class Bridge:
         if self._is_world_model_silent():
             self._publish_transforms(pose.timestamp_ns, [self._frames.make_base_transform(pose)])
 
-    def _publish_transforms(self, robot_ns: int, transforms: list[Transform]) -> None:
+    def _publish_transforms(self, robot_ns: int, transforms: list[RosTransform]) -> None:
         timestamp_ns = self._ros_time.convert(robot_ns)
         self._transform_publisher.publish(ros.encode_transforms(timestamp_ns, transforms))
 
-    def _forward_status(self, status: m.Status) -> None:
+    def _forward_status(self, status: m.RobotStatus) -> None:
         timestamp_ns = self._ros_time.convert(status.timestamp_ns)
         self._diagnostics_publisher.publish(robot_in_ros.encode_diagnostics(timestamp_ns, status))
 
-    def _publish_markers(self, world: m.World) -> None:
+    def _publish_markers(self, world: m.WorldModel) -> None:
         """Publish the contacts and obstacles of a world model."""
         frame = self._frames.odom
         contacts_ns = world.timestamp_ns
@@ -264,7 +264,7 @@ class Bridge:
         return float(np.arctan2(tail_to_head[1], tail_to_head[0]))
 
 
-def _find_pose_time_ns(world: m.World) -> int:
+def _find_pose_time_ns(world: m.WorldModel) -> int:
     """Return the robot time in ns at which the base pose of a world model holds.
 
     An estimated pose holds at the time of the world model, a measured one at the time of its measurement.

@@ -16,7 +16,7 @@ from snakesim_hal.network.commanding import CommandingClient
 from snakesim_hal.network.foreign_network import RawReader
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Description, JointState, Status
+from snakesim_hal.wire.messages import Clock, JointState, RobotDescription, RobotStatus
 from snakesim_operator.features.ros2.joint_commands import RosJointTargets
 from snakesim_operator.features.ros2.message_age import SenderClocks
 
@@ -81,8 +81,8 @@ class JointCommander:
         Raises:
             NotConnectedError: The robot is lost, or its host has restarted.
         """
-        robot = session.wait_for_latched(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
-        status = session.wait_for_latched(keys.STATUS, Status, DESCRIPTION_TIMEOUT_S)
+        robot = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, DESCRIPTION_TIMEOUT_S)
+        status = session.wait_for_latched(keys.STATUS, RobotStatus, DESCRIPTION_TIMEOUT_S)
         if robot is None or status is None:
             raise NotConnectedError(
                 "the robot does not describe itself; is its HAL host running?", code="network/no-robot"

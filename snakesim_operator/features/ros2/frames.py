@@ -10,8 +10,16 @@ a separate drift. `base_link` is the base: the tail end of the tail link, x alon
 import math
 import re
 
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Description, JointState, MountedSample, Pose, World
-from snakesim_operator.features.ros2.messages import Transform, Triple, Wxyz
+from snakesim_hal.wire.messages import (
+    ColorImage,
+    DepthImage,
+    JointState,
+    MountedSample,
+    Pose,
+    RobotDescription,
+    WorldModel,
+)
+from snakesim_operator.features.ros2.messages import RosTransform, Triple, Wxyz
 
 MAP_FRAME = "map"
 ORIGIN: Triple = (0.0, 0.0, 0.0)
@@ -27,10 +35,10 @@ def make_ros_name(text: str) -> str:
     return name
 
 
-class Frames:
+class RobotFrames:
     """The frames of one robot: their names, and the transforms between them."""
 
-    def __init__(self, robot: Description, prefix: str = "") -> None:
+    def __init__(self, robot: RobotDescription, prefix: str = "") -> None:
         """Name the frames of the robot.
 
         Args:
@@ -42,8 +50,8 @@ class Frames:
         self.odom = f"{prefix}odom"
         self.base = f"{prefix}base_link"
         self.fixed = [
-            Transform(MAP_FRAME, self.odom, ORIGIN, NO_ROTATION),
-            Transform(self.base, self.get_link_frame(0), ORIGIN, NO_ROTATION),
+            RosTransform(MAP_FRAME, self.odom, ORIGIN, NO_ROTATION),
+            RosTransform(self.base, self.get_link_frame(0), ORIGIN, NO_ROTATION),
         ]
 
     def get_link_frame(self, link: int) -> str:
@@ -62,39 +70,39 @@ class Frames:
         """Return the frame name of the IMU on a link."""
         return f"{self.get_link_frame(link)}_imu_frame"
 
-    def make_imu_transform(self, link: int) -> Transform:
+    def make_imu_transform(self, link: int) -> RosTransform:
         """Return the pose of an IMU, which sits in the middle of its link."""
         middle = (self._robot.links[link].length_m / 2, 0.0, 0.0)
-        return Transform(self.get_link_frame(link), self.get_imu_frame(link), middle, NO_ROTATION)
+        return RosTransform(self.get_link_frame(link), self.get_imu_frame(link), middle, NO_ROTATION)
 
-    def make_base_transform(self, pose: World | Pose) -> Transform:
+    def make_base_transform(self, pose: WorldModel | Pose) -> RosTransform:
         """Return the pose of the base in `odom`."""
         if isinstance(pose, Pose):
-            return Transform(self.odom, self.base, pose.position_w, pose.orientation_wxyz)
-        return Transform(self.odom, self.base, pose.base_position_w, pose.base_orientation_wxyz)
+            return RosTransform(self.odom, self.base, pose.position_w, pose.orientation_wxyz)
+        return RosTransform(self.odom, self.base, pose.base_position_w, pose.base_orientation_wxyz)
 
-    def make_joint_transforms(self, joints: JointState) -> list[Transform]:
+    def make_joint_transforms(self, joints: JointState) -> list[RosTransform]:
         """Return the pose of each link in the link behind it, without the links whose joint state is not valid."""
-        transforms: list[Transform] = []
+        transforms: list[RosTransform] = []
         for i, joint in enumerate(self._robot.joints):
             if not joints.valid[i]:
                 continue
             position = (self._robot.links[i].length_m, 0.0, 0.0)
             orientation = _make_joint_rotation(joint.axis, joints.angle_rad[i])
-            transforms.append(Transform(self.get_link_frame(i), self.get_link_frame(i + 1), position, orientation))
+            transforms.append(RosTransform(self.get_link_frame(i), self.get_link_frame(i + 1), position, orientation))
         return transforms
 
-    def make_camera_transforms(self, kind: str, camera: str, image: DepthImage | ColorImage) -> list[Transform]:
+    def make_camera_transforms(self, kind: str, camera: str, image: DepthImage | ColorImage) -> list[RosTransform]:
         """Return the pose of a camera on its link, and of its optical frame in the camera frame."""
         optical_frame = self.get_optical_frame(kind, camera)
         camera_frame = optical_frame.replace("_optical_frame", "_frame")
-        mount = Transform(self.get_link_frame(image.link), camera_frame, image.position_l, image.orientation_l_wxyz)
-        return [mount, Transform(camera_frame, optical_frame, ORIGIN, OPTICAL_IN_CAMERA)]
+        mount = RosTransform(self.get_link_frame(image.link), camera_frame, image.position_l, image.orientation_l_wxyz)
+        return [mount, RosTransform(camera_frame, optical_frame, ORIGIN, OPTICAL_IN_CAMERA)]
 
-    def make_mount_transforms(self, sensor: str, sample: MountedSample) -> list[Transform]:
+    def make_mount_transforms(self, sensor: str, sample: MountedSample) -> list[RosTransform]:
         """Return the pose of a sensor on its link, as its sample states it."""
         link_frame = self.get_link_frame(sample.link)
-        return [Transform(link_frame, self.get_mount_frame(sensor), sample.position_l, sample.orientation_l_wxyz)]
+        return [RosTransform(link_frame, self.get_mount_frame(sensor), sample.position_l, sample.orientation_l_wxyz)]
 
 
 def _make_joint_rotation(axis: str, angle_rad: float) -> Wxyz:

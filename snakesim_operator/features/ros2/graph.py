@@ -42,7 +42,7 @@ class RosType:
 
 
 @dataclass(frozen=True)
-class Topic:
+class RosTopic:
     """A topic, or a service, and its quality of service."""
 
     name: str  # with its namespace, such as /planar13/joint_states
@@ -72,12 +72,14 @@ class NodeName:
     namespace: str = "/"
 
 
-def make_topic_key(domain: int, topic: Topic) -> str:
+def make_topic_key(domain: int, topic: RosTopic) -> str:
     """Return the Zenoh key of a topic's samples."""
     return f"{domain}/{topic.name.strip('/')}/{topic.type.dds_name}/{topic.type.type_hash}"
 
 
-def make_token(domain: int, zenoh_id: str, entity: int, kind: str, node: NodeName, topic: Topic | None = None) -> str:
+def make_token(
+    domain: int, zenoh_id: str, entity: int, kind: str, node: NodeName, topic: RosTopic | None = None
+) -> str:
     """Return the liveliness token of a node (without a topic) or of one of its endpoints."""
     security_enclave = _escape_slashes("/")
     node_names = f"{security_enclave}/{_escape_slashes(node.namespace)}/{node.name}"
@@ -141,7 +143,7 @@ class RosPublisher:
         self._publisher.send(message, attachment)
 
 
-class Node:
+class RosNode:
     """A node in the ROS graph, present for as long as its session is open."""
 
     def __init__(self, foreign_network: ForeignNetwork, domain: int, name: NodeName) -> None:
@@ -151,7 +153,7 @@ class Node:
         self._entities: Iterator[int] = count(NODE_ID)  # numbers of the node and its endpoints
         foreign_network.declare_token(self._make_next_token(NODE))
 
-    def declare_publisher(self, topic: Topic) -> RosPublisher:
+    def declare_publisher(self, topic: RosTopic) -> RosPublisher:
         """Declare a publisher, which `ros2 topic info` then shows."""
         key = make_topic_key(self._domain, topic)
         publisher = self._network.declare_publisher(key, latched=topic.latched, background=topic.images)
@@ -159,7 +161,7 @@ class Node:
         self._network.declare_token(token)
         return RosPublisher(publisher, token)
 
-    def declare_subscription(self, topic: Topic) -> RawReader:
+    def declare_subscription(self, topic: RosTopic) -> RawReader:
         """Subscribe to a topic.
 
         Returns:
@@ -169,12 +171,12 @@ class Node:
         self._network.declare_token(self._make_next_token(SUBSCRIPTION, topic))
         return reader
 
-    def declare_service(self, service: Topic) -> RawQueryable:
+    def declare_service(self, service: RosTopic) -> RawQueryable:
         """Offer a service, which `ros2 service list` then shows, and return the queue of its requests in CDR."""
         queryable = self._network.declare_queryable(make_topic_key(self._domain, service))
         self._network.declare_token(self._make_next_token(SERVER, service))
         return queryable
 
-    def _make_next_token(self, kind: str, topic: Topic | None = None) -> str:
+    def _make_next_token(self, kind: str, topic: RosTopic | None = None) -> str:
         """Return the liveliness token of the next entity of this node."""
         return make_token(self._domain, self._network.id, next(self._entities), kind, self._name, topic)

@@ -10,14 +10,14 @@ from typing import NoReturn
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.foreign_network import ForeignNetwork, open_foreign_network
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.base.targets import RobotSelection, find_single_robot
-from snakesim_operator.features.ros2.bridge import Bridge, BridgeOptions, is_consistent
+from snakesim_operator.features.ros2.bridge import BridgeOptions, RosBridge, is_consistent
 from snakesim_operator.features.ros2.driving import JointCommander
-from snakesim_operator.features.ros2.graph import Node, NodeName, Topic
+from snakesim_operator.features.ros2.graph import NodeName, RosNode, RosTopic
 from snakesim_operator.features.ros2.messages import JOINT_STATE
 from snakesim_operator.features.ros2.operating import make_operating_servers
 from snakesim_operator.features.ros2.parameters import make_parameter_servers
@@ -50,7 +50,7 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
             code="network/invalid-address",
         )
     with open_session(replace(connection, max_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.wait_for_latched(keys.DESCRIPTION, Description, START_TIMEOUT_S, is_consistent)
+        robot = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, START_TIMEOUT_S, is_consistent)
         if robot is None:
             raise NotConnectedError(
                 f"{connection.namespace} does not describe itself within {START_TIMEOUT_S:g} s", code="network/no-robot"
@@ -59,13 +59,13 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
         with contextlib.ExitStack() as exit_stack:
             network = _connect_to_ros(arguments.ros_router, exit_stack)
             name = NodeName(NODE_NAME, f"/{options.namespace}")
-            node = Node(network, arguments.domain, name)
-            bridge = Bridge(session, node, robot, options)
+            node = RosNode(network, arguments.domain, name)
+            bridge = RosBridge(session, node, robot, options)
             servers = _make_servers(session, node, connection, bridge.prefix, operate=arguments.operate)
             for server in servers:
                 exit_stack.callback(server.close)
             if arguments.joint_commands:
-                topic = Topic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=MAX_JOINT_COMMANDS)
+                topic = RosTopic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=MAX_JOINT_COMMANDS)
                 messages = node.declare_subscription(topic)
                 commander = JointCommander(session, messages, print_line, wall_time=options.wall_time)
                 exit_stack.callback(commander.close)
@@ -79,7 +79,7 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
             _run_cycles(bridge, servers, arguments.hz)
 
 
-def _make_options(arguments: argparse.Namespace, robot: Description) -> BridgeOptions:
+def _make_options(arguments: argparse.Namespace, robot: RobotDescription) -> BridgeOptions:
     """Return the bridge's options. Without --stamps, a real robot has wall-clock time, an emulated one robot time."""
     wall_time = not robot.emulated
     if arguments.stamps is not None:
@@ -104,13 +104,15 @@ def _connect_to_ros(endpoint: str, cleanup: contextlib.ExitStack) -> ForeignNetw
         ) from None
 
 
-def _make_servers(session: Session, node: Node, link: Link, prefix: str, *, operate: bool) -> list[ServiceServer]:
+def _make_servers(
+    session: Session, node: RosNode, link: ConnectionSettings, prefix: str, *, operate: bool
+) -> list[ServiceServer]:
     operating_servers = make_operating_servers(session, node, link, prefix, operate=operate)
     parameter_servers = make_parameter_servers(session, node, f"/{prefix}{NODE_NAME}", operate=operate)
     return operating_servers + parameter_servers
 
 
-def _run_cycles(bridge: Bridge, servers: Sequence[ServiceServer], hz: float) -> NoReturn:
+def _run_cycles(bridge: RosBridge, servers: Sequence[ServiceServer], hz: float) -> NoReturn:
     """Run the bridge's cycles at this rate until Ctrl-C; cycles that were missed are not made up for."""
     due_s = time.monotonic()
     while True:
@@ -121,7 +123,7 @@ def _run_cycles(bridge: Bridge, servers: Sequence[ServiceServer], hz: float) -> 
         time.sleep(max(0.0, due_s - time.monotonic()))
 
 
-def _wait_for_robot(selection: RobotSelection) -> Link:
+def _wait_for_robot(selection: RobotSelection) -> ConnectionSettings:
     """Return how to reach the selected robot; wait for a robot that is starting. Raises NotConnectedError."""
     deadline_s = time.monotonic() + START_TIMEOUT_S
     is_reported = False

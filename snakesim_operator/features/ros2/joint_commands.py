@@ -11,13 +11,13 @@ from typing import Any
 
 from rosbags.serde import SerdeError
 
-from snakesim_hal.wire.messages import Clock, Description, JointState, Mode
+from snakesim_hal.wire.messages import Clock, JointMode, JointState, RobotDescription
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.features.ros2.message_age import find_age_problem
 from snakesim_operator.features.ros2.messages import JOINT_STATE, TYPE_STORE
 
 TARGET_LIFETIME_NS = 500_000_000  # of a joint's target in robot time
-MODE_FIELDS = ((Mode.POSITION, "position"), (Mode.VELOCITY, "velocity"), (Mode.TORQUE, "effort"))
+MODE_FIELDS = ((JointMode.POSITION, "position"), (JointMode.VELOCITY, "velocity"), (JointMode.TORQUE, "effort"))
 MAX_NAME_SHOWN = 40  # characters of an unknown joint name in a message to the user
 
 
@@ -26,10 +26,10 @@ class _RefusedMessageError(Exception):
 
 
 @dataclass(frozen=True)
-class _JointCommand:
+class _FollowableCommand:
     """A message that can be followed."""
 
-    mode: Mode
+    mode: JointMode
     targets: dict[int, float]  # by joint index; in rad, rad/s or N m, as the mode requires
     timestamp_ns: int  # in its header, in ROS time; 0: none
 
@@ -38,7 +38,7 @@ class _JointCommand:
 class _JointTarget:
     """The newest target of one joint."""
 
-    mode: Mode
+    mode: JointMode
     target: float
     valid_until_ns: int  # robot time
 
@@ -46,7 +46,7 @@ class _JointTarget:
 class RosJointTargets:
     """Keeps the newest target of each joint, and makes the setpoints of each control cycle from them."""
 
-    def __init__(self, robot: Description) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
         self._joint_indices = {joint.name: i for i, joint in enumerate(robot.joints)}
         self._torque_limits_nm = [joint.torque_limit_nm for joint in robot.joints]
@@ -88,7 +88,7 @@ class RosJointTargets:
         if clock.lifecycle != "armed":
             self._targets = [None] * joint_count
             self._held_angles_rad = [None] * joint_count
-        modes = [Mode.POSITION] * joint_count
+        modes = [JointMode.POSITION] * joint_count
         targets = [0.0] * joint_count
         for i in range(joint_count):
             target = self._targets[i]
@@ -111,7 +111,7 @@ class RosJointTargets:
             self._held_angles_rad[joint] = held_rad
         return held_rad
 
-    def _decode_command(self, payload: bytes) -> _JointCommand:
+    def _decode_command(self, payload: bytes) -> _FollowableCommand:
         """Decode mode, targets and timestamp of a sensor_msgs/JointState that commands joints.
 
         Args:
@@ -137,9 +137,9 @@ class RosJointTargets:
             targets[self._joint_indices[name]] = value
         ros_time = message.header.stamp
         timestamp_ns = ros_time.sec * 1_000_000_000 + ros_time.nanosec
-        return _JointCommand(mode, targets, timestamp_ns)
+        return _FollowableCommand(mode, targets, timestamp_ns)
 
-    def _validate_target(self, name: str, mode: Mode, field: str, value: float) -> None:
+    def _validate_target(self, name: str, mode: JointMode, field: str, value: float) -> None:
         """Raise _RefusedMessageError for a target that this robot's joint cannot follow."""
         if name not in self._joint_indices:
             known_names = ", ".join(self._joint_indices)
@@ -152,7 +152,7 @@ class RosJointTargets:
             raise _RefusedMessageError(f"has {field} for {name}, whose drive takes {supported}")
 
 
-def _determine_age_ns(command: _JointCommand, age_ns: int, ros_now_ns: int) -> int:
+def _determine_age_ns(command: _FollowableCommand, age_ns: int, ros_now_ns: int) -> int:
     """Determine the age of a command in ns, and refuse a command that is too old.
 
     Args:
@@ -173,7 +173,7 @@ def _determine_age_ns(command: _JointCommand, age_ns: int, ros_now_ns: int) -> i
     return age_ns
 
 
-def _find_commanded_mode(message: Any) -> tuple[Mode, str]:
+def _find_commanded_mode(message: Any) -> tuple[JointMode, str]:
     """Return the mode that a message commands, and the name of its field: the first field that is not empty counts.
 
     Raises _RefusedMessageError.

@@ -54,7 +54,7 @@ MAX_TIME_S = 2**31 - 1  # builtin_interfaces/Time has 32 bits; a robot's clock m
 
 
 @dataclass(frozen=True)
-class Transform:
+class RosTransform:
     """Pose of `child` in `parent`."""
 
     parent: str
@@ -64,7 +64,7 @@ class Transform:
 
 
 @dataclass(frozen=True)
-class Marker:
+class RosMarker:
     """One shape to draw. Arrows have `points` (tail and tip); `size_m` then is shaft and head diameter, head length."""
 
     group: str
@@ -128,13 +128,13 @@ def encode_string(text: str) -> bytes:
     return encode_message(STRING, text)
 
 
-def encode_transforms(timestamp_ns: int, transforms: Sequence[Transform]) -> bytes:
+def encode_transforms(timestamp_ns: int, transforms: Sequence[RosTransform]) -> bytes:
     """Return a tf2_msgs/TFMessage in CDR."""
     stamped = [_make_stamped_transform(timestamp_ns, transform) for transform in transforms]
     return encode_message(TRANSFORMS, stamped)
 
 
-def _make_stamped_transform(timestamp_ns: int, transform: Transform) -> Any:
+def _make_stamped_transform(timestamp_ns: int, transform: RosTransform) -> Any:
     translation = make_vector(transform.position_m)
     rotation = make_quaternion(transform.orientation_wxyz)
     pose = make_message("geometry_msgs/msg/Transform", translation, rotation)
@@ -142,17 +142,17 @@ def _make_stamped_transform(timestamp_ns: int, transform: Transform) -> Any:
     return make_message("geometry_msgs/msg/TransformStamped", header, transform.child, pose)
 
 
-def encode_markers(timestamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
+def encode_markers(timestamp_ns: int, frame: str, shapes: Sequence[RosMarker]) -> bytes:
     """Return a visualization_msgs/MarkerArray in CDR that replaces everything on its topic."""
     header = make_header(timestamp_ns, frame)
-    nothing = Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
+    nothing = RosMarker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
     markers = [_make_marker(header, 0, DELETE_ALL, nothing)]
     for number, shape in enumerate(shapes):
         markers.append(_make_marker(header, number, ADD, shape))
     return encode_message(MARKERS, markers)
 
 
-def _make_marker(header: Any, marker_id: int, action: int, shape: Marker) -> Any:
+def _make_marker(header: Any, marker_id: int, action: int, shape: RosMarker) -> Any:
     """Make a visualization_msgs/Marker; its fields are in the order of their definition.
 
     Args:

@@ -6,11 +6,11 @@ from typing import Any
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.network.session import Link, Session
+from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, LifecycleRequest, Status, make_arm_request
+from snakesim_hal.wire.messages import LifecycleRequest, RobotDescription, RobotStatus, make_arm_request
 from snakesim_operator.base.robot_selection import RobotSelection
-from snakesim_operator.features.ros2.graph import Node
+from snakesim_operator.features.ros2.graph import RosNode
 from snakesim_operator.features.ros2.message_age import find_request_age_problem
 from snakesim_operator.features.ros2.server import ServiceServer, run_action
 from snakesim_operator.features.ros2.service_types import TRIGGER
@@ -23,7 +23,7 @@ REQUESTER = f"{get_user_name()[:40]}, ros2"
 
 
 def make_operating_servers(
-    session: Session, node: Node, connection: Link, prefix: str, *, operate: bool
+    session: Session, node: RosNode, connection: ConnectionSettings, prefix: str, *, operate: bool
 ) -> list[ServiceServer]:
     """Declare the ROS services that stop the robot and, if ROS may operate it, arm, disarm and reset it.
 
@@ -34,7 +34,7 @@ def make_operating_servers(
         prefix: Namespace of the services, with a slash behind it, or empty.
         operate: Whether ROS may arm, disarm and reset; stop is always offered.
     """
-    operator = _Operator(session, connection)
+    operator = _RobotOperator(session, connection)
     servers = [_make_trigger_server(node, f"/{prefix}stop", operator.stop)]
     if operate:
         arm = ServiceServer(
@@ -51,7 +51,7 @@ def make_operating_servers(
     return servers
 
 
-def _make_trigger_server(node: Node, name: str, action: Callable[[], str]) -> ServiceServer:
+def _make_trigger_server(node: RosNode, name: str, action: Callable[[], str]) -> ServiceServer:
     return ServiceServer(node, name, TRIGGER, _make_trigger_handler(action), make_refusal=_make_trigger_refusal)
 
 
@@ -75,10 +75,10 @@ def _explain_late_arm_request(attachment: bytes) -> str:
     return find_request_age_problem(attachment, time.time_ns())
 
 
-class _Operator:
+class _RobotOperator:
     """Sends the requests of the services to the robot. Each method returns the robot's answer in words."""
 
-    def __init__(self, session: Session, link: Link) -> None:
+    def __init__(self, session: Session, link: ConnectionSettings) -> None:
         self._session = session
         self._link = link
 
@@ -93,13 +93,13 @@ class _Operator:
 
     def arm(self) -> str:
         """Arm the robot that the host describes at present."""
-        robot = self._session.wait_for_latched(keys.DESCRIPTION, Description, DESCRIPTION_TIMEOUT_S)
+        robot = self._session.wait_for_latched(keys.DESCRIPTION, RobotDescription, DESCRIPTION_TIMEOUT_S)
         if robot is None:
             raise NotConnectedError(
                 f"{self._link.namespace} publishes no description; is its HAL host running?", code="network/no-robot"
             )
         # If it does not become ready, the host's answer to the request gives the reason.
-        self._session.wait_for_latched(keys.STATUS, Status, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
+        self._session.wait_for_latched(keys.STATUS, RobotStatus, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
         return self._send_lifecycle_request(make_arm_request(robot, REQUESTER), "armed")
 
     def disarm(self) -> str:

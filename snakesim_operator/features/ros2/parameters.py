@@ -13,13 +13,13 @@ import numpy as np
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import Session
 from snakesim_operator.features.ros2 import service_types as types
-from snakesim_operator.features.ros2.graph import Node
+from snakesim_operator.features.ros2.graph import RosNode
 from snakesim_operator.features.ros2.messages import make_message
 from snakesim_operator.features.ros2.operating import REQUESTER
 from snakesim_operator.features.ros2.server import ServiceServer, run_action
 from snakesim_operator.robot_commands.parameters import (
     PREFIX,
-    Parameter,
+    RobotParameter,
     change_parameters,
     format_value,
     parse_parameters,
@@ -45,7 +45,7 @@ QUEUE_DEPTH = 1000  # of a node's parameter services, as rmw's profile has it
 NOT_ALLOWED = "this bridge only watches: start it with --operate to let ROS set parameters"
 
 
-def make_parameter_servers(session: Session, node: Node, node_name: str, *, operate: bool) -> list[ServiceServer]:
+def make_parameter_servers(session: Session, node: RosNode, node_name: str, *, operate: bool) -> list[ServiceServer]:
     """Declare the six parameter services of a ROS node, and return their servers.
 
     Args:
@@ -113,7 +113,7 @@ class ParameterServices:
         """Set all of the parameters or none of them."""
         return types.SET_PARAMETERS_ATOMICALLY.encode_response(self._set_and_make_result(request.parameters))
 
-    def _read_parameters(self) -> dict[str, Parameter]:
+    def _read_parameters(self) -> dict[str, RobotParameter]:
         """Return the controller's parameters by name; none if no controller publishes any."""
         try:
             in_force = read_parameters_in_force(self._session)
@@ -205,7 +205,7 @@ def _decode_value(value: Any) -> Any:
     return None
 
 
-def _make_descriptor(name: str, parameter: Parameter | None) -> Any:
+def _make_descriptor(name: str, parameter: RobotParameter | None) -> Any:
     """Make an rcl_interfaces/ParameterDescriptor of a parameter; it is empty for an unknown parameter.
 
     Args:
@@ -235,7 +235,7 @@ def _make_descriptor(name: str, parameter: Parameter | None) -> Any:
     )
 
 
-def _make_range(parameter: Parameter) -> Any:
+def _make_range(parameter: RobotParameter) -> Any:
     """Return an rcl_interfaces/FloatingPointRange. It needs both limits, so a missing one becomes the largest float."""
     lower = -sys.float_info.max
     if parameter.minimum is not None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple
 
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Imu, Message
@@ -27,7 +27,7 @@ def _has_always_subscriber() -> bool:
     return True
 
 
-class Relay(ABC, Generic[MessageT]):
+class TopicRelay(ABC, Generic[MessageT]):
     """Forwards samples of one key in every n-th cycle of the bridge, while ROS nodes want them.
 
     The relay subscribes to the key only while a subscriber needs the samples: an image that no ROS node reads does not
@@ -58,10 +58,10 @@ class Relay(ABC, Generic[MessageT]):
         self._message_type = message_type
         self._every_cycles = every_cycles
         self._has_subscriber = has_subscriber
-        self._reader: Reader[MessageT] | None = None  # None while no subscriber needs the samples
+        self._reader: SampleReader[MessageT] | None = None  # None while no subscriber needs the samples
 
     @abstractmethod
-    def forward_new_samples(self, reader: Reader[MessageT], is_valid: Callable[[Message], bool]) -> None:
+    def forward_new_samples(self, reader: SampleReader[MessageT], is_valid: Callable[[Message], bool]) -> None:
         """Forward what has arrived since the last poll, at most once for each topic.
 
         Args:
@@ -91,7 +91,7 @@ class Relay(ABC, Generic[MessageT]):
             self._reader = None
 
 
-class NewestRelay(Relay[MessageT]):
+class NewestRelay(TopicRelay[MessageT]):
     """Forwards the newest sample since the last poll."""
 
     def __init__(
@@ -103,17 +103,17 @@ class NewestRelay(Relay[MessageT]):
         forward: Callable[[MessageT], None],
         has_subscriber: Callable[[], bool] = _has_always_subscriber,
     ) -> None:
-        """Prepare the relay, as `Relay` does; `forward` is called with each forwarded sample."""
+        """Prepare the relay, as `TopicRelay` does; `forward` is called with each forwarded sample."""
         super().__init__(session, key, message_type, every_cycles, has_subscriber)
         self._forward = forward
 
-    def forward_new_samples(self, reader: Reader[MessageT], is_valid: Callable[[Message], bool]) -> None:
+    def forward_new_samples(self, reader: SampleReader[MessageT], is_valid: Callable[[Message], bool]) -> None:
         newest = reader.pop_newest(is_valid)
         if newest is not None:
             self._forward(newest)
 
 
-class ImuRelay(Relay[Imu]):
+class ImuRelay(TopicRelay[Imu]):
     """Forwards the newest measurement of every IMU since the last poll.
 
     A sample holds only those IMUs that have new measurements, so all samples count.
@@ -126,7 +126,7 @@ class ImuRelay(Relay[Imu]):
         super().__init__(session, keys.IMU, Imu)
         self._forward = forward
 
-    def forward_new_samples(self, reader: Reader[Imu], is_valid: Callable[[Message], bool]) -> None:
+    def forward_new_samples(self, reader: SampleReader[Imu], is_valid: Callable[[Message], bool]) -> None:
         newest: dict[int, ImuMeasurement] = {}
         for sample in reader.drain():
             if is_valid(sample):

@@ -12,15 +12,15 @@ from snakesim_hal.wire.messages import (
     DepthImage,
     Imu,
     JointState,
-    Obstacle,
-    Ranges,
-    Status,
-    World,
+    KnownObstacle,
+    RangeScan,
+    RobotStatus,
     WorldContact,
+    WorldModel,
 )
 from snakesim_operator.base.png import encode_png
 from snakesim_operator.features.ros2 import messages as ros
-from snakesim_operator.features.ros2.messages import Marker, Rgba, Triple
+from snakesim_operator.features.ros2.messages import Rgba, RosMarker, Triple
 
 # How contacts and obstacles are drawn.
 ARROW_M_PER_N = 0.01  # length of a force arrow
@@ -68,12 +68,12 @@ def encode_joint_state(timestamp_ns: int, names: list[str], joints: JointState) 
     )
 
 
-def make_contact_markers(contacts: Iterable[WorldContact]) -> list[Marker]:
+def make_contact_markers(contacts: Iterable[WorldContact]) -> list[RosMarker]:
     """Return an arrow for the force on the body at each contact."""
-    markers: list[Marker] = []
+    markers: list[RosMarker] = []
     for contact in contacts:
         points = (contact.position_w, _find_arrow_tip(contact))
-        markers.append(Marker("contacts", ros.ARROW, ARROW_SIZE_M, CONTACT_COLOR, points_m=points))
+        markers.append(RosMarker("contacts", ros.ARROW, ARROW_SIZE_M, CONTACT_COLOR, points_m=points))
     return markers
 
 
@@ -83,12 +83,12 @@ def _find_arrow_tip(contact: WorldContact) -> Triple:
     return (x + ARROW_M_PER_N * fx, y + ARROW_M_PER_N * fy, z + ARROW_M_PER_N * fz)
 
 
-def make_obstacle_markers(world: World) -> list[Marker]:
+def make_obstacle_markers(world: WorldModel) -> list[RosMarker]:
     """Return the obstacles of the world model: opaque if they are certain, orange if they were touched."""
     return [_make_obstacle_marker(obstacle) for obstacle in world.obstacles]
 
 
-def _make_obstacle_marker(obstacle: Obstacle) -> Marker:
+def _make_obstacle_marker(obstacle: KnownObstacle) -> RosMarker:
     """Make a marker with the shape of an obstacle; its color shows contact, and its opacity the confidence."""
     diameter_m = 2 * obstacle.radius_m
     match obstacle.shape:
@@ -108,7 +108,7 @@ def _make_obstacle_marker(obstacle: Obstacle) -> Marker:
     red, green, blue, _ = color
     opacity = MIN_OPACITY + OPACITY_RANGE * obstacle.confidence
     rgba = (red, green, blue, opacity)
-    return Marker("obstacles", shape, size_m, rgba, obstacle.position_w, orientation_wxyz)
+    return RosMarker("obstacles", shape, size_m, rgba, obstacle.position_w, orientation_wxyz)
 
 
 def encode_depth_image(timestamp_ns: int, frame: str, image: DepthImage) -> bytes:
@@ -208,7 +208,7 @@ def encode_camera_info(timestamp_ns: int, frame: str, image: DepthImage | ColorI
     )
 
 
-def encode_laser_scan(timestamp_ns: int, frame: str, scan: Ranges) -> bytes:
+def encode_laser_scan(timestamp_ns: int, frame: str, scan: RangeScan) -> bytes:
     """Return a sensor_msgs/LaserScan with all beams at one time. Beams without a return are infinite (REP 117)."""
     ranges_m = [np.inf if range_m is None else range_m for range_m in scan.range_m]
     angle_max_rad = scan.angle_min_rad + scan.angle_step_rad * (len(ranges_m) - 1)
@@ -245,7 +245,7 @@ def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: 
     return ros.encode_message(ros.FLOAT64_ARRAY, layout, np.array(values, dtype=np.float64))
 
 
-def encode_diagnostics(timestamp_ns: int, status: Status) -> bytes:
+def encode_diagnostics(timestamp_ns: int, status: RobotStatus) -> bytes:
     """Encode the robot's status as a diagnostic_msgs/DiagnosticArray with one entry: state, reason and faults.
 
     Args:
@@ -270,7 +270,7 @@ def encode_diagnostics(timestamp_ns: int, status: Status) -> bytes:
     return ros.encode_message(ros.DIAGNOSTICS, ros.make_header(timestamp_ns, ""), [entry])
 
 
-def _find_diagnostic_level(status: Status) -> int:
+def _find_diagnostic_level(status: RobotStatus) -> int:
     if status.lifecycle in ("fault", "estop"):
         return ERROR
     if status.faults or status.isolated or status.derated:

@@ -14,10 +14,10 @@ from snakesim_hal.wire.custom_sample import find_custom_messages, find_message_t
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.contact_wrenches import encode_wrenches
-from snakesim_operator.features.ros2.frames import Frames, make_ros_name
-from snakesim_operator.features.ros2.graph import Node, RosPublisher, RosType, Topic
-from snakesim_operator.features.ros2.messages import Transform
-from snakesim_operator.features.ros2.relay import ImuMeasurement, ImuRelay, NewestRelay, Relay, RosTime
+from snakesim_operator.features.ros2.frames import RobotFrames, make_ros_name
+from snakesim_operator.features.ros2.graph import RosNode, RosPublisher, RosTopic, RosType
+from snakesim_operator.features.ros2.messages import RosTransform
+from snakesim_operator.features.ros2.relay import ImuMeasurement, ImuRelay, NewestRelay, RosTime, TopicRelay
 
 ImageEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and image to a message in CDR
 SampleEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and sample to a message in CDR
@@ -34,16 +34,16 @@ class StaticFrames:
     def __init__(self, publisher: RosPublisher, ros_time: RosTime) -> None:
         self._publisher = publisher
         self._ros_time = ros_time
-        self._fixed: list[Transform] = []
-        self._sensors: dict[str, list[Transform]] = {}  # by the sensor's key
+        self._fixed: list[RosTransform] = []
+        self._sensors: dict[str, list[RosTransform]] = {}  # by the sensor's key
 
-    def reset(self, frames: Frames) -> None:
+    def reset(self, frames: RobotFrames) -> None:
         """Start over with the frames of a robot whose sensors have not sent samples."""
         self._fixed = frames.fixed
         self._sensors.clear()
         self._publish_all_transforms()
 
-    def place_sensor(self, key: str, transforms: list[Transform]) -> None:
+    def place_sensor(self, key: str, transforms: list[RosTransform]) -> None:
         """Publish where a sensor is mounted, if that is not published."""
         if self._sensors.get(key) != transforms:
             self._sensors[key] = transforms
@@ -61,7 +61,7 @@ class SensorTopics:
     """Publishes the samples of one robot's sensors."""
 
     def __init__(
-        self, session: Session, node: Node, prefix: str, ros_time: RosTime, static_frames: StaticFrames
+        self, session: Session, node: RosNode, prefix: str, ros_time: RosTime, static_frames: StaticFrames
     ) -> None:
         """Prepare the ROS topics of one robot's sensors; `set_robot` and `make_relays` must be called next.
 
@@ -79,18 +79,18 @@ class SensorTopics:
         self._static_frames = static_frames
         self._imu_publishers: dict[int, RosPublisher] = {}  # by link, from the first sample on
 
-    def set_robot(self, robot: m.Description, frames: Frames) -> None:
+    def set_robot(self, robot: m.RobotDescription, frames: RobotFrames) -> None:
         """Use this description and these frames from now on."""
         self._robot = robot
         self._frames = frames
 
-    def make_relays(self, image_every_cycles: int) -> list[Relay[Any]]:
+    def make_relays(self, image_every_cycles: int) -> list[TopicRelay[Any]]:
         """Declare the topics of the robot's sensors, and return the relays that feed them.
 
         Args:
             image_every_cycles: Number of bridge cycles from one image of a camera to the next.
         """
-        relays: list[Relay[Any]] = []
+        relays: list[TopicRelay[Any]] = []
         sensor_keys = {sensor.key for sensor in self._robot.sensors}
         if keys.CONTACTS in sensor_keys:
             relays.append(self._make_contact_relay())
@@ -112,9 +112,9 @@ class SensorTopics:
         return relays
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
-        return self._node.declare_publisher(Topic(f"/{self._prefix}{name}", ros_type, **quality))
+        return self._node.declare_publisher(RosTopic(f"/{self._prefix}{name}", ros_type, **quality))
 
-    def _make_contact_relay(self) -> Relay[Any]:
+    def _make_contact_relay(self) -> TopicRelay[Any]:
         """Return the relay of the contact forces, with a topic for each link."""
         names = [make_ros_name(link.name) for link in self._robot.links]
         publishers = [self._declare_publisher(f"{name}/contact", ros.WRENCH) for name in names]
@@ -128,7 +128,7 @@ class SensorTopics:
         every_cycle = 1
         return NewestRelay(self._session, keys.CONTACTS, m.Contacts, every_cycle, forward)
 
-    def _make_depth_camera_relay(self, key: str, every_cycles: int) -> Relay[Any]:
+    def _make_depth_camera_relay(self, key: str, every_cycles: int) -> TopicRelay[Any]:
         """Return the relay of a depth camera; its topics are named as image_transport names them."""
         topic = f"{make_ros_name(_get_sensor_name(key))}/depth/image_raw"
         raw = self._declare_image_publisher(topic, ros.IMAGE)
@@ -139,7 +139,7 @@ class SensorTopics:
         )
         return self._make_camera_relay(key, "depth", m.DepthImage, outputs, every_cycles)
 
-    def _make_color_camera_relay(self, key: str, every_cycles: int) -> Relay[Any]:
+    def _make_color_camera_relay(self, key: str, every_cycles: int) -> TopicRelay[Any]:
         """Return the relay of a color camera; its topics are named as image_transport names them."""
         topic = f"{make_ros_name(_get_sensor_name(key))}/color/image_raw"
         raw = self._declare_image_publisher(topic, ros.IMAGE)
@@ -160,7 +160,7 @@ class SensorTopics:
         message_type: type[Any],
         publishers_and_encoders: tuple[tuple[RosPublisher, ImageEncoder], ...],
         every_cycles: int,
-    ) -> Relay[Any]:
+    ) -> TopicRelay[Any]:
         """Make the relay of one camera, which publishes its samples as images and intrinsics.
 
         Images are read and encoded only while a ROS node subscribes to them.
@@ -191,7 +191,9 @@ class SensorTopics:
 
         return NewestRelay(self._session, key, message_type, every_cycles, forward, is_wanted)
 
-    def _make_mounted_sensor_relay(self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder) -> Relay[Any]:
+    def _make_mounted_sensor_relay(
+        self, key: str, topic: str, ros_type: RosType, encode: SampleEncoder
+    ) -> TopicRelay[Any]:
         """Return the relay of one topic of a sensor that is mounted on a link."""
         name = _get_sensor_name(key)
         publisher = self._declare_publisher(f"{make_ros_name(name)}/{topic}", ros_type)

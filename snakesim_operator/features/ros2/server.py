@@ -12,7 +12,7 @@ from snakesim_hal.base.errors import SnakesimError
 from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.base.workers import ErrorReporter
 from snakesim_hal.network.foreign_network import RawQuery, RawQueryable
-from snakesim_operator.features.ros2.graph import Node, Topic, make_reply_attachment
+from snakesim_operator.features.ros2.graph import RosNode, RosTopic, make_reply_attachment
 from snakesim_operator.features.ros2.service_types import RosService
 
 RequestHandler = Callable[[Any], bytes]  # from a request to a response in CDR
@@ -28,7 +28,7 @@ class ServiceServer:
 
     def __init__(
         self,
-        node: Node,
+        node: RosNode,
         name: str,
         service: RosService,
         answer: RequestHandler,
@@ -53,7 +53,7 @@ class ServiceServer:
         self._handle_request = answer
         self._make_refusal = make_refusal
         self._find_refusal_reason = explain_refusal
-        self._request_queue: RawQueryable = node.declare_service(Topic(name, service.type, depth=depth))
+        self._request_queue: RawQueryable = node.declare_service(RosTopic(name, service.type, depth=depth))
         self._executor = ThreadPoolExecutor(1)
         self._running_request: Future[None] | None = None  # the request that is being answered
         self._error_report = ErrorReporter(name)

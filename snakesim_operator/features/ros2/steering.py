@@ -13,7 +13,7 @@ from snakesim_hal.base.terminal import PrintLine
 from snakesim_hal.network.foreign_network import RawReader
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Intent
+from snakesim_hal.wire.messages import LocomotionIntent
 from snakesim_operator.features.ros2.message_age import SenderClocks, find_age_problem
 from snakesim_operator.features.ros2.messages import decode_twist
 
@@ -38,7 +38,7 @@ class CmdVelInput:
             print_text: Reports dropped messages to the user.
         """
         self._twist_reader = twists
-        self._intent_publisher = session.declare_publisher(keys.INTENT, Intent)
+        self._intent_publisher = session.declare_publisher(keys.INTENT, LocomotionIntent)
         self._print_text = print_text
         self._steering = CmdVelSteering()
         self._sender_clocks = SenderClocks()
@@ -78,7 +78,7 @@ class CmdVelSteering:
 
     def make_intent(
         self, payload: bytes, now_ns: int, body_heading_w_rad: float | None, age_ns: int = 0
-    ) -> Intent | None:
+    ) -> LocomotionIntent | None:
         """Make the intent that a Twist stands for, and update the desired heading.
 
         Args:
@@ -104,7 +104,7 @@ class CmdVelSteering:
         speed_m_s = components[0]
         turn_rate_rad_s = components[5]
         self._update_heading(turn_rate_rad_s, now_ns, body_heading_w_rad)
-        return Intent(
+        return LocomotionIntent(
             timestamp_ns=max(now_ns - age_ns, 0),
             requester=REQUESTER,
             speed_m_s=speed_m_s,

@@ -7,7 +7,7 @@ may be on another computer; a comment in the document lists what is missing.
 import math
 from xml.etree import ElementTree
 
-from snakesim_hal.wire.messages import Description, JointDescription, LinkDescription
+from snakesim_hal.wire.messages import JointDescription, LinkDescription, RobotDescription
 
 AXIS_XYZ = {"yaw": "0 0 1", "pitch": "0 1 0"}
 MISSING_DATA_COMMENT = (
@@ -16,7 +16,7 @@ MISSING_DATA_COMMENT = (
 )
 
 
-def make_urdf(robot: Description, prefix: str = "") -> str:
+def make_urdf(robot: RobotDescription, prefix: str = "") -> str:
     """Return a URDF document with the links and joints of a robot, for viewers in ROS.
 
     Args:

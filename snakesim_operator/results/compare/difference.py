@@ -9,26 +9,26 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.host_record import BLACK_BOX
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.compare.alignment import TIME_TOLERANCE_S, AlignedRuns, JointSeries, align_runs
 from snakesim_operator.results.compare.following import LagAndGain, fit_lag_and_gain
 from snakesim_operator.results.compare.settings import (
-    Setting,
+    SettingDifference,
     describe_drive_differences,
     find_differing_settings,
     list_identifying_settings,
 )
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval, find_propulsion_periods
-from snakesim_operator.results.report.timeline import Series, measure_distance, read_reported_distance
+from snakesim_operator.results.report.timeline import TimelineSeries, measure_distance, read_reported_distance
 from snakesim_operator.results.run_log import RunRecord
 
 DIVERGENCE_THRESHOLD_RAD = 0.05  # three degrees: a hundred times the noise of an angle sensor
 MAX_HAND_OVERS_NAMED = 12
 STATIONARY_THRESHOLD_M = 0.001  # a run that moved less did not move; a percentage of that is meaningless
 TARGET_QUANTITIES = (
-    (Mode.POSITION, "angle target", "rad"),
-    (Mode.VELOCITY, "speed target", "rad/s"),
-    (Mode.TORQUE, "torque target", "N·m"),
+    (JointMode.POSITION, "angle target", "rad"),
+    (JointMode.VELOCITY, "speed target", "rad/s"),
+    (JointMode.TORQUE, "torque target", "N·m"),
 )
 
 
@@ -72,8 +72,8 @@ class AdvanceComparison:
     """How far both runs advanced by the same measure, at the end of the common time."""
 
     measure: str
-    a: Series
-    b: Series
+    a: TimelineSeries
+    b: TimelineSeries
     at_s: float
     a_m: float
     b_m: float
@@ -142,8 +142,8 @@ class RunDifference:
     b: RunRecord
     joints: list[str]  # tail to head
     aligned: AlignedRuns
-    identifying_settings: list[Setting]
-    differing_settings: list[Setting]  # settings that differ
+    identifying_settings: list[SettingDifference]
+    differing_settings: list[SettingDifference]  # settings that differ
     drive_difference: str  # a sentence about drives that differ; empty if all drives are the same
     advance: AdvanceComparison | None
     lag_and_gain_by_joint: list[LagAndGain | None]  # how the angle in B follows that in A; None if unknown
@@ -372,7 +372,7 @@ def _compute_correlation(a: Floats, b: Floats) -> float | None:
 
 def _compute_tracking_error_rad(joints: JointSeries) -> float | None:
     """Compute the RMS of angle - target over all joints in position mode; None if no value is known."""
-    errors = (joints.angle_rad - joints.target)[joints.mode == Mode.POSITION]
+    errors = (joints.angle_rad - joints.target)[joints.mode == JointMode.POSITION]
     errors = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else None
 

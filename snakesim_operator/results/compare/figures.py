@@ -6,8 +6,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_operator.results.compare.difference import AdvanceComparison, QuantityDifference, RunDifference
 from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.page.charts import (
-    Bar,
-    Line,
+    ChartBar,
+    ChartLine,
     PlotlyDict,
     TimeMarker,
     make_bar_chart,
@@ -26,10 +26,10 @@ def draw_advance(difference: RunDifference, moved: AdvanceComparison) -> list[Pl
     advance_b_m = np.interp(time_s, moved.b.time_s, moved.b.values)
     ahead_mm = 1000 * (advance_b_m - advance_a_m)
     drawn = [
-        Line("A", moved.a.time_s, moved.a.values, COLOR_A, width=3.5),
-        Line("B", moved.b.time_s, moved.b.values, COLOR_B),
+        ChartLine("A", moved.a.time_s, moved.a.values, COLOR_A, width=3.5),
+        ChartLine("B", moved.b.time_s, moved.b.values, COLOR_B),
     ]
-    gap = Line("B − A", time_s, ahead_mm)
+    gap = ChartLine("B − A", time_s, ahead_mm)
     marks = mark_divergence(difference)
     return [
         make_line_chart("Advance of both runs over time", "advance, m", drawn, end_s, markers=marks),
@@ -63,7 +63,7 @@ def draw_joint_in_both_runs(
     """
     time_s = difference.aligned.time_s
     worst = gap.max_difference_by_joint[joint]
-    drawn = [Line("A", time_s, a[:, joint], COLOR_A, width=3.5), Line("B", time_s, b[:, joint], COLOR_B)]
+    drawn = [ChartLine("A", time_s, a[:, joint], COLOR_A, width=3.5), ChartLine("B", time_s, b[:, joint], COLOR_B)]
     marks: list[TimeMarker] = []
     if worst is not None and worst.difference:
         marks.append(TimeMarker(worst.time_s, "worst"))
@@ -73,12 +73,12 @@ def draw_joint_in_both_runs(
 
 def draw_hand_overs(difference: RunDifference) -> PlotlyDict:
     """Draw when each joint propelled, with one row for A and one for B."""
-    drawn: list[Bar] = []
+    drawn: list[ChartBar] = []
     propelled: set[int] = set()
     for run, record, color in (("A", difference.a, COLOR_A), ("B", difference.b, COLOR_B)):
         for interval in find_propulsion_intervals(record):
             row = f"{difference.joints[interval.joint_index]} {run}"
-            drawn.append(Bar(row, interval.start_s, interval.end_s, f"{run} {interval.duration_s:.1f} s", color))
+            drawn.append(ChartBar(row, interval.start_s, interval.end_s, f"{run} {interval.duration_s:.1f} s", color))
             propelled.add(interval.joint_index)
     rows: list[str] = []
     for joint in sorted(propelled, reverse=True):

@@ -24,7 +24,7 @@ DRIVE_IDENTITY_FIELDS = ("serial", "firmware")  # fields of a joint that identif
 
 
 @dataclass(frozen=True)
-class Setting:
+class SettingDifference:
     """The value of one setting in both runs, as text."""
 
     key: str  # dotted
@@ -32,16 +32,16 @@ class Setting:
     b: str
 
 
-def list_identifying_settings(a: RunRecord, b: RunRecord) -> list[Setting]:
+def list_identifying_settings(a: RunRecord, b: RunRecord) -> list[SettingDifference]:
     """List the settings that identify a run for people, whether they differ or not."""
     rows = [("scenario", "name"), ("robot", "robot.name"), ("scene", "scene.name")]
     rows += [(key, key) for key in ("backend", "clock_mode", "rate_hz", "duration_s", "controller", "seed")]
     values_a = dict(iterate_leaves(msgspec.to_builtins(a.config)))
     values_b = dict(iterate_leaves(msgspec.to_builtins(b.config)))
-    return [Setting(name, _format_value(values_a, key), _format_value(values_b, key)) for name, key in rows]
+    return [SettingDifference(name, _format_value(values_a, key), _format_value(values_b, key)) for name, key in rows]
 
 
-def find_differing_settings(a: RunRecord, b: RunRecord) -> list[Setting]:
+def find_differing_settings(a: RunRecord, b: RunRecord) -> list[SettingDifference]:
     """Find every value that differs: of the effective configuration, and of the description of the robot.
 
     The description follows from the robot file, so it is compared only if both runs have the same robot file.
@@ -49,12 +49,14 @@ def find_differing_settings(a: RunRecord, b: RunRecord) -> list[Setting]:
     sources = [("", _flatten_config(a), _flatten_config(b))]
     if a.config.robot == b.config.robot:
         sources.append(("description.", _flatten_description(a), _flatten_description(b)))
-    settings: list[Setting] = []
+    settings: list[SettingDifference] = []
     for prefix, values_a, values_b in sources:
         for key in dict.fromkeys([*values_a, *values_b]):
             is_in_both = key in values_a and key in values_b
             if not is_in_both or values_a[key] != values_b[key]:
-                settings.append(Setting(prefix + key, _format_value(values_a, key), _format_value(values_b, key)))
+                settings.append(
+                    SettingDifference(prefix + key, _format_value(values_a, key), _format_value(values_b, key))
+                )
     return settings
 
 

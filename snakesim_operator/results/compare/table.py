@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_operator.results.compare.difference import QuantityDifference, RunDifference, format_joint_order
-from snakesim_operator.results.compare.settings import Setting, find_drive_differences
+from snakesim_operator.results.compare.settings import SettingDifference, find_drive_differences
 from snakesim_operator.results.compare.verdict import SAME_TEXT, describe_difference, describe_relative_distance
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval
 
@@ -135,7 +135,7 @@ def _format_identifying_settings(difference: RunDifference) -> list[str]:
     return lines
 
 
-def _format_differing_settings(settings: list[Setting]) -> list[str]:
+def _format_differing_settings(settings: list[SettingDifference]) -> list[str]:
     """Format the rows of the settings that differ, at most MAX_SETTINGS_SHOWN of them."""
     if not settings:
         return ["no setting differs"]

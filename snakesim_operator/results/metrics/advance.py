@@ -11,7 +11,7 @@ from snakesim_hal.model.kinematics import compute_body_points_w
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
 from snakesim_hal.run_log.black_box import BlackBox
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.messages import JointMode, RobotDescription
 from snakesim_operator.results.run_log import RunRecord
 
 SAMPLE_PERIOD_S = 0.1
@@ -61,7 +61,7 @@ class ForwardProgress:
 
     @staticmethod
     def from_body_points(
-        goal: HeadingGoal | WaypointGoal | None, robot: Description, time_s: Floats, body_points_w: Floats
+        goal: HeadingGoal | WaypointGoal | None, robot: RobotDescription, time_s: Floats, body_points_w: Floats
     ) -> "ForwardProgress":
         """Compute the advance towards a goal from sampled positions of the body.
 
@@ -166,7 +166,7 @@ class ForwardProgress:
 class GoalMonitor:
     """Monitors a run, and detects its end: the goal was reached GOAL_HOLD_DURATION_S ago, or the robot is stuck."""
 
-    def __init__(self, config: RunConfig, robot: Description, stall_timeout_s: float | None = None) -> None:
+    def __init__(self, config: RunConfig, robot: RobotDescription, stall_timeout_s: float | None = None) -> None:
         """Prepare to monitor a run.
 
         Args:
@@ -218,7 +218,7 @@ class GoalMonitor:
         return False
 
 
-def compute_center_of_mass_w(robot: Description, body_points_w: Floats) -> Floats:
+def compute_center_of_mass_w(robot: RobotDescription, body_points_w: Floats) -> Floats:
     """Compute the horizontal position of the center of mass.
 
     Args:
@@ -249,7 +249,7 @@ def compute_energy_j(record: RunRecord, rows: NDArray[np.bool_] | slice = slice(
     return float(np.nansum(np.abs(_compute_joint_power_w(record)[rows])) * _get_control_period_s(record))
 
 
-def compute_work_j(record: RunRecord, mode: Mode) -> float:
+def compute_work_j(record: RunRecord, mode: JointMode) -> float:
     """Compute the sum of torque x velocity of all joints while they are in a mode, in J.
 
     Each row stands for a control period. Torque is sampled at the end of a period. In position mode, its component

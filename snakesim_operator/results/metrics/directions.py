@@ -58,7 +58,7 @@ class HeadingEffort:
 
 
 @dataclass(frozen=True)
-class Displacement:
+class DisplacementMetrics:
     """Speed, energy use and slip along the net displacement of the center of mass, for every gait."""
 
     displacement_m_s: float | None = None
@@ -110,14 +110,14 @@ class Displacement:
 
 
 @dataclass(frozen=True)
-class Slip:
+class SlipFractions:
     """Fractions of the links' motion that do not move the body forward. None if the links hardly moved."""
 
     longitudinal: float | None = None
     lateral: float | None = None
 
 
-def measure_slip(record: RunRecord, distance_m: float) -> Slip:
+def measure_slip(record: RunRecord, distance_m: float) -> SlipFractions:
     """Measure the slip of the links: how much longer their paths are than the displacement, and how far sideways.
 
     With the horizontal steps d of the center of each link i from one sample to the next, the link masses m, and the
@@ -138,7 +138,7 @@ def measure_slip(record: RunRecord, distance_m: float) -> Slip:
     row_step = max(round(SAMPLE_PERIOD_S * record.config.rate_hz), 1)
     rows = np.flatnonzero(record.has_pose)[::row_step]
     if len(rows) < 2:
-        return Slip()
+        return SlipFractions()
     forward_kinematics = ForwardKinematics(record.description)
     body_points_w = forward_kinematics.compute_body_points_w(
         record.position_w_m[rows], record.orientation_wxyz[rows], record.angle_rad[rows]
@@ -154,8 +154,8 @@ def measure_slip(record: RunRecord, distance_m: float) -> Slip:
     path_m = float((step_lengths_m @ masses_kg).sum() / masses_kg.sum())
     lateral_path_m = float((lateral_steps_m @ masses_kg).sum() / masses_kg.sum())
     if path_m < MIN_DISTANCE_M:
-        return Slip()
-    return Slip(longitudinal=max(1.0 - distance_m / path_m, 0.0), lateral=lateral_path_m / path_m)
+        return SlipFractions()
+    return SlipFractions(longitudinal=max(1.0 - distance_m / path_m, 0.0), lateral=lateral_path_m / path_m)
 
 
 def _find_bearing_rad(progress: ForwardProgress, displacement_w: Floats) -> float | None:

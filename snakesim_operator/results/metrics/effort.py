@@ -6,7 +6,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import compute_surface_friction
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, ForwardProgress, compute_energy_j_per_m
 from snakesim_operator.results.metrics.form_closure import compute_form_closure_margin, find_body_contacts
 from snakesim_operator.results.run_log import RunRecord
@@ -16,7 +16,7 @@ HEADROOM_PERCENTILE = 95
 
 
 @dataclass(frozen=True)
-class Effort:
+class EffortMetrics:
     """Effort until the goal or the end of the run. A metric is None if it is unknown or the advance is too short."""
 
     body_lengths_s: float | None = None
@@ -29,7 +29,9 @@ class Effort:
     planning_fraction: float | None = None  # fraction of navigation's cycles in which it searched for a path
 
     @staticmethod
-    def from_run(record: RunRecord, progress: ForwardProgress | None, *, has_torque_and_velocity: bool) -> "Effort":
+    def from_run(
+        record: RunRecord, progress: ForwardProgress | None, *, has_torque_and_velocity: bool
+    ) -> "EffortMetrics":
         """Compute how fast a run advanced along its route, and at what effort.
 
         Args:
@@ -41,11 +43,11 @@ class Effort:
             The metrics. A metric is None if it is unknown; all of them are None if the pose is unknown.
         """
         if progress is None or progress.goal_or_end_s <= 0:
-            return Effort()
+            return EffortMetrics()
         cost_of_transport = None
         if has_torque_and_velocity:
             cost_of_transport = _compute_cost_of_transport(record, progress)
-        return Effort(
+        return EffortMetrics(
             body_lengths_s=progress.final_advance_m / progress.goal_or_end_s / get_body_length_m(record),
             cost_of_transport=cost_of_transport,
             propulsive_efficiency=compute_propulsive_efficiency(record, cost_of_transport),
@@ -129,7 +131,9 @@ def _compute_form_closure_fraction(record: RunRecord, progress: ForwardProgress)
     Returns:
         A value between 0 and 1. It is 0 if the scene has no obstacles, and None if no sampled pose is known.
     """
-    outlines = Outlines.from_obstacles([placed.obstacle for placed in record.placed_obstacles if not placed.walkable])
+    outlines = ObstacleOutlines.from_obstacles(
+        [placed.obstacle for placed in record.placed_obstacles if not placed.walkable]
+    )
     if not len(outlines):
         return 0.0
     radius_m = record.description.links[0].radius_m

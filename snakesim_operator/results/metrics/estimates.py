@@ -7,12 +7,12 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_body_points_w
-from snakesim_hal.wire.messages import World
+from snakesim_hal.wire.messages import WorldModel
 from snakesim_operator.results.run_log import RunRecord
 
 
 @dataclass(frozen=True)
-class Estimates:
+class EstimateMetrics:
     """Sources of the last world model, and errors of dead reckoning. A value is None if it is unknown."""
 
     pose_from: str | None = None
@@ -21,7 +21,7 @@ class Estimates:
     dead_reckoning_error_m: float | None = None
 
     @staticmethod
-    def from_run(record: RunRecord) -> "Estimates":
+    def from_run(record: RunRecord) -> "EstimateMetrics":
         """Determine the sources of the estimates of guidance, and the error of its dead reckoning.
 
         Args:
@@ -31,7 +31,7 @@ class Estimates:
             The estimates. Distance and error are None if no pose was estimated by dead reckoning.
         """
         if not record.worlds or len(record.time_s) == 0:
-            return Estimates()
+            return EstimateMetrics()
         last_world = record.worlds[-1]
         dead_reckoned_worlds = [world for world in record.worlds if world.pose_from == "dead_reckoning"]
         known_errors_m: list[float] = []
@@ -42,7 +42,7 @@ class Estimates:
         distance_m = None
         if len(dead_reckoned_worlds) > 1:
             distance_m = _measure_estimated_advance_m(record, dead_reckoned_worlds[0], dead_reckoned_worlds[-1])
-        return Estimates(
+        return EstimateMetrics(
             pose_from=last_world.pose_from,
             contacts_from=last_world.contacts_from,
             dead_reckoned_distance_m=distance_m,
@@ -64,7 +64,7 @@ class Estimates:
         return phrases
 
 
-def _measure_position_error_m(record: RunRecord, world: World) -> float | None:
+def _measure_position_error_m(record: RunRecord, world: WorldModel) -> float | None:
     """Return the horizontal distance from the estimated to the measured position in m; None if none was measured."""
     row = record.find_nearest_row(world.timestamp_ns * 1e-9)
     if not record.has_pose[row]:
@@ -73,7 +73,7 @@ def _measure_position_error_m(record: RunRecord, world: World) -> float | None:
     return math.dist((x, y), world.base_position_w[:2])
 
 
-def _measure_estimated_advance_m(record: RunRecord, first: World, last: World) -> float | None:
+def _measure_estimated_advance_m(record: RunRecord, first: WorldModel, last: WorldModel) -> float | None:
     """Return the advance along the route between two estimated poses, in m.
 
     Without a route, the displacement of the mean of the body points is used. Returns None if an angle is unknown.
@@ -90,7 +90,7 @@ def _measure_estimated_advance_m(record: RunRecord, first: World, last: World) -
     return last_position_m - first_position_m
 
 
-def _find_estimated_body_points_w(record: RunRecord, world: World) -> Floats:
+def _find_estimated_body_points_w(record: RunRecord, world: WorldModel) -> Floats:
     """Compute the horizontal positions of tail end, joints and head end at the estimated pose, (joints + 2, 2)."""
     angles_rad = record.angle_rad[record.find_nearest_row(world.timestamp_ns * 1e-9)]
     return compute_body_points_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles_rad)[

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import KnownObstacle
 
 MAX_RANGE_M = 1.0
 FOV_RAD = math.pi / 2  # of the camera
@@ -53,8 +53,8 @@ class MapScore:
 
 
 def score_map(
-    reported: Sequence[Obstacle],
-    true_obstacles: Sequence[Obstacle],
+    reported: Sequence[KnownObstacle],
+    true_obstacles: Sequence[KnownObstacle],
     head_w: Sequence[float] | Floats,
     heading_rad: float,
 ) -> MapScore:
@@ -75,7 +75,7 @@ def score_map(
     """
     head = np.asarray(head_w, dtype=np.float64)[:2]
     near_true_obstacles = _select_nearby_obstacles(true_obstacles, head, MAX_RANGE_M + MAX_MATCH_DISTANCE_M)
-    true_outlines = Outlines.from_obstacles(near_true_obstacles)
+    true_outlines = ObstacleOutlines.from_obstacles(near_true_obstacles)
     map_score = MapScore()
     matched_names: set[str] = set()
     for obstacle in _select_nearby_obstacles(reported, head, MAX_RANGE_M):
@@ -105,7 +105,9 @@ def score_map(
     return map_score
 
 
-def find_visible_obstacles(obstacles: Sequence[Obstacle], head_w: Floats, heading_rad: float) -> list[Obstacle]:
+def find_visible_obstacles(
+    obstacles: Sequence[KnownObstacle], head_w: Floats, heading_rad: float
+) -> list[KnownObstacle]:
     """Return the obstacles within MAX_RANGE_M of the head that a camera at the head sees.
 
     An obstacle is visible if its center is in the field of view, its outline is at least MIN_RANGE_M away, and other
@@ -117,8 +119,8 @@ def find_visible_obstacles(obstacles: Sequence[Obstacle], head_w: Floats, headin
         heading_rad: Direction in which the camera looks.
     """
     near_obstacles = _select_nearby_obstacles(obstacles, head_w, MAX_RANGE_M)
-    outlines = Outlines.from_obstacles(near_obstacles)
-    visible_obstacles: list[Obstacle] = []
+    outlines = ObstacleOutlines.from_obstacles(near_obstacles)
+    visible_obstacles: list[KnownObstacle] = []
     for i, obstacle in enumerate(near_obstacles):
         x, y = np.array(obstacle.position_w[:2]) - head_w
         bearing_rad = (math.atan2(y, x) - heading_rad + math.pi) % (2 * math.pi) - math.pi
@@ -136,7 +138,7 @@ def find_visible_obstacles(obstacles: Sequence[Obstacle], head_w: Floats, headin
     return visible_obstacles
 
 
-def find_facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
+def find_facing_points_w(obstacle: KnownObstacle, from_w: Floats) -> Floats:
     """Return points on the side of an obstacle that faces a viewer, also if another obstacle hides them.
 
     Args:
@@ -157,7 +159,7 @@ def find_facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
     return points[is_facing] if is_facing.any() else points
 
 
-def _sample_box_outline(obstacle: Obstacle) -> tuple[Floats, Floats]:
+def _sample_box_outline(obstacle: KnownObstacle) -> tuple[Floats, Floats]:
     """Return points on the outline of a box relative to its center, and the outward normals there, both (n, 2)."""
     side_points = OUTLINE_POINTS // 4
     half_size = np.array(obstacle.half_size_m[:2])
@@ -172,7 +174,7 @@ def _sample_box_outline(obstacle: Obstacle) -> tuple[Floats, Floats]:
     return points @ rotation, normals @ rotation
 
 
-def align_map(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[Obstacle]:
+def align_map(reported: Sequence[KnownObstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[KnownObstacle]:
     """Align a map with the true pose: move it rigidly, as the estimated pose of the base moves to the true pose.
 
     This removes the pose error from the errors of a map, so that only the errors of perception remain.
@@ -188,7 +190,7 @@ def align_map(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Seque
     rotation_rad = to_w[2] - from_w[2]
     cos = math.cos(rotation_rad)
     sin = math.sin(rotation_rad)
-    corrected: list[Obstacle] = []
+    corrected: list[KnownObstacle] = []
     for obstacle in reported:
         x, y, z = obstacle.position_w
         offset_x = x - from_w[0]
@@ -201,11 +203,13 @@ def align_map(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Seque
     return corrected
 
 
-def _select_nearby_obstacles(obstacles: Sequence[Obstacle], head_w: Floats, max_distance_m: float) -> list[Obstacle]:
+def _select_nearby_obstacles(
+    obstacles: Sequence[KnownObstacle], head_w: Floats, max_distance_m: float
+) -> list[KnownObstacle]:
     """Return the obstacles whose outline is within a distance of the head, in m."""
-    is_near_by_obstacle = Outlines.from_obstacles(obstacles).compute_distances_m(head_w) <= max_distance_m
+    is_near_by_obstacle = ObstacleOutlines.from_obstacles(obstacles).compute_distances_m(head_w) <= max_distance_m
     return [obstacle for obstacle, is_near in zip(obstacles, is_near_by_obstacle.tolist(), strict=True) if is_near]
 
 
-def _get_half_size_m(obstacle: Obstacle) -> float:
+def _get_half_size_m(obstacle: KnownObstacle) -> float:
     return max(obstacle.half_size_m[:2]) if obstacle.shape == "box" else obstacle.radius_m

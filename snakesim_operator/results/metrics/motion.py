@@ -13,7 +13,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_operator.results.metrics.advance import ForwardProgress
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.time_axis import Interval, get_run_end_s, get_time_origin_s
+from snakesim_operator.results.time_axis import LabeledInterval, get_run_end_s, get_time_origin_s
 
 MAX_REST_M = 0.4 * MOVING_M  # a body that stays within this distance of a position is at rest there
 TIME_TOLERANCE_S = 1e-6  # times that differ by less are the same
@@ -25,7 +25,7 @@ MOVING_LABEL = "moving"
 class StopIntervals:
     """The intervals in which the body was stationary, on the time axis of the run."""
 
-    stops: list[Interval]  # in time order
+    stops: list[LabeledInterval]  # in time order
     run_end_s: float  # of the run
 
     @property
@@ -37,24 +37,24 @@ class StopIntervals:
         return max(1.0 - stopped_s / self.run_end_s, 0.0)
 
     @property
-    def final_stop(self) -> Interval | None:
+    def final_stop(self) -> LabeledInterval | None:
         """The stop that lasted until the end; None if the body moved at the end."""
         if self.stops and self.stops[-1].end_s >= self.run_end_s:
             return self.stops[-1]
         return None
 
     @property
-    def all_intervals(self) -> list[Interval]:
+    def all_intervals(self) -> list[LabeledInterval]:
         """The stops and the intervals of motion between them, from the first tick to the end."""
-        spans: list[Interval] = []
+        spans: list[LabeledInterval] = []
         covered_s = 0.0
         for stop in self.stops:
             if stop.start_s > covered_s:
-                spans.append(Interval(covered_s, stop.start_s, MOVING_LABEL))
+                spans.append(LabeledInterval(covered_s, stop.start_s, MOVING_LABEL))
             spans.append(stop)
             covered_s = stop.end_s
         if covered_s < self.run_end_s:
-            spans.append(Interval(covered_s, self.run_end_s, MOVING_LABEL))
+            spans.append(LabeledInterval(covered_s, self.run_end_s, MOVING_LABEL))
         return spans
 
     def is_stationary_at(self, time_s: float) -> bool:
@@ -78,7 +78,7 @@ def find_stops(record: RunRecord) -> StopIntervals | None:
     run_end_s = get_run_end_s(record)
     is_stationary = _mask_stationary_samples(time_s, center_w)
     last_sample = len(is_stationary) - 1
-    stops: list[Interval] = []
+    stops: list[LabeledInterval] = []
     for first, last in _find_true_segments(is_stationary):
         start_s = _find_stop_start_s(time_s, center_w, first)
         stop_end_s = run_end_s
@@ -88,7 +88,7 @@ def find_stops(record: RunRecord) -> StopIntervals | None:
         if stops and start_s - stops[-1].end_s < WINDOW_S:
             previous = stops.pop()
             start_s = previous.start_s
-        stops.append(Interval(start_s, max(stop_end_s, start_s), STATIONARY_LABEL))
+        stops.append(LabeledInterval(start_s, max(stop_end_s, start_s), STATIONARY_LABEL))
     return StopIntervals(stops, run_end_s)
 
 

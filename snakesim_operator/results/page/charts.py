@@ -25,7 +25,7 @@ MIN_LABELED_FRACTION = 0.03  # of the time axis; a shorter bar has no room for i
 
 
 @dataclass(frozen=True)
-class Line:
+class ChartLine:
     """A time series and the style of its line. NaN interrupts the line."""
 
     name: str
@@ -50,7 +50,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Bar:
+class ChartBar:
     """A horizontal bar for an interval of time, in a named row that may have several bars."""
 
     row: str
@@ -72,11 +72,11 @@ class TimeMarker:
 def make_line_chart(
     title: str,
     axis: str,
-    drawn_lines: Sequence[Line],
+    drawn_lines: Sequence[ChartLine],
     end_s: float,
     *,
     levels: Sequence[tuple[float, str]] = (),
-    shades: Sequence[Bar] = (),
+    shades: Sequence[ChartBar] = (),
     markers: Sequence[TimeMarker] = (),
     height: int = 220,
     from_zero: bool = False,
@@ -117,7 +117,7 @@ def make_line_chart(
 
 
 def make_bar_chart(
-    title: str, rows: Sequence[str], bars: Sequence[Bar], end_s: float, markers: Sequence[TimeMarker] = ()
+    title: str, rows: Sequence[str], bars: Sequence[ChartBar], end_s: float, markers: Sequence[TimeMarker] = ()
 ) -> PlotlyDict:
     """Make a Plotly chart of horizontal bars over time, such as the states of a run.
 

@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_operator.results.metrics.motion import find_stops
 from snakesim_operator.results.metrics.propulsion import find_propulsion_periods
 from snakesim_operator.results.report.snapshots import (
-    Snapshot,
+    RunSnapshot,
     count_unmeasured_contacts,
     find_snapshot,
     find_snapshots_with_force_balance,
@@ -29,7 +29,7 @@ SAME_TIME_S = 0.1
 
 
 @dataclass(frozen=True)
-class Event:
+class ReportEvent:
     """An event of a run that the report shows."""
 
     time_s: float
@@ -37,51 +37,51 @@ class Event:
     joint_index: int | None = None  # joint that begins to propel; None if the event is no hand-over
 
 
-def find_events(record: RunRecord, summary: RunSummary) -> list[Event]:
+def find_events(record: RunRecord, summary: RunSummary) -> list[ReportEvent]:
     """Find all events of a run, in order of time; none in a run without ticks."""
     if not len(record.time_s):
         return []
-    events = [Event(0.0, "Start")]
+    events = [ReportEvent(0.0, "Start")]
     events += _find_hand_over_events(record)
     events += _find_largest_force_events(record)
-    events += [Event(band.start_s, "Jam") for band in find_jam_intervals(record)[:1]]
+    events += [ReportEvent(band.start_s, "Jam") for band in find_jam_intervals(record)[:1]]
     stop_intervals = find_stops(record)
     stop = find_final_stop(record, stop_intervals) if stop_intervals and summary.locomoting_fraction else None
     if stop is None:
-        events.append(Event(get_run_end_s(record), "End"))
+        events.append(ReportEvent(get_run_end_s(record), "End"))
     else:
-        events.append(Event(stop.time_s, "Stop"))
+        events.append(ReportEvent(stop.time_s, "Stop"))
     return sorted(events, key=lambda event: event.time_s)
 
 
-def _find_hand_over_events(record: RunRecord) -> list[Event]:
+def _find_hand_over_events(record: RunRecord) -> list[ReportEvent]:
     names = [joint.name for joint in record.description.joints]
-    events: list[Event] = []
+    events: list[ReportEvent] = []
     for number, period in enumerate(find_propulsion_periods(record)):
         name = names[period.joint_index]
         words = f"{name} begins to propel" if number == 0 else f"Hand-over to {name}"
-        events.append(Event(period.start_s, words, period.joint_index))
+        events.append(ReportEvent(period.start_s, words, period.joint_index))
     return events
 
 
-def _find_largest_force_events(record: RunRecord) -> list[Event]:
+def _find_largest_force_events(record: RunRecord) -> list[ReportEvent]:
     """Return the event of the largest contact force; none in a run without contact."""
     forces_n = record.contact_peak_n
     if not np.nanmax(forces_n, initial=0.0) > 0:
         return []
     row = int(np.nanargmax(forces_n))
     at_s = float(record.time_s[row] - record.time_s[0])
-    return [Event(at_s, f"Largest contact force over 50 ms, {forces_n[row]:.0f} N")]
+    return [ReportEvent(at_s, f"Largest contact force over 50 ms, {forces_n[row]:.0f} N")]
 
 
-def select_listed_events(events: list[Event]) -> list[Event]:
+def select_listed_events(events: list[ReportEvent]) -> list[ReportEvent]:
     """Select the events that get a button: all except hand-overs between number MAX_HAND_OVERS_LISTED and the last."""
     hand_overs = [event for event in events if event.joint_index is not None]
     hidden_events = hand_overs[MAX_HAND_OVERS_LISTED:-1]
     return [event for event in events if event not in hidden_events]
 
 
-def select_snapshots_to_draw(record: RunRecord, events: list[Event]) -> list[tuple[Event, Snapshot]]:
+def select_snapshots_to_draw(record: RunRecord, events: list[ReportEvent]) -> list[tuple[ReportEvent, RunSnapshot]]:
     """Select the events of a run that get a drawing, and the snapshot of the snake that is drawn for each.
 
     Only a few hand-overs are drawn. Events whose snapshots look the same share one drawing with both descriptions.
@@ -94,7 +94,7 @@ def select_snapshots_to_draw(record: RunRecord, events: list[Event]) -> list[tup
         Pairs of event and snapshot, in order of the snapshots' time.
     """
     hand_over_times_s = _hand_over_times_to_draw(events)
-    drawn_events: list[tuple[Event, Snapshot]] = []
+    drawn_events: list[tuple[ReportEvent, RunSnapshot]] = []
     hand_overs_first = sorted(
         events, key=lambda event: event.joint_index is None
     )  # their snapshots show forces, so others join them
@@ -120,7 +120,7 @@ def select_snapshots_to_draw(record: RunRecord, events: list[Event]) -> list[tup
     return sorted(drawn_events, key=lambda pair: pair[1].time_s)
 
 
-def _hand_over_times_to_draw(events: Sequence[Event]) -> set[float]:
+def _hand_over_times_to_draw(events: Sequence[ReportEvent]) -> set[float]:
     """Return the times of at most MAX_HAND_OVERS_DRAWN hand-overs, evenly spaced in their order."""
     hand_overs = [event for event in events if event.joint_index is not None]
     count = min(len(hand_overs), MAX_HAND_OVERS_DRAWN)
@@ -128,7 +128,7 @@ def _hand_over_times_to_draw(events: Sequence[Event]) -> set[float]:
     return {hand_overs[index].time_s for index in indices}
 
 
-def _find_event_snapshot(record: RunRecord, event: Event) -> Snapshot | None:
+def _find_event_snapshot(record: RunRecord, event: ReportEvent) -> RunSnapshot | None:
     """Find the snapshot that is drawn for an event; None if the pose is unknown.
 
     Snapshots in which the controller's desired forces balance are preferred: first those with the fewest forces that
@@ -145,19 +145,19 @@ def _find_event_snapshot(record: RunRecord, event: Event) -> Snapshot | None:
     else:
         start_s = event.time_s
         end_s = event.time_s + SETTLING_S
-    candidates: list[Snapshot] = []
+    candidates: list[RunSnapshot] = []
     for snapshot in find_snapshots_with_force_balance(record, start_s, end_s):
         if event.joint_index is None or event.joint_index == snapshot.propulsion_joint:
             candidates.append(snapshot)
 
-    def rank(snapshot: Snapshot) -> tuple[int, float]:
+    def rank(snapshot: RunSnapshot) -> tuple[int, float]:
         return count_unmeasured_contacts(snapshot), abs(snapshot.time_s - event.time_s)
 
     return min(candidates, key=rank, default=find_snapshot(record, event.time_s))
 
 
 def _find_similar_snapshot(
-    record: RunRecord, snapshot: Snapshot, drawn_events: Sequence[tuple[Event, Snapshot]]
+    record: RunRecord, snapshot: RunSnapshot, drawn_events: Sequence[tuple[ReportEvent, RunSnapshot]]
 ) -> int | None:
     """Return the index of the first drawn event whose snapshot looks like this one; None if there is none."""
     for index, (_, other) in enumerate(drawn_events):
@@ -166,7 +166,7 @@ def _find_similar_snapshot(
     return None
 
 
-def _looks_alike(record: RunRecord, a: Snapshot, b: Snapshot) -> bool:
+def _looks_alike(record: RunRecord, a: RunSnapshot, b: RunSnapshot) -> bool:
     """Return whether two snapshots have nearly the same body points, or nearly the same time."""
     moved_m = np.abs(find_body_points_xy_w(record, a.row) - find_body_points_xy_w(record, b.row)).max()
     return bool(moved_m < SAME_SHAPE_M or abs(a.time_s - b.time_s) < SAME_TIME_S)

@@ -7,9 +7,9 @@ import numpy as np
 from snakesim_operator.results.metrics.motion import MOVING_LABEL, STATIONARY_LABEL, find_stops
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval
 from snakesim_operator.results.page.charts import (
-    Bar,
+    ChartBar,
+    ChartLine,
     Floats,
-    Line,
     PlotlyDict,
     TimeMarker,
     make_bar_chart,
@@ -17,7 +17,7 @@ from snakesim_operator.results.page.charts import (
     make_line_chart,
 )
 from snakesim_operator.results.report.timeline import (
-    Series,
+    TimelineSeries,
     compute_reference_rad,
     describe_state,
     find_jam_intervals,
@@ -46,10 +46,10 @@ def get_joint_color(joint: int) -> str:
     return f"--joint-{joint}"
 
 
-def draw_advance(record: RunRecord, moved: Series) -> PlotlyDict:
+def draw_advance(record: RunRecord, moved: TimelineSeries) -> PlotlyDict:
     """Draw the advance of the body over time."""
     return _make_line_chart_of_run(
-        record, "Advance over time", "advance, m", [Line(moved.label, moved.time_s, moved.values)]
+        record, "Advance over time", "advance, m", [ChartLine(moved.label, moved.time_s, moved.values)]
     )
 
 
@@ -61,22 +61,24 @@ def draw_states_and_propulsion(record: RunRecord, intervals: list[PropulsionInte
         intervals: Intervals in which joints propelled.
     """
     joint_names = [joint.name for joint in record.description.joints]
-    drawn: list[Bar] = []
+    drawn: list[ChartBar] = []
     stop_intervals = find_stops(record)
     if stop_intervals is not None:
         for span in stop_intervals.all_intervals:
-            drawn.append(Bar("motion", span.start_s, span.end_s, span.label, MOTION_COLORS[span.label]))
+            drawn.append(ChartBar("motion", span.start_s, span.end_s, span.label, MOTION_COLORS[span.label]))
     for band in find_state_intervals(record):
-        drawn.append(Bar("control", band.start_s, band.end_s, describe_state(band.label), f"--{band.label.lower()}"))
+        drawn.append(
+            ChartBar("control", band.start_s, band.end_s, describe_state(band.label), f"--{band.label.lower()}")
+        )
     for band in find_jam_intervals(record):
-        drawn.append(Bar("jam", band.start_s, band.end_s, "jammed", "--bad"))
+        drawn.append(ChartBar("jam", band.start_s, band.end_s, "jammed", "--bad"))
     rows_with_bars = {bar.row for bar in drawn}
     rows = [row for row in ("motion", "control", "jam") if row in rows_with_bars]
 
     for interval in intervals:
         name = joint_names[interval.joint_index]
         words = f"{interval.duration_s:.1f} s"
-        drawn.append(Bar(name, interval.start_s, interval.end_s, words, get_joint_color(interval.joint_index)))
+        drawn.append(ChartBar(name, interval.start_s, interval.end_s, words, get_joint_color(interval.joint_index)))
     head_to_tail = sorted({interval.joint_index for interval in intervals}, reverse=True)
     rows += [joint_names[joint] for joint in head_to_tail]
     return make_bar_chart(
@@ -156,16 +158,16 @@ def draw_contacts(record: RunRecord) -> list[PlotlyDict]:
     ]
 
 
-def _make_line(record: RunRecord, name: str, values: Floats, *style: Any, **more_style: Any) -> Line:
-    return Line(name, record.time_s - get_time_origin_s(record), values, *style, **more_style)
+def _make_line(record: RunRecord, name: str, values: Floats, *style: Any, **more_style: Any) -> ChartLine:
+    return ChartLine(name, record.time_s - get_time_origin_s(record), values, *style, **more_style)
 
 
 def _make_line_chart_of_run(
-    record: RunRecord, label: str, axis: str, drawn: list[Line], **chart_options: Any
+    record: RunRecord, label: str, axis: str, drawn: list[ChartLine], **chart_options: Any
 ) -> PlotlyDict:
     return make_line_chart(label, axis, drawn, get_run_end_s(record), markers=mark_faults(record), **chart_options)
 
 
-def _shade_propulsion(intervals: list[PropulsionInterval], joint: int) -> list[Bar]:
+def _shade_propulsion(intervals: list[PropulsionInterval], joint: int) -> list[ChartBar]:
     of_joint = [interval for interval in intervals if interval.joint_index == joint]
-    return [Bar("", interval.start_s, interval.end_s, "", get_joint_color(joint)) for interval in of_joint]
+    return [ChartBar("", interval.start_s, interval.end_s, "", get_joint_color(joint)) for interval in of_joint]

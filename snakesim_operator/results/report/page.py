@@ -11,7 +11,12 @@ from snakesim_hal.wire.messages import TICK_TIMES
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval, find_propulsion_intervals
 from snakesim_operator.results.page.html import render_page
 from snakesim_operator.results.report import figures
-from snakesim_operator.results.report.events import Event, find_events, select_listed_events, select_snapshots_to_draw
+from snakesim_operator.results.report.events import (
+    ReportEvent,
+    find_events,
+    select_listed_events,
+    select_snapshots_to_draw,
+)
 from snakesim_operator.results.report.playback import make_playback
 from snakesim_operator.results.report.polygon import draw_force_polygon, find_common_force_scale, format_subscript
 from snakesim_operator.results.report.pushing import make_pushing_section
@@ -117,7 +122,7 @@ def render_playback_page(record: RunRecord, summary: RunSummary) -> str:
     )
 
 
-def _make_snapshot_cards(record: RunRecord, events: list[Event]) -> list[dict[str, Any]]:
+def _make_snapshot_cards(record: RunRecord, events: list[ReportEvent]) -> list[dict[str, Any]]:
     """Make the content of the snapshot cards of the report: for each drawn event its drawings as SVG, and numbers.
 
     Args:

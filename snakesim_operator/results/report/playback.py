@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
-from snakesim_hal.wire.messages import ControlState, World, WorldContact
+from snakesim_hal.wire.messages import ControlState, WorldContact, WorldModel
 from snakesim_operator.results.metrics.motion import MOVING_LABEL, STATIONARY_LABEL, StopIntervals, find_stops
 from snakesim_operator.results.page.svg import Point, make_element, make_svg
 from snakesim_operator.results.report.labels import LabelPlacer
@@ -24,14 +24,14 @@ from snakesim_operator.results.report.top_view import draw_body, draw_ground, dr
 from snakesim_operator.results.report.view import (
     MAX_ARROW_LENGTH,
     MAX_MEASURED_ARROW_RATIO,
-    Viewport,
+    MapViewport,
     compute_map_viewport,
     find_body_points_xy_w,
 )
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import get_run_end_s, get_time_origin_s
 
-MessageT = TypeVar("MessageT", ControlState, World)
+MessageT = TypeVar("MessageT", ControlState, WorldModel)
 MAX_FRAMES = 300
 MAX_MAPS = 80  # of a whole run
 MAX_PATH_POINTS = 60
@@ -42,7 +42,7 @@ SHOWN_FOR_S = 0.3  # an older message is not shown: control and guidance publish
 
 
 @dataclass(frozen=True)
-class Playback:
+class MapPlayback:
     """The map as markup, and the frames as data for playback.js."""
 
     picture: Markup
@@ -51,7 +51,7 @@ class Playback:
     has_measured_forces: bool
 
 
-def make_playback(record: RunRecord) -> Playback | None:
+def make_playback(record: RunRecord) -> MapPlayback | None:
     """Make the playback of a run; None if the pose is never known."""
     rows_with_pose = np.flatnonzero(record.has_pose)
     if not len(rows_with_pose):
@@ -102,12 +102,12 @@ def make_playback(record: RunRecord) -> Playback | None:
         "maps": maps,
         "paths": paths,
     }
-    return Playback(
+    return MapPlayback(
         Markup(_draw_first_frame(record, view, body_points_w[0])), data, has_desired_forces, has_measured_forces
     )
 
 
-def _draw_first_frame(record: RunRecord, view: Viewport, nodes: Floats) -> str:
+def _draw_first_frame(record: RunRecord, view: MapViewport, nodes: Floats) -> str:
     """Draw the map and the snake, with empty groups that playback.js fills."""
     labels = LabelPlacer(view.width, view.height)
     snake = make_element("g", draw_body(record, view, nodes, labels), class_="snake")
@@ -139,7 +139,7 @@ def _describe_motion(stop_intervals: StopIntervals | None, time_s: float, state:
 
 
 def _collect_perceived_maps(
-    record: RunRecord, view: Viewport, rows: NDArray[np.intp]
+    record: RunRecord, view: MapViewport, rows: NDArray[np.intp]
 ) -> tuple[list[list[list[float]]], list[int]]:
     """Collect some of the perceived maps that guidance published, for the playback.
 
@@ -159,7 +159,7 @@ def _collect_perceived_maps(
 
 
 def _collect_planned_paths(
-    record: RunRecord, view: Viewport, rows: NDArray[np.intp]
+    record: RunRecord, view: MapViewport, rows: NDArray[np.intp]
 ) -> tuple[list[list[float]], list[int]]:
     """Collect the paths that navigation planned, for the playback.
 
@@ -177,7 +177,7 @@ def _collect_planned_paths(
     return paths, _find_latest_indices(record, rows, [trajectory.timestamp_ns or 0 for trajectory in planned])
 
 
-def _flatten_coordinates(view: Viewport, points_w: Floats) -> list[float]:
+def _flatten_coordinates(view: MapViewport, points_w: Floats) -> list[float]:
     """Convert world points to coordinates of the drawing: x, y, x, y, ..."""
     return [round(part, 1) for point in points_w for part in view.to_pixels(point)]
 
@@ -204,7 +204,7 @@ def _find_latest_messages(
     return latest
 
 
-def _find_force_scale(states: Sequence[ControlState | None], worlds: Sequence[World | None]) -> float:
+def _find_force_scale(states: Sequence[ControlState | None], worlds: Sequence[WorldModel | None]) -> float:
     """Find the force scale, in units of the drawing per newton, at which most arrows have their full length.
 
     The desired forces set the scale; without any, the measured forces.
@@ -220,7 +220,7 @@ def _find_force_scale(states: Sequence[ControlState | None], worlds: Sequence[Wo
 
 
 def _make_desired_arrows(
-    view: Viewport, state: ControlState | None, world: World | None, pixels_per_n: float
+    view: MapViewport, state: ControlState | None, world: WorldModel | None, pixels_per_n: float
 ) -> tuple[list[float], list[str]]:
     """Make the arrows of the desired forces, and last of their resultant, and the CSS classes of each arrow."""
     balance = make_force_balance(state) if state is not None else None
@@ -233,16 +233,16 @@ def _make_desired_arrows(
     return _make_arrow_coordinates(view, forces, pixels_per_n), [*contact_classes, resultant_class]
 
 
-def _make_measured_arrows(view: Viewport, world: World | None, pixels_per_n: float) -> list[float]:
+def _make_measured_arrows(view: MapViewport, world: WorldModel | None, pixels_per_n: float) -> list[float]:
     forces = [(view.to_pixels(contact.position_w), np.array(contact.force_w[:2])) for contact in _get_contacts(world)]
     return _make_arrow_coordinates(view, forces, pixels_per_n)
 
 
-def _get_contacts(world: World | None) -> list[WorldContact]:
+def _get_contacts(world: WorldModel | None) -> list[WorldContact]:
     return world.contacts if world is not None else []
 
 
-def _make_arrow_coordinates(view: Viewport, forces: list[tuple[Point, Floats]], pixels_per_n: float) -> list[float]:
+def _make_arrow_coordinates(view: MapViewport, forces: list[tuple[Point, Floats]], pixels_per_n: float) -> list[float]:
     """Return four coordinates for each arrow: x and y of its tail, then of its tip.
 
     An arrow that is too long is cut, so that one impact does not dwarf the other forces.

@@ -11,7 +11,7 @@ from snakesim_hal.model.scene import compute_normal_gravity_m_s2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.metrics.map_score import MapScore, score_map
 from snakesim_operator.results.metrics.motion import find_stops
-from snakesim_operator.results.page.charts import Bar, Line, PlotlyDict, make_bar_chart, make_line_chart
+from snakesim_operator.results.page.charts import ChartBar, ChartLine, PlotlyDict, make_bar_chart, make_line_chart
 from snakesim_operator.results.report.timeline import find_longest_reason, find_state_intervals
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import (
@@ -119,8 +119,8 @@ def _draw_contact_forces(record: RunRecord) -> PlotlyDict:
         time_s = world.timestamp_ns * 1e-9 - get_time_origin_s(record)
         measured.append(ForceSample(time_s, world.timestamp_ns, _sum_forces(world.contacts)))
     drawn = [
-        Line("desired at all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
-        Line("measured contacts", _times_s(measured), _forward_forces_n(record, measured), "--measured"),
+        ChartLine("desired at all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
+        ChartLine("measured contacts", _times_s(measured), _forward_forces_n(record, measured), "--measured"),
     ]
     normal_gravity_m_s2 = compute_normal_gravity_m_s2(record.config.scene)
     load_n = normal_gravity_m_s2 * sum(link.mass_kg for link in record.description.links)
@@ -162,10 +162,10 @@ def _draw_pushed_obstacles(record: RunRecord) -> PlotlyDict:
     }
     strongest = sorted(spans, key=lambda name: -impulse_n_s[name])[:MAX_OBSTACLES]
     shown = sorted(strongest, key=lambda name: _sort_key(spans[name][0]))
-    drawn: list[Bar] = []
+    drawn: list[ChartBar] = []
     for name in shown:
         for span in _merge_adjacent(spans[name]):
-            drawn.append(Bar(name, span.start_s, span.end_s, f"{span.force_n:.0f} N", "--reference"))
+            drawn.append(ChartBar(name, span.start_s, span.end_s, f"{span.force_n:.0f} N", "--reference"))
     return make_bar_chart("Obstacles pushed off over time", shown, drawn, get_run_end_s(record))
 
 
@@ -249,9 +249,9 @@ def _score_maps(record: RunRecord) -> tuple[MapScore | None, PlotlyDict | None]:
         return None, None
     time_s = np.array(times_s)
     drawn = [
-        Line("position error, median, mm", time_s, np.array(median_errors_mm), "--measured"),
-        Line("missed", time_s, np.array(miss_counts, dtype=np.float64), "--bad", shape="hv"),
-        Line("ghosts", time_s, np.array(ghost_counts, dtype=np.float64), "--commanded", shape="hv"),
+        ChartLine("position error, median, mm", time_s, np.array(median_errors_mm), "--measured"),
+        ChartLine("missed", time_s, np.array(miss_counts, dtype=np.float64), "--bad", shape="hv"),
+        ChartLine("ghosts", time_s, np.array(ghost_counts, dtype=np.float64), "--commanded", shape="hv"),
     ]
     label = "Map against truth over time"
     return total, make_line_chart(label, "mm, or how many", drawn, get_run_end_s(record), height=190, from_zero=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.results.metrics.force_tracking import MIN_CONTACT_FORCE_N, ForcePair, pair_forces
 from snakesim_operator.results.report.top_view import find_outline_w
 from snakesim_operator.results.run_log import RunRecord
@@ -135,7 +135,7 @@ def _measure_gap_m(
     return float((axis_distances_m - radii_m).min())
 
 
-def _sample_outline_w(obstacle: Obstacle) -> Floats:
+def _sample_outline_w(obstacle: KnownObstacle) -> Floats:
     """Sample points on the outline of an obstacle, also between the corners of a box, (n, 2)."""
     corners = find_outline_w(obstacle)
     next_corners = np.roll(corners, -1, axis=0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import ControlState, World, WorldContact
+from snakesim_hal.wire.messages import ControlState, WorldContact, WorldModel
 from snakesim_operator.results.metrics.force_tracking import is_contact_measured
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import get_report_time_s
@@ -83,7 +83,7 @@ class ForceBalance:
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class RunSnapshot:
     """State of a run at one time."""
 
     time_s: float  # on the time axis
@@ -125,7 +125,7 @@ def make_force_balance(state: ControlState) -> ForceBalance | None:
 
 def find_snapshots_with_force_balance(
     record: RunRecord, start_s: float = 0.0, end_s: float = math.inf
-) -> list[Snapshot]:
+) -> list[RunSnapshot]:
     """Find the snapshots during locomotion with a propulsion joint in which the desired forces balance.
 
     Args:
@@ -138,7 +138,7 @@ def find_snapshots_with_force_balance(
     """
     if not len(record.time_s):
         return []
-    snapshots: list[Snapshot] = []
+    snapshots: list[RunSnapshot] = []
     for state in record.control_states:
         time_s = get_report_time_s(record, state)
         if not start_s <= time_s <= end_s:
@@ -161,7 +161,7 @@ def _is_balanced(balance: ForceBalance) -> bool:
     return is_closed and not min(balance.magnitudes_n) <= 0
 
 
-def find_snapshot(record: RunRecord, time_s: float) -> Snapshot | None:
+def find_snapshot(record: RunRecord, time_s: float) -> RunSnapshot | None:
     """Find the snapshot at a time on the time axis, without desired forces; None if the pose is unknown then."""
     row = record.find_nearest_row(float(record.time_s[0]) + time_s)
     if record.find_body_points_w(row) is None:
@@ -171,13 +171,13 @@ def find_snapshot(record: RunRecord, time_s: float) -> Snapshot | None:
     return _make_snapshot(record, time_s, last_state, None)
 
 
-def project_measured_force_n(snapshot: Snapshot, direction_w: Floats) -> float:
+def project_measured_force_n(snapshot: RunSnapshot, direction_w: Floats) -> float:
     """Project the sum of the measured contact forces onto a direction, (2,) of any length. The result is in N."""
     unit = direction_w / max(float(np.hypot(*direction_w)), 1e-12)
     return sum(float(np.dot(contact.force_w[:2], unit)) for contact in snapshot.measured_contacts)
 
 
-def count_unmeasured_contacts(snapshot: Snapshot) -> int:
+def count_unmeasured_contacts(snapshot: RunSnapshot) -> int:
     """Count the desired contact forces at whose obstacles no contact was measured."""
     if snapshot.force_balance is None:
         return 0
@@ -188,13 +188,13 @@ def count_unmeasured_contacts(snapshot: Snapshot) -> int:
 
 def _make_snapshot(
     record: RunRecord, time_s: float, state: ControlState | None, balance: ForceBalance | None
-) -> Snapshot:
+) -> RunSnapshot:
     robot_time_s = float(record.time_s[0]) + time_s
     tolerance_s = SIMULTANEOUS_S if balance is not None else 3 * SIMULTANEOUS_S
     world = _find_world_near(record, robot_time_s, tolerance_s)
     names = [joint.name for joint in record.description.joints]
     propelling = state.propulsion_joint if state is not None else None
-    return Snapshot(
+    return RunSnapshot(
         time_s=time_s,
         row=record.find_nearest_row(robot_time_s),
         state=state,
@@ -204,7 +204,7 @@ def _make_snapshot(
     )
 
 
-def _find_world_near(record: RunRecord, robot_time_s: float, tolerance_s: float) -> World | None:
+def _find_world_near(record: RunRecord, robot_time_s: float, tolerance_s: float) -> WorldModel | None:
     """Return the world model whose timestamp is nearest to a robot time, or None if none is within a tolerance in s."""
     nearest = min(record.worlds, key=lambda world: abs(world.timestamp_ns * 1e-9 - robot_time_s), default=None)
     if nearest is None or abs(nearest.timestamp_ns * 1e-9 - robot_time_s) > tolerance_s:

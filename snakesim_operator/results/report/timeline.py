@@ -7,13 +7,13 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.metrics.motion import StopIntervals
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import measure_route_position_m
 from snakesim_operator.results.time_axis import (
-    Interval,
+    LabeledInterval,
     get_report_time_s,
     get_time_origin_s,
     list_control_state_spans,
@@ -26,7 +26,7 @@ MIN_MISMATCH_S = 1.0  # control measures motion over a preceding window of this 
 
 
 @dataclass(frozen=True)
-class Series:
+class TimelineSeries:
     """Values over time with a label that names them."""
 
     time_s: Floats
@@ -39,7 +39,7 @@ def describe_state(state: str) -> str:
     return STATES.get(state, state)
 
 
-def find_state_intervals(record: RunRecord) -> list[Interval]:
+def find_state_intervals(record: RunRecord) -> list[LabeledInterval]:
     """Find the intervals of the locomotion states that control reported; each lasts until the next report."""
     return merge_equal_reports(record, [state.state for state in record.control_states])
 
@@ -81,7 +81,7 @@ def find_false_not_locomoting_reports(
     )
 
 
-def find_longest_reason(record: RunRecord, interval: Interval) -> str:
+def find_longest_reason(record: RunRecord, interval: LabeledInterval) -> str:
     """Return the reason for no motion that control reported for longest in an interval; without any, STANDING_STILL."""
     duration_s_by_reason: dict[str, float] = {}
     for start_s, end_s, state in list_control_state_spans(record):
@@ -91,7 +91,7 @@ def find_longest_reason(record: RunRecord, interval: Interval) -> str:
     return max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason], default="") or STANDING_STILL
 
 
-def find_jam_intervals(record: RunRecord) -> list[Interval]:
+def find_jam_intervals(record: RunRecord) -> list[LabeledInterval]:
     """Find the intervals in which the controller reported a jam."""
     intervals = merge_equal_reports(record, ["jammed" if state.jammed else None for state in record.control_states])
     return [interval for interval in intervals if interval.label == "jammed"]
@@ -130,17 +130,17 @@ def compute_reference_rad(record: RunRecord, joint: int) -> Floats:
         timestamps_s = np.array([state.timestamp_ns * 1e-9 for state in states])
         angles = np.array([state.reference_rad[joint] for state in states])
         reference = np.interp(record.time_s, timestamps_s, angles, left=np.nan, right=angles[-1])
-    in_position = record.mode[:, joint] == Mode.POSITION
+    in_position = record.mode[:, joint] == JointMode.POSITION
     return np.where(in_position, record.target[:, joint], reference)
 
 
 def select_commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
     """Return the commanded torque of a joint in torque mode, (n,); NaN in all other modes."""
-    return np.where(record.mode[:, joint] == Mode.TORQUE, record.target[:, joint], np.nan)
+    return np.where(record.mode[:, joint] == JointMode.TORQUE, record.target[:, joint], np.nan)
 
 
 @lru_cache(maxsize=2)  # chart and comparison of two runs need the same series
-def measure_distance(record: RunRecord) -> Series | None:
+def measure_distance(record: RunRecord) -> TimelineSeries | None:
     """Measure how far the robot advanced since the first tick, as a series over time.
 
     The best available measure is used: the mean position of the body along the route; without a route, the distance of
@@ -164,16 +164,18 @@ def measure_distance(record: RunRecord) -> Series | None:
     route_positions_m = [measure_route_position_m(record, int(row)) for row in rows]
     if None not in route_positions_m:
         along_m = np.array(route_positions_m, dtype=np.float64)
-        return Series(time_s, along_m - along_m[0], "advance along the route, mean over the body")
+        return TimelineSeries(time_s, along_m - along_m[0], "advance along the route, mean over the body")
     displacement_w = record.position_w_m[rows, :2] - record.position_w_m[rows[0], :2]
-    return Series(time_s, np.hypot(*displacement_w.T), "distance of the tail end from where it was")
+    return TimelineSeries(time_s, np.hypot(*displacement_w.T), "distance of the tail end from where it was")
 
 
-def read_reported_distance(record: RunRecord) -> Series | None:
+def read_reported_distance(record: RunRecord) -> TimelineSeries | None:
     """Return the advance of the tail along the path, as the controller reported it; None if it is unknown."""
     states = [state for state in record.control_states if state.path_s_m is not None]
     if len(states) < 2:
         return None
     along = np.array([state.path_s_m for state in states], dtype=np.float64)
     timestamps_s = np.array([get_report_time_s(record, state) for state in states])
-    return Series(timestamps_s, along - along[0], "advance of the tail along the path, as the controller knew it")
+    return TimelineSeries(
+        timestamps_s, along - along[0], "advance of the tail along the path, as the controller knew it"
+    )

@@ -7,7 +7,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.model.scene import compute_normal_gravity_m_s2
-from snakesim_hal.wire.messages import Obstacle, WorldContact
+from snakesim_hal.wire.messages import KnownObstacle, WorldContact
 from snakesim_operator.results.page.svg import (
     draw_arrow,
     draw_polyline,
@@ -22,13 +22,13 @@ from snakesim_operator.results.page.svg import (
 )
 from snakesim_operator.results.report.labels import LabelPlacer
 from snakesim_operator.results.report.polygon import format_subscript
-from snakesim_operator.results.report.snapshots import ForceBalance, Snapshot
+from snakesim_operator.results.report.snapshots import ForceBalance, RunSnapshot
 from snakesim_operator.results.report.view import (
     FOOTER_HEIGHT,
     MARGIN,
     MAX_ARROW_LENGTH,
     MAX_MEASURED_ARROW_RATIO,
-    Viewport,
+    MapViewport,
     find_body_points_xy_w,
     find_half_extent_m,
 )
@@ -44,7 +44,7 @@ NAME_GAPS = (16.0, 24.0, 34.0)  # distances of the labels of head and tail to tr
 MEASURED_OFFSET = 7.0  # of a measured force from its contact, so that its arrow does not cover the desired force
 
 
-def draw_top_view(record: RunRecord, snapshot: Snapshot, view: Viewport) -> str:
+def draw_top_view(record: RunRecord, snapshot: RunSnapshot, view: MapViewport) -> str:
     """Draw the snake, the obstacles and the forces of one snapshot as SVG.
 
     Args:
@@ -77,14 +77,14 @@ def draw_top_view(record: RunRecord, snapshot: Snapshot, view: Viewport) -> str:
     return make_svg(view.width, view.height, description, *parts, draw_scales(view))
 
 
-def draw_ground(record: RunRecord, view: Viewport, labels: LabelPlacer) -> str:
+def draw_ground(record: RunRecord, view: MapViewport, labels: LabelPlacer) -> str:
     """Draw the route of the scene and all obstacles."""
     normal_gravity_m_s2 = compute_normal_gravity_m_s2(record.config.scene)
     obstacles = [_draw_obstacle(item, normal_gravity_m_s2, view, labels) for item in record.placed_obstacles]
     return _draw_route(record, view) + "".join(obstacles)
 
 
-def _draw_route(record: RunRecord, view: Viewport) -> str:
+def _draw_route(record: RunRecord, view: MapViewport) -> str:
     route = record.route
     if route is None:
         return ""
@@ -94,7 +94,7 @@ def _draw_route(record: RunRecord, view: Viewport) -> str:
     return draw_polyline(points, "route")
 
 
-def _draw_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float, view: Viewport, labels: LabelPlacer) -> str:
+def _draw_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float, view: MapViewport, labels: LabelPlacer) -> str:
     """Draw one obstacle as SVG, with a tooltip; empty if it is not in the window.
 
     Args:
@@ -103,7 +103,7 @@ def _draw_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float, view: Viewp
         view: Window and scale of the drawing.
         labels: Labels of the drawing, which avoid the obstacle.
     """
-    obstacle: Obstacle = item.obstacle
+    obstacle: KnownObstacle = item.obstacle
     if not view.is_drawn(obstacle):
         return ""
     if item.walkable:
@@ -135,7 +135,7 @@ def _describe_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float) -> str:
     return ", ".join(words)
 
 
-def find_outline_w(obstacle: Obstacle) -> Floats:
+def find_outline_w(obstacle: KnownObstacle) -> Floats:
     """Find points on the outline of an obstacle, (n, 2) in the world: the corners of a box, or points on a circle."""
     center = np.array(obstacle.position_w[:2])
     if obstacle.shape != "box":
@@ -148,7 +148,7 @@ def find_outline_w(obstacle: Obstacle) -> Floats:
     return center + corners @ np.array([(cos, sin), (-sin, cos)])
 
 
-def draw_body(record: RunRecord, view: Viewport, body_points_w: Floats, labels: LabelPlacer) -> str:
+def draw_body(record: RunRecord, view: MapViewport, body_points_w: Floats, labels: LabelPlacer) -> str:
     """Draw the snake's links as thick lines with round ends, then its joints as dots, as SVG.
 
     The links are drawn tail to head, so that every link shows its round end over the link behind it.
@@ -181,7 +181,7 @@ def draw_body(record: RunRecord, view: Viewport, body_points_w: Floats, labels: 
     return "".join(parts)
 
 
-def _draw_measured_force(contact: WorldContact, view: Viewport, labels: LabelPlacer) -> str:
+def _draw_measured_force(contact: WorldContact, view: MapViewport, labels: LabelPlacer) -> str:
     """Draw a measured force beside the desired one. An arrow that is too long is cut and labeled with its magnitude."""
     magnitude_n = math.hypot(*contact.force_w[:2])
     cut = min(1.0, MAX_MEASURED_ARROW_RATIO * MAX_ARROW_LENGTH / max(magnitude_n * view.pixels_per_n, 1e-9))
@@ -194,7 +194,7 @@ def _draw_measured_force(contact: WorldContact, view: Viewport, labels: LabelPla
     return drawn
 
 
-def _draw_solved_forces(snapshot: Snapshot, view: Viewport, labels: LabelPlacer) -> str:
+def _draw_solved_forces(snapshot: RunSnapshot, view: MapViewport, labels: LabelPlacer) -> str:
     """Draw the controller's desired contact forces and their resultant as arrows, in SVG; empty without any.
 
     Args:
@@ -224,7 +224,7 @@ def _draw_solved_forces(snapshot: Snapshot, view: Viewport, labels: LabelPlacer)
     return "".join(parts)
 
 
-def _label_push_point(index: int, balance: ForceBalance, view: Viewport, labels: LabelPlacer) -> str:
+def _label_push_point(index: int, balance: ForceBalance, view: MapViewport, labels: LabelPlacer) -> str:
     """Label a push-point: the magnitude of its force at the tip of the arrow, and its name behind the contact."""
     contact = balance.contacts[index]
     magnitude_n = balance.magnitudes_n[index]
@@ -236,7 +236,7 @@ def _label_push_point(index: int, balance: ForceBalance, view: Viewport, labels:
     return force + name
 
 
-def draw_scales(view: Viewport) -> str:
+def draw_scales(view: MapViewport) -> str:
     """Draw the scale bars of length and of force, and the axes x and y, at the bottom of a top view.
 
     Args:

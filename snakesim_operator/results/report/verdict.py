@@ -38,7 +38,7 @@ Kind = Literal["good", "poor", "bad"]
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RunVerdict:
     """A text about the result of a run, and its rating."""
 
     rating: Kind
@@ -46,7 +46,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Stop:
+class LocomotionStop:
     """The end of locomotion, before the end of the run."""
 
     time_s: float
@@ -54,18 +54,18 @@ class Stop:
     is_intended: bool
 
 
-def make_verdict(record: RunRecord, summary: RunSummary) -> Verdict:
+def make_verdict(record: RunRecord, summary: RunSummary) -> RunVerdict:
     """Make the verdict on a run, with a sentence about numbers that are estimates."""
     verdict = _judge_run(record, summary)
     estimates = "; ".join(get_estimates(summary).describe())
     if not estimates:
         return verdict
-    return Verdict(verdict.rating, f"{verdict.text} {end_with_full_stop(estimates.capitalize())}")
+    return RunVerdict(verdict.rating, f"{verdict.text} {end_with_full_stop(estimates.capitalize())}")
 
 
-def _judge_run(record: RunRecord, summary: RunSummary) -> Verdict:
+def _judge_run(record: RunRecord, summary: RunSummary) -> RunVerdict:
     if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
-        return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
+        return RunVerdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
     stopping_faults = [fault for fault in summary.faults if fault.reach == "robot"]
     if stopping_faults:
         return _judge_stopped_run(record, summary, stopping_faults[0])
@@ -76,11 +76,11 @@ def _judge_run(record: RunRecord, summary: RunSummary) -> Verdict:
     if stop_intervals is None:
         moved = describe_distance(record, summary)
         rest = f"{describe_hand_overs(summary)}{describe_trouble(summary)}.{describe_ending(summary.ended)}"
-        return Verdict("poor", f"{moved}; {rest}")
+        return RunVerdict("poor", f"{moved}; {rest}")
     return _judge_motion(record, summary, stop_intervals)
 
 
-def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> Verdict:
+def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> RunVerdict:
     """Make the verdict on a run that a fault stopped."""
     start_s = float(record.time_s[0]) if len(record.time_s) else 0.0
     at_s = fault.tick / summary.rate_hz - start_s
@@ -88,10 +88,10 @@ def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> 
     stopped = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {end_with_full_stop(fault.cause)}"
     moved = describe_distance(record, summary)
     before = ", ".join([moved[0].lower() + moved[1:], *describe_refused_commands(summary)])
-    return Verdict("bad", f"{stopped}{describe_last_control_state(record, at_s)} Before that: {before}.")
+    return RunVerdict("bad", f"{stopped}{describe_last_control_state(record, at_s)} Before that: {before}.")
 
 
-def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> Verdict:
+def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> RunVerdict:
     """Judge a run that tests the joints and is not meant to locomote: it is good if it moved every joint.
 
     A joint was moved if its target deviated by more than MOVED_RAD from the median of its targets.
@@ -120,10 +120,10 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> V
     ending = describe_ending(summary.ended)
     words = f"{words} Ran for {summary.duration_s:.1f} s; {describe_trouble(summary)}.{ending}"
     is_good = all_joints_moved and summary.ended == COMPLETE
-    return Verdict("good" if is_good else "poor", words)
+    return RunVerdict("good" if is_good else "poor", words)
 
 
-def _judge_motion(record: RunRecord, summary: RunSummary, stop_intervals: StopIntervals) -> Verdict:
+def _judge_motion(record: RunRecord, summary: RunSummary, stop_intervals: StopIntervals) -> RunVerdict:
     """Judge a run that no fault stopped and whose pose is known, by the measured stop_intervals.
 
     The run is poor if it did not locomote, if it jammed or was stationary for long, or if it ended early or behind its
@@ -140,7 +140,7 @@ def _judge_motion(record: RunRecord, summary: RunSummary, stop_intervals: StopIn
     if _did_not_locomote(summary):
         outcome = "Jammed" if summary.jammed else "Did not locomote"
         reason = end_with_full_stop(_explain_no_locomotion(summary))
-        return Verdict("poor", f"{outcome}: {reason} {moved}; {trouble}.{ending}")
+        return RunVerdict("poor", f"{outcome}: {reason} {moved}; {trouble}.{ending}")
 
     pushed = describe_hand_overs(summary) or describe_pushed_obstacles(record)
     stop = find_final_stop(record, stop_intervals)
@@ -150,7 +150,7 @@ def _judge_motion(record: RunRecord, summary: RunSummary, stop_intervals: StopIn
         outcome = "Jammed" if summary.jammed else "Stopped"
         reason = stop.reason.removeprefix("jammed: ")
         stopped = f"{outcome} at {stop.time_s:.1f} s of {get_run_end_s(record):.1f} s: {reason}"
-        return Verdict("poor", f"{stopped} {moved}; {pushed}{trouble}.{ending}")
+        return RunVerdict("poor", f"{stopped} {moved}; {pushed}{trouble}.{ending}")
 
     still_moving = ""
     if stop is None and not ending:
@@ -166,7 +166,7 @@ def _judge_motion(record: RunRecord, summary: RunSummary, stop_intervals: StopIn
     went_backward = (summary.path_distance_m or 0.0) < 0
     is_distance_unknown = get_distance_m(summary) is None
     is_poor = ended_early or went_backward or is_distance_unknown
-    return Verdict("poor" if is_poor else "good", words)
+    return RunVerdict("poor" if is_poor else "good", words)
 
 
 def _did_not_locomote(summary: RunSummary) -> bool:
@@ -184,7 +184,7 @@ def _explain_no_locomotion(summary: RunSummary) -> str:
     return summary.last_reason or STANDING_STILL
 
 
-def find_final_stop(record: RunRecord, stop_intervals: StopIntervals) -> Stop | None:
+def find_final_stop(record: RunRecord, stop_intervals: StopIntervals) -> LocomotionStop | None:
     """Find when the body came to rest until the end of the run, as measured, and the reason that control reported.
 
     Returns:
@@ -195,4 +195,4 @@ def find_final_stop(record: RunRecord, stop_intervals: StopIntervals) -> Stop | 
         return None
     reported = [state for state in record.control_states if get_report_time_s(record, state) >= stop.start_s]
     is_intended = bool(reported) and reported[-1].state == "Idle"
-    return Stop(stop.start_s, end_with_full_stop(find_longest_reason(record, stop)), is_intended)
+    return LocomotionStop(stop.start_s, end_with_full_stop(find_longest_reason(record, stop)), is_intended)

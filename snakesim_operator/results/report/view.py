@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.results.page.svg import Point
-from snakesim_operator.results.report.snapshots import Snapshot
+from snakesim_operator.results.report.snapshots import RunSnapshot
 from snakesim_operator.results.run_log import RunRecord
 
 MAX_ARROW_LENGTH = 72.0  # length of the arrow of the strongest force, in units of the drawing
@@ -24,7 +24,7 @@ FOOTER_HEIGHT = 30.0  # height of the area below the map with the scale bars
 
 
 @dataclass(frozen=True)
-class Viewport:
+class MapViewport:
     """A window of the ground, with a scale for length and one for force. All snapshots of a report share the scales."""
 
     min_corner_w: Floats  # (2,), lower left corner in m, in the rotated frame
@@ -50,7 +50,7 @@ class Viewport:
         x, y = self.rotate(np.asarray(vector_w, dtype=np.float64)[:2])
         return float(start[0] + units * x), float(start[1] - units * y)
 
-    def is_drawn(self, obstacle: Obstacle) -> bool:
+    def is_drawn(self, obstacle: KnownObstacle) -> bool:
         """Return whether an obstacle is drawn: only if it fits completely, unless it is too large for the window."""
         x, y = self.to_pixels(obstacle.position_w)
         half_extent = self.pixels_per_m * find_half_extent_m(obstacle)
@@ -61,12 +61,12 @@ class Viewport:
         return half_extent <= x <= map_width - half_extent and half_extent <= y <= map_height - half_extent
 
 
-def find_half_extent_m(obstacle: Obstacle) -> float:
+def find_half_extent_m(obstacle: KnownObstacle) -> float:
     """Return how far an obstacle extends from its center on the ground, in m."""
     return max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2]))
 
 
-def compute_viewports(record: RunRecord, snapshots: list[Snapshot], width: float) -> list[Viewport]:
+def compute_viewports(record: RunRecord, snapshots: list[RunSnapshot], width: float) -> list[MapViewport]:
     """Compute a viewport around the body for each snapshot, all of one size and one scale, with room for arrows."""
     if not snapshots:
         return []
@@ -76,7 +76,7 @@ def compute_viewports(record: RunRecord, snapshots: list[Snapshot], width: float
     return _fit_viewports(record, bodies, pixels_per_n, width)
 
 
-def _max_force_n(snapshots: list[Snapshot]) -> float:
+def _max_force_n(snapshots: list[RunSnapshot]) -> float:
     """Return the largest desired force in N; without any, the largest measured force."""
     desired_n: list[float] = []
     measured_n: list[float] = []
@@ -90,7 +90,9 @@ def _max_force_n(snapshots: list[Snapshot]) -> float:
     return max(desired_n or measured_n, default=0.0)
 
 
-def compute_map_viewport(record: RunRecord, body_points_w: list[Floats], pixels_per_n: float, width: float) -> Viewport:
+def compute_map_viewport(
+    record: RunRecord, body_points_w: list[Floats], pixels_per_n: float, width: float
+) -> MapViewport:
     """Compute one viewport for a whole run.
 
     Args:
@@ -102,7 +104,7 @@ def compute_map_viewport(record: RunRecord, body_points_w: list[Floats], pixels_
     return _fit_viewports(record, [np.vstack(body_points_w)], pixels_per_n, width)[0]
 
 
-def _fit_viewports(record: RunRecord, point_sets: list[Floats], pixels_per_n: float, width: float) -> list[Viewport]:
+def _fit_viewports(record: RunRecord, point_sets: list[Floats], pixels_per_n: float, width: float) -> list[MapViewport]:
     """Fit a viewport around each set of points, all of one size and one scale.
 
     If the first set is taller than wide, the ground is rotated by a quarter turn. A window grows so that it does not
@@ -116,7 +118,7 @@ def _fit_viewports(record: RunRecord, point_sets: list[Floats], pixels_per_n: fl
     """
     span_x, span_y = np.ptp(point_sets[0], axis=0)
     upright = bool(span_y > 1.3 * span_x)
-    unscaled = Viewport(np.zeros(2), 1.0, pixels_per_n, 0.0, 0.0, upright)
+    unscaled = MapViewport(np.zeros(2), 1.0, pixels_per_n, 0.0, 0.0, upright)
     rotated_sets = [unscaled.rotate(points) for points in point_sets]
     max_span_m = max(float(np.ptp(points[:, 0])) for points in rotated_sets)
     margin_m = ARROW_MARGIN * max_span_m / (width - 2 * ARROW_MARGIN)
@@ -132,14 +134,16 @@ def _fit_viewports(record: RunRecord, point_sets: list[Floats], pixels_per_n: fl
     scale = width / float(width_m)
     height = min(float(height_m) * scale, MAX_HEIGHT_RATIO * width)
     half_size_m = np.array([width, height]) / (2 * scale)
-    viewports: list[Viewport] = []
+    viewports: list[MapViewport] = []
     for low, high in window_corners:
         corner = (low + high) / 2 - half_size_m
-        viewports.append(Viewport(corner, scale, pixels_per_n, width, height + FOOTER_HEIGHT, upright))
+        viewports.append(MapViewport(corner, scale, pixels_per_n, width, height + FOOTER_HEIGHT, upright))
     return viewports
 
 
-def _grow_around_obstacles(record: RunRecord, unscaled: Viewport, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+def _grow_around_obstacles(
+    record: RunRecord, unscaled: MapViewport, low: Floats, high: Floats
+) -> tuple[Floats, Floats]:
     """Enlarge a window, given by its corners, until it cuts no obstacle except large ones."""
     max_half_extent_m = MAX_WHOLE_OBSTACLE_FRACTION * float((high - low).min())
     small: list[tuple[Floats, float]] = []

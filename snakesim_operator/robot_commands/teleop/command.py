@@ -13,14 +13,14 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import call_on_stop_signals, get_user_name
 from snakesim_hal.base.terminal import overwrite_lines, print_line
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, ControlState, Intent, Status, World
+from snakesim_hal.wire.messages import Clock, ControlState, LocomotionIntent, RobotStatus, WorldModel
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.robot_commands.prepared_stop import PreparedStop
 from snakesim_operator.robot_commands.teleop.joystick import STICK_AGE_S, Joystick, open_joystick
-from snakesim_operator.robot_commands.teleop.keyboard import Keyboard
-from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, TURN_RAD_S, Steering
+from snakesim_operator.robot_commands.teleop.keyboard import KeyReader
+from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, TURN_RAD_S, SteeringState
 
 PERIOD_S = 0.05
 SCREEN_PERIOD_CYCLES = 4  # periods
@@ -57,7 +57,7 @@ def teleoperate_robot(selection: RobotSelection, max_speed_m_s: float, joystick:
             device = None if joystick == Path() else joystick
             stick = open_joystick(device)
             stack.callback(stick.close)
-        keyboard = Keyboard() if stick is None or sys.stdin.isatty() else None
+        keyboard = KeyReader() if stick is None or sys.stdin.isatty() else None
         link = find_single_robot(selection, "teleop")
         session = stack.enter_context(open_session(link, CONNECT_TIMEOUT_S))
         if keyboard is not None:
@@ -69,7 +69,12 @@ class TeleopLoop:
     """Reads one operator's input, sends it to one robot, and shows the robot's state."""
 
     def __init__(
-        self, session: Session, link: Link, max_speed_m_s: float, keyboard: Keyboard | None, stick: Joystick | None
+        self,
+        session: Session,
+        link: ConnectionSettings,
+        max_speed_m_s: float,
+        keyboard: KeyReader | None,
+        stick: Joystick | None,
     ) -> None:
         """Prepare to steer a robot: publish intents, read the robot's state, and prepare the emergency stop.
 
@@ -85,25 +90,25 @@ class TeleopLoop:
         self._keyboard = keyboard
         self._stick = stick
         self._user = f"{get_user_name()[:40]}, teleop {os.getpid()}"  # with the process id: one user may run two
-        self._steering = Steering(self._user, max_speed_m_s)
+        self._steering = SteeringState(self._user, max_speed_m_s)
         self._ignored_late_keys = False  # the newest keys were late
         self._end_reason = ""  # not empty: the loop ends
 
         # What is sent.
-        self._intent_publisher = session.declare_publisher(keys.INTENT, Intent)
+        self._intent_publisher = session.declare_publisher(keys.INTENT, LocomotionIntent)
         self._last_intent_ns = -1  # robot time of the newest intent
 
         # What is received.
         self._clock_reader = session.declare_reader(keys.CLOCK, Clock)
-        self._world_reader = session.declare_reader(keys.WORLD, World)
+        self._world_reader = session.declare_reader(keys.WORLD, WorldModel)
         self._control_state_reader = session.declare_reader(keys.CONTROL_STATE, ControlState)
-        self._status_reader = session.declare_latched_reader(keys.STATUS, Status)
-        self._intent_reader = session.declare_reader(keys.INTENT, Intent)
+        self._status_reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
+        self._intent_reader = session.declare_reader(keys.INTENT, LocomotionIntent)
 
         # The newest of each, with the monotonic time of its arrival.
         self._clock: Clock | None = None
         self._clock_arrival_s = time.monotonic()
-        self._status: Status | None = None
+        self._status: RobotStatus | None = None
         self._status_arrival_s = 0.0
         self._control_state: ControlState | None = None
         self._control_arrival_s = 0.0
@@ -176,7 +181,7 @@ class TeleopLoop:
         elif self._is_input_lost():
             self._request_end("the terminal is gone")
 
-    def _read_keyboard(self, keyboard: Keyboard, now_s: float) -> None:
+    def _read_keyboard(self, keyboard: KeyReader, now_s: float) -> None:
         """Process all pressed keys. Keys that came late may stop the robot, but not steer it."""
         pressed_keys = keyboard.read_keys(0.0)
         if pressed_keys:

@@ -39,7 +39,7 @@ def _encode_read_ioctl(number: int, size: int) -> int:
 
 
 @dataclass(frozen=True)
-class Axis:
+class JoystickAxis:
     """The ends of an axis, in the device's unit."""
 
     lower: int
@@ -57,7 +57,7 @@ class Axis:
 class Joystick:
     """The left stick and the buttons of one device."""
 
-    def __init__(self, handle: int, x_axis: Axis, y_axis: Axis) -> None:
+    def __init__(self, handle: int, x_axis: JoystickAxis, y_axis: JoystickAxis) -> None:
         """Start with a released stick.
 
         Args:
@@ -164,7 +164,7 @@ def _enable_monotonic_timestamps(handle: int) -> bool:
     return True
 
 
-def _read_axes(handle: int) -> tuple[Axis, Axis] | None:
+def _read_axes(handle: int) -> tuple[JoystickAxis, JoystickAxis] | None:
     """Return the axes X and Y of the stick; None if an axis or the buttons of a joystick are missing."""
     try:
         if not _has_joystick_buttons(handle):
@@ -185,11 +185,11 @@ def _has_joystick_buttons(handle: int) -> bool:
     return any(bits[code // 8] >> code % 8 & 1 for code in BUTTONS)
 
 
-def _read_axis(handle: int, axis: int) -> Axis | None:
+def _read_axis(handle: int, axis: int) -> JoystickAxis | None:
     """Return the range of an axis; None if it is empty."""
     info = bytearray(ABSINFO.size)
     fcntl.ioctl(handle, _encode_read_ioctl(0x40 + axis, len(info)), info)
     _, lower, upper, *_ = ABSINFO.unpack(info)
     if upper <= lower:
         return None
-    return Axis(lower, upper)
+    return JoystickAxis(lower, upper)

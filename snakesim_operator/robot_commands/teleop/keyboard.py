@@ -64,7 +64,7 @@ class KeyTiming:
         return has_too_many_keys or time_since_last_read_s > MAX_UNREAD_DURATION_S
 
 
-class Keyboard:
+class KeyReader:
     """Reads stdin key by key, without echo. Ctrl-C works; Ctrl-Z does not, because it would leave the robot moving."""
 
     def __init__(self, no_terminal_message: str = NO_TERMINAL_MESSAGE) -> None:

@@ -2,7 +2,7 @@
 
 import math
 
-from snakesim_hal.wire.messages import Intent
+from snakesim_hal.wire.messages import LocomotionIntent
 
 INTENT_VALIDITY_NS = 500_000_000  # in robot time; ten times as long as the period in which intents are repeated
 SPEED_STEP_M_S = 0.05
@@ -11,7 +11,7 @@ TURN_RAD_S = 0.8  # with the stick fully to one side
 MAX_HEADING_OFFSET_RAD = math.pi / 2  # the requested direction is ahead of the body's by at most this
 
 
-class Steering:
+class SteeringState:
     """Speed and direction, changed by keys or by a stick."""
 
     def __init__(self, requester: str, max_speed_m_s: float) -> None:
@@ -60,13 +60,13 @@ class Steering:
         self.speed_m_s = 0.0
         self.last_input_s = now_s
 
-    def make_intent(self, robot_time_ns: int) -> Intent:
+    def make_intent(self, robot_time_ns: int) -> LocomotionIntent:
         """Return the operator's request as an Intent message, which expires after INTENT_VALIDITY_NS.
 
         Args:
             robot_time_ns: Current robot time.
         """
-        return Intent(
+        return LocomotionIntent(
             timestamp_ns=robot_time_ns,
             requester=self._requester,
             speed_m_s=self.speed_m_s,

@@ -24,7 +24,7 @@ from snakesim_testing.can.listened_bus import (
     LATE_MS,
     NODES,
     RATE_HZ,
-    Bench,
+    RobotOnBus,
     bench,
     first_in,
     passed_for_module_ms,
@@ -38,7 +38,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 @pytest.fixture
-def robot(tmp_path: Path, channel: str) -> Iterator[Bench]:
+def robot(tmp_path: Path, channel: str) -> Iterator[RobotOnBus]:
     with bench(tmp_path, channel) as made:
         yield made
 
@@ -51,7 +51,7 @@ def killed(process: subprocess.Popen[bytes]) -> int:
     return now_ns
 
 
-def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: Bench) -> None:
+def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: RobotOnBus) -> None:
     _, control = robot.arm()
     killed_ns = killed(control)
     passive = {ModuleState.DISARMED}
@@ -72,7 +72,7 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: Bench) -> 
     )
 
 
-def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: Bench, channel: str) -> None:
+def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: RobotOnBus, channel: str) -> None:
     host, _ = robot.arm()
     armed = [ModuleState.ARMED] * JOINTS
     assert robot.listener.states() == armed, robot.read_log("host")

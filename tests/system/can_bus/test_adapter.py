@@ -17,11 +17,11 @@ from snakesim_can_backend.bus.adapter import (
 )
 from snakesim_can_backend.bus.load import ReportSchedule, busiest_period_s, compute_bus_load
 from snakesim_can_backend.emulator.bus_time import BusTime
-from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id
+from snakesim_can_backend.protocol.definitions import CanFrame, Opcode, frame_id
 from snakesim_hal.base.errors import BackendError, ConfigError, SnakesimError
 from snakesim_testing.messages import raises_error
 
-STATE = Frame(frame_id(Opcode.JOINT_STATE, 3), bytes(8))
+STATE = CanFrame(frame_id(Opcode.JOINT_STATE, 3), bytes(8))
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_frames_go_both_ways_and_foreign_ones_are_left_out(channel: str, other: 
     other.send(can.Message(arbitration_id=STATE.id, is_remote_frame=True, is_extended_id=False))
     other.send(can.Message(arbitration_id=0, is_error_frame=True))
     other.send(can.Message(arbitration_id=STATE.id, data=b"12345678", is_extended_id=False))
-    assert wire.receive() == [Frame(STATE.id, b"12345678")]
+    assert wire.receive() == [CanFrame(STATE.id, b"12345678")]
     assert [error.kind for error in wire.errors()] == ["error_frames"]
     assert wire.errors() == []
     wire.close()
@@ -54,7 +54,7 @@ def test_frames_go_both_ways_and_foreign_ones_are_left_out(channel: str, other: 
 
 def test_adapter_receives_only_requested_frames_and_leaves_nothing(channel: str, other: can.BusABC) -> None:
     wire = open_wire(channel, [Opcode.SYNC])
-    sync = Frame(frame_id(Opcode.SYNC, 0), bytes(6))
+    sync = CanFrame(frame_id(Opcode.SYNC, 0), bytes(6))
     for frame in (STATE, sync, STATE, sync):
         other.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
     assert wire.receive() == [sync, sync]

@@ -19,13 +19,13 @@ from snakesim_can_backend.protocol.definitions import (
     FIRST_NODE,
     LAST_NODE,
     NODE_BITS,
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleState,
     Opcode,
 )
 from snakesim_can_backend.protocol.expanded import list_nodes
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.operator.registered import run_registered
 
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
@@ -76,10 +76,10 @@ def layout_of(message: Message) -> dict[str, tuple[object, ...]]:
     }
 
 
-def sent() -> list[tuple[Frame, str]]:
+def sent() -> list[tuple[CanFrame, str]]:
     """Frames of every kind, and what stock cantools is to say of them."""
     layouts = load_layouts()
-    setpoint = layouts[Opcode.SET_POINT].encode(5, mode=Mode.POSITION, count=3, position=-0.5, torque_limit=7.0)
+    setpoint = layouts[Opcode.SET_POINT].encode(5, mode=JointMode.POSITION, count=3, position=-0.5, torque_limit=7.0)
     state = layouts[Opcode.JOINT_STATE].encode(
         62, angle=1.0, velocity=-2.0, torque=0.5, count=3, state=ModuleState.ARMED, derated=1
     )

@@ -12,16 +12,16 @@ from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.bus_faults import inject_into_interface
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS
-from snakesim_can_backend.protocol.definitions import Frame, ModuleState
+from snakesim_can_backend.protocol.definitions import CanFrame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_testing.can.driver_loop import Loop, armed, cleared_and_armed_again, config, loop
+from snakesim_testing.can.driver_loop import DriverLoop, armed, cleared_and_armed_again, config, loop
 from snakesim_testing.messages import raises_error
 
 
-def inject(run: Loop, text: str, *, begins: bool = True) -> None:
+def inject(run: DriverLoop, text: str, *, begins: bool = True) -> None:
     FaultyBackend(run.backend).inject(parse_injection(f"{text}@0"), begins=begins)
 
 
@@ -98,7 +98,7 @@ def test_a_bus_that_fails_stops_the_joints_and_comes_back(
 def test_one_end_of_a_virtual_bus() -> None:
     here, there = VirtualWire("wire-faults"), VirtualWire("wire-faults")
     try:
-        frame = Frame(0x105, b"1")
+        frame = CanFrame(0x105, b"1")
         assert here.send(frame)
         assert there.receive() == [frame]
         assert here.errors() == []

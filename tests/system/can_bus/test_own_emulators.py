@@ -13,7 +13,7 @@ from snakesim_can_backend.driver import own_emulators
 from snakesim_can_backend.driver.own_emulators import EmulatorProcess, validate_emulator_settings
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
@@ -157,14 +157,14 @@ def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_p
     assert "--interactive" in arguments
     assert "--stepped" not in arguments
     assert arguments[arguments.index("--pose") + 1] == "none"
-    emulators.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=True)
-    emulators.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=False)
+    emulators.inject(FaultInjection("mute", "joint_3", 1.0, 2.0), begins=True)
+    emulators.inject(FaultInjection("mute", "joint_3", 1.0, 2.0), begins=False)
     wait_until(lambda: heard.exists() and heard.read_text().endswith("off\n"), "the end told to the child")
     assert heard.read_text() == "mute joint_3\nmute joint_3 off\n"
     emulators.stop()
     with raises_error(BackendError, code="injection/not-supported", field="joint_1"):
         for _ in range(100):  # until the pipe is known to be broken
-            emulators.inject(Injection("leak", "joint_1"), begins=True)
+            emulators.inject(FaultInjection("leak", "joint_1"), begins=True)
 
 
 def test_emulator_process_that_cannot_start_is_a_backend_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

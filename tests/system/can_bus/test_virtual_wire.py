@@ -9,9 +9,9 @@ from collections.abc import Iterator
 import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire, wait
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_testing.messages import raises_error
 
 
@@ -26,10 +26,10 @@ class End:
     def __call__(self) -> float | None:
         self.ran += 1
         if self.then_send is not None:
-            self.then_send.send(Frame(0x101, b"\x01"))
+            self.then_send.send(CanFrame(0x101, b"\x01"))
         return self.pause_s
 
-    def inject(self, injection: Injection, *, begins: bool) -> None:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> None:
         raise AssertionError(f"nobody asked for {injection}")
 
     def close(self) -> None:
@@ -62,7 +62,7 @@ def took_s(began: float) -> float:
 
 def test_virtual_bus_ends_receive_each_other_and_not_themselves(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, far = pair
-    frames = [Frame(0x105, b"\x01\x02"), Frame(0x7FF, b""), Frame(0, bytes(8))]
+    frames = [CanFrame(0x105, b"\x01\x02"), CanFrame(0x7FF, b""), CanFrame(0, bytes(8))]
     assert all(near.send(frame) for frame in frames)
     assert far.receive() == frames
     assert far.receive() == []
@@ -78,7 +78,7 @@ def test_a_virtual_bus_says_when_something_may_come(pair: tuple[VirtualWire, Vir
     assert near.idle() == 0.25
     near.peer = End(None)
     assert near.idle() is None
-    far.send(Frame(1, b""))
+    far.send(CanFrame(1, b""))
     assert near.idle() == 0.0
 
 
@@ -138,6 +138,6 @@ def test_virtual_bus_that_is_gone_is_a_backend_error() -> None:
     wire = VirtualWire(f"gone-{uuid.uuid4().hex}")
     wire._bus.shutdown()
     with raises_error(BackendError, code="bus/io-failed"):
-        wire.send(Frame(0x80, b"12345"))
+        wire.send(CanFrame(0x80, b"12345"))
     with raises_error(BackendError, code="bus/io-failed"):
         wire.receive()

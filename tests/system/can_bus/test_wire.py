@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from snakesim_can_backend.bus import bus as wire_module
 from snakesim_can_backend.bus.bus import MAX_AT_ONCE, SocketCanWire, drain_socket, is_up, validate_interface
 from snakesim_can_backend.bus.bus_errors import BusError, Kind, decode_error_frame
-from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode
+from snakesim_can_backend.protocol.definitions import FROM_HOST, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_testing.messages import raises_error
 
@@ -136,13 +136,13 @@ def test_drain_takes_everything_in_its_order(frames: list[tuple[int, bytes]]) ->
     with near, far:
         near.setblocking(False)
         errors: list[tuple[int, bytes]] = []
-        taken: list[Frame] = []
+        taken: list[CanFrame] = []
         for identifier, data in frames:
             far.send(can_frame(identifier, data))
         far.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8))))
         drain_socket(near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data)))
-        assert taken == [Frame(*frame) for frame in frames]
-        assert all(type(frame) is Frame for frame in taken)
+        assert taken == [CanFrame(*frame) for frame in frames]
+        assert all(type(frame) is CanFrame for frame in taken)
         assert errors == [(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8)))]
         drain_socket(near, bytearray(16), taken, lambda *_: None)
         assert len(taken) == len(frames)
@@ -154,13 +154,13 @@ def test_a_bus_that_babbles_does_not_keep_its_reader() -> None:
             buffer[:] = can_frame(0x101, bytes(8))
             return 16
 
-    taken: list[Frame] = []
+    taken: list[CanFrame] = []
     drain_socket(Babbling(), bytearray(16), taken, lambda *_: None)  # pyright: ignore[reportArgumentType]
     assert len(taken) == MAX_AT_ONCE
 
 
 def test_a_frame_goes_out_as_the_kernel_wants_it(rig: Rig) -> None:
-    assert rig.wire.send(Frame(0x0C5, bytes.fromhex("3178EC581BF4")))
+    assert rig.wire.send(CanFrame(0x0C5, bytes.fromhex("3178EC581BF4")))
     assert rig.kernel.recv(64) == bytes.fromhex("C5000000 06000000 3178EC581BF40000")
     assert rig.wire.fileno() == rig.socket.fileno()
     assert rig.wire.idle() == math.inf
@@ -171,7 +171,7 @@ def test_frames_and_errors_come_in(rig: Rig) -> None:
     rig.kernel.send(can_frame(0x105, b"\x01\x02"))
     rig.kernel.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(8)))
     rig.kernel.send(can_frame(0x080, bytes(5)))
-    assert rig.wire.receive() == [Frame(0x105, b"\x01\x02"), Frame(0x080, bytes(5))]
+    assert rig.wire.receive() == [CanFrame(0x105, b"\x01\x02"), CanFrame(0x080, bytes(5))]
     assert rig.kinds() == ["bus_off"]
     assert rig.kinds() == []
     assert rig.wire.receive() == []
@@ -179,7 +179,7 @@ def test_frames_and_errors_come_in(rig: Rig) -> None:
 
 def test_wire_full_queue_is_reported_and_nothing_kept(rig: Rig) -> None:
     sent = 0
-    while rig.wire.send(Frame(0x101, bytes(8))):
+    while rig.wire.send(CanFrame(0x101, bytes(8))):
         sent += 1
     assert rig.kinds() == ["queue_full"]
     for _ in range(sent):
@@ -187,14 +187,14 @@ def test_wire_full_queue_is_reported_and_nothing_kept(rig: Rig) -> None:
     rig.kernel.settimeout(0.01)
     with pytest.raises(TimeoutError):
         rig.kernel.recv(64)
-    assert rig.wire.send(Frame(0x102, b""))
+    assert rig.wire.send(CanFrame(0x102, b""))
     assert rig.kinds() == []
 
 
 @pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN])
 def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
     rig.socket.fails = OSError(number, "full")
-    assert not rig.wire.send(Frame(0x101, b""))
+    assert not rig.wire.send(CanFrame(0x101, b""))
     assert rig.wire.errors() == [BusError("queue_full", "can7", "the transmit queue is full")]
 
 
@@ -202,7 +202,7 @@ def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
 def test_wire_lost_interface_is_reported_once_per_loss(rig: Rig, number: int, word: str) -> None:
     rig.socket.fails, rig.up = OSError(number, ""), False
     for _ in range(3):
-        assert not rig.wire.send(Frame(0x101, b""))
+        assert not rig.wire.send(CanFrame(0x101, b""))
         assert rig.wire.receive() == []
     assert rig.wire.errors() == [BusError("interface_down", "can7", f"the interface is {word}")]
     assert rig.kinds() == []
@@ -210,14 +210,14 @@ def test_wire_lost_interface_is_reported_once_per_loss(rig: Rig, number: int, wo
     assert rig.wire.errors() == [BusError("interface_up", "can7", "the interface is up again")]
     assert rig.socket.bound_to == (("can7",) if word == "gone" else None)
     assert rig.kinds() == []
-    assert rig.wire.send(Frame(0x101, b""))
+    assert rig.wire.send(CanFrame(0x101, b""))
 
 
 def test_wire_sent_frame_proves_interface_is_back(rig: Rig) -> None:
     rig.socket.fails, rig.up = OSError(errno.ENETDOWN, ""), False
     rig.wire.receive()
     rig.socket.fails = None
-    assert rig.wire.send(Frame(0x101, b""))
+    assert rig.wire.send(CanFrame(0x101, b""))
     assert rig.kinds() == ["interface_down", "interface_up"]
 
 
@@ -232,14 +232,14 @@ def test_what_came_before_an_error_is_not_lost(rig: Rig) -> None:
         return receive(buffer)
 
     rig.socket.recv_into, rig.up = then_down, False
-    assert rig.wire.receive() == [Frame(0x105, b"\x01")]
+    assert rig.wire.receive() == [CanFrame(0x105, b"\x01")]
     assert rig.kinds() == ["interface_down"]
 
 
 def test_anything_else_ends_the_run(rig: Rig) -> None:
     rig.kernel.close()
     with raises_error(BackendError, code="bus/io-failed"):
-        rig.wire.send(Frame(0x101, b""))
+        rig.wire.send(CanFrame(0x101, b""))
 
 
 @pytest.mark.parametrize("only", [None, FROM_HOST])

@@ -10,15 +10,15 @@ import pytest
 
 import snakesim
 from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import JointState, Status
+from snakesim_hal.wire.messages import JointState, RobotStatus
 from snakesim_operator.playback.info import inspect_recording
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.command import (
     CompletedRun,
-    Running,
+    RunningCommand,
     make_environment,
     run_to_end,
     running_armed_snakesim,
@@ -36,7 +36,7 @@ EXTERNAL = ("--set", "services.control.external=true")
 
 
 @pytest.fixture(scope="module", params=["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
-def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
     """A robot that waits for its controller."""
     with running_snakesim(tmp_path_factory.mktemp("robot") / "run", *ROBOT, request.param, *EXTERNAL) as started:
         started.wait_for("a client that takes the lease")
@@ -44,7 +44,7 @@ def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 @pytest.fixture(scope="module")
-def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
     """A robot with a controller of its own."""
     with running_armed_snakesim(tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime") as started:
         yield started
@@ -66,8 +66,8 @@ def test_example_clients_are_as_short_as_documented() -> None:
     assert len([line for line in lines if line]) == 9
 
 
-def status(session: Session) -> Status:
-    found = session.wait_for_latched(keys.STATUS, Status, 10.0)
+def status(session: Session) -> RobotStatus:
+    found = session.wait_for_latched(keys.STATUS, RobotStatus, 10.0)
     assert found is not None
     return found
 
@@ -77,9 +77,9 @@ def urgently() -> None:
     set_realtime_priority(SERVICE_PRIORITY)
 
 
-def test_a_client_leases_arms_moves_and_disarms(waiting: Running) -> None:
+def test_a_client_leases_arms_moves_and_disarms(waiting: RunningCommand) -> None:
     """First of those who wait with the robot: what it has counted is of this client."""
-    with open_session(Link(waiting.endpoint, "planar13")) as session:
+    with open_session(ConnectionSettings(waiting.endpoint, "planar13")) as session:
         wait_until(lambda: status(session).waiting_for == ["control"], "a run that waits for control alone")
         joints = session.declare_reader(keys.JOINTS, JointState, depth=DEPTH)
         ended = run_to_end([sys.executable, CLIENT, waiting.endpoint, "planar13"], waiting.home, child_setup=urgently)
@@ -97,16 +97,16 @@ def test_a_client_leases_arms_moves_and_disarms(waiting: Running) -> None:
         assert {fault.what for fault in now.faults} <= {"service_lost"}
 
 
-def test_a_stop_by_udp_stops_the_robot(waiting: Running) -> None:
+def test_a_stop_by_udp_stops_the_robot(waiting: RunningCommand) -> None:
     host, _, port = waiting.endpoint.removeprefix("tcp/").partition(":")
     ended = run_to_end([sys.executable, STOP, host, port], waiting.home)
     assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, ended.out + ended.err
-    with open_session(Link(waiting.endpoint, "planar13")) as session:
+    with open_session(ConnectionSettings(waiting.endpoint, "planar13")) as session:
         assert status(session).lifecycle == "estop"
     settled(waiting)
 
 
-def script(text: str, run: Running, folder: Path) -> CompletedRun:
+def script(text: str, run: RunningCommand, folder: Path) -> CompletedRun:
     """Run a script to its end, on a robot that waits for a controller."""
     settled(run)
     (folder / "script.py").write_text(textwrap.dedent(text))
@@ -114,14 +114,14 @@ def script(text: str, run: Running, folder: Path) -> CompletedRun:
     return run_to_end([sys.executable, "script.py", run.endpoint], folder, env, 60.0, urgently)
 
 
-def settled(run: Running) -> None:
+def settled(run: RunningCommand) -> None:
     with snakesim.Robot.connect(run.endpoint) as robot:
         wait_until(lambda: "control" in robot.status.waiting_for, "a run that waits for its controller")
         if robot.status.lifecycle != "disarmed":
             robot.reset_fault()
 
 
-def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running, tmp_path: Path) -> None:
+def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: RunningCommand, tmp_path: Path) -> None:
     nod = next(s for s in parse_sections(REPOSITORY / "docs" / "how-to" / "python.md") if "nod.py" in s.files).files[
         "nod.py"
     ]
@@ -136,7 +136,7 @@ def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running,
     assert "hal/description" in held
 
 
-def test_an_exception_disarms_what_was_armed(waiting: Running, tmp_path: Path) -> None:
+def test_an_exception_disarms_what_was_armed(waiting: RunningCommand, tmp_path: Path) -> None:
     failing = """
         import sys, snakesim
         with snakesim.Robot.connect(sys.argv[1]) as robot:
@@ -151,7 +151,7 @@ def test_an_exception_disarms_what_was_armed(waiting: Running, tmp_path: Path) -
         assert robot.status.lifecycle == "disarmed", robot.status.reason
 
 
-def test_a_stop_by_somebody_else_ends_the_wait(waiting: Running, tmp_path: Path) -> None:
+def test_a_stop_by_somebody_else_ends_the_wait(waiting: RunningCommand, tmp_path: Path) -> None:
     stopped = """
         import sys, snakesim
         with snakesim.Robot.connect(sys.argv[1]) as robot:
@@ -169,7 +169,7 @@ def test_a_stop_by_somebody_else_ends_the_wait(waiting: Running, tmp_path: Path)
     settled(waiting)
 
 
-def test_what_is_no_command_is_refused_before_it_is_sent(waiting: Running) -> None:
+def test_what_is_no_command_is_refused_before_it_is_sent(waiting: RunningCommand) -> None:
     with snakesim.Robot.connect(waiting.endpoint) as robot:
         with raises_error(snakesim.ConfigError, code="python/invalid-argument"):
             robot.command([0.0])
@@ -178,7 +178,7 @@ def test_what_is_no_command_is_refused_before_it_is_sent(waiting: Running) -> No
 
 
 @pytest.mark.quiet
-def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(driven: Running, tmp_path: Path) -> None:
+def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(driven: RunningCommand, tmp_path: Path) -> None:
     with snakesim.Robot.connect(driven.endpoint, name="planar13") as robot:
         before = robot.wait()
         assert robot.wait() > before

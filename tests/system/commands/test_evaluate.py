@@ -270,10 +270,10 @@ def test_one_case_again_as_a_whole_run(home: Path, undisturbed: tuple[CompletedR
 
 DEADLY = """
 import os
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 
 
-class Deadly(Hold):
+class Deadly(HoldPose):
     def update(self, observation):
         if observation.tick > 20:
             os._exit(1)

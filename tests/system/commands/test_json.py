@@ -7,9 +7,9 @@ import msgspec
 import pytest
 
 from snakesim_hal.model.files import list_shipped_names
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Status
+from snakesim_hal.wire.messages import RobotDescription, RobotStatus
 from snakesim_operator.cli import main
 from snakesim_testing.hal.small_robots import make_description, make_status
 from snakesim_testing.harness.endpoint import find_free_endpoint
@@ -29,8 +29,8 @@ def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixtu
     endpoint = find_free_endpoint()
     assert main(["status", "--json", "--endpoint", endpoint]) == 1
     assert json.loads(capsys.readouterr().out) == {"robots": [], "silent": []}
-    with open_session(Link(endpoint, "worm", listen=True)) as session:
-        session.declare_latched_publisher(keys.STATUS, Status).put(make_status(lifecycle="disarmed"))
+    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
+        session.declare_latched_publisher(keys.STATUS, RobotStatus).put(make_status(lifecycle="disarmed"))
         assert main(["status", "--json", "--endpoint", endpoint]) == 0
     (robot,) = json.loads(capsys.readouterr().out)["robots"]
     assert (robot["namespace"], robot["impostor"], robot["status"]["lifecycle"]) == ("worm", False, "disarmed")
@@ -52,11 +52,11 @@ def test_status_and_top_say_whether_something_real_moves(
 ) -> None:
     """In the second line of a robot; a description of another host counts nothing."""
     endpoint = find_free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as session:
-        session.declare_latched_publisher(keys.STATUS, Status).put(make_status())
+    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
+        session.declare_latched_publisher(keys.STATUS, RobotStatus).put(make_status())
         if described is not None:
             robot = msgspec.structs.replace(make_description(), **described)
-            session.declare_latched_publisher(keys.DESCRIPTION, Description).put(robot)
+            session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(robot)
         main(["status", "--endpoint", endpoint])
         assert capsys.readouterr().out.splitlines()[1].startswith(said)
         if described is None or "host" not in described:
@@ -66,9 +66,9 @@ def test_status_and_top_say_whether_something_real_moves(
 
 def test_json_isolated_joint_is_reported_with_how_to_recover(capsys: pytest.CaptureFixture[str]) -> None:
     endpoint = find_free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as session:
+    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
         lost = make_status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)
-        session.declare_latched_publisher(keys.STATUS, Status).put(lost)
+        session.declare_latched_publisher(keys.STATUS, RobotStatus).put(lost)
         assert main(["status", "--endpoint", endpoint]) == 0
     said = capsys.readouterr().out
     assert "isolated: joint_3; passive until a reset" in said

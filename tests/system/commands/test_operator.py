@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.host.latch import ESTOP
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Running, running_armed_snakesim
+from snakesim_testing.runs.command import RunningCommand, running_armed_snakesim
 from snakesim_testing.runs.in_process_command import snakesim, tell
 
 pytestmark = pytest.mark.e2e
@@ -29,18 +29,18 @@ LONG = (
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
     with running_armed_snakesim(tmp_path_factory.mktemp("operator") / "run", *LONG) as started:
         yield started
         assert started.interrupt() == 130, started.printed()
 
 
-def until_armed(run: Running) -> None:
+def until_armed(run: RunningCommand) -> None:
     """As a person does it: until the answer is yes."""
     wait_until(lambda: tell(run, "robot", "arm", "planar13", "sim").code == 0, "armed", 30.0)
 
 
-def test_arming_is_for_what_is_named(run: Running) -> None:
+def test_arming_is_for_what_is_named(run: RunningCommand) -> None:
     assert tell(run, "robot", "disarm").code == 0
     for robot, backend, word in (("mamba", "sim", "'planar13', not 'mamba'"), ("planar13", "can", "'sim', not 'can'")):
         ended = tell(run, "robot", "arm", robot, backend)
@@ -55,7 +55,7 @@ def test_arming_is_for_what_is_named(run: Running) -> None:
     assert tell(run, "robot", "reset").code == 1
 
 
-def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
+def test_a_stop_is_latched_and_outlives_the_host(run: RunningCommand) -> None:
     until_armed(run) if "planar13: armed" not in tell(run, "status").out else None
     stopped = tell(run, "estop")
     assert stopped.code == 0

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.process import get_user_name
-from snakesim_testing.runs.command import CompletedRun, Running, running_armed_snakesim
+from snakesim_testing.runs.command import CompletedRun, RunningCommand, running_armed_snakesim
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -15,13 +15,13 @@ LONG = ("peg_row", "--duration", "600", "--set", "rate_hz=50", "--clock-mode", "
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
     with running_armed_snakesim(tmp_path_factory.mktemp("param") / "run", *LONG) as started:
         yield started
 
 
 @pytest.fixture
-def param(run: Running, tmp_path: Path):
+def param(run: RunningCommand, tmp_path: Path):
     def call(*words: str, robot: str | None = None) -> CompletedRun:
         verb, *more = words
         selection = () if robot is None else ("--namespace", robot)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from snakesim_hal.base.errors import NotConnectedError, RefusedError
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_hal.network.stop_port import Reply, StopRequester, open_stop_port, start_stop_server
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.robot_commands import prepared_stop
@@ -65,14 +65,16 @@ class Bench:
         monkeypatch.setattr(prepared_stop, "stop_robots", self._search)
         self.network_error: Exception | None = None
         self.searched = 0
-        self.stop = PreparedStop(RobotSelection("tcp/127.0.0.1:9", "worm"), Link("tcp/127.0.0.1:9", "worm"), self._note)
+        self.stop = PreparedStop(
+            RobotSelection("tcp/127.0.0.1:9", "worm"), ConnectionSettings("tcp/127.0.0.1:9", "worm"), self._note
+        )
 
     def _take(self, who: str, reply: Reply) -> None:
         self.asked.append(who)
         self.go_on.wait(10.0)
         reply("emergency stop")
 
-    def _ask_session(self, _session: Any, _link: Link, _limit_s: float) -> list[StopResult]:
+    def _ask_session(self, _session: Any, _link: ConnectionSettings, _limit_s: float) -> list[StopResult]:
         if self.network_error is not None:
             raise self.network_error
         return []

@@ -7,9 +7,9 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Preview, SensorDescription
+from snakesim_hal.wire.messages import ColorImage, DepthImage, ImagePreview, SensorDescription
 from snakesim_operator.monitoring.preview import encode_preview, find_cameras
 from snakesim_testing.hal.small_robots import make_description
 from snakesim_testing.harness.endpoint import find_free_endpoint
@@ -63,16 +63,19 @@ def test_only_what_is_looked_at() -> None:
     sensor = SensorDescription(key=keys.depth_key("head"), rate_hz=20.0, delay_s=0.0)
     robot = msgspec.structs.replace(make_description(), sensors=[sensor])
     endpoint = find_free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as beside:
+    with (
+        open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal,
+        open_session(ConnectionSettings(endpoint, "worm")) as beside,
+    ):
         images = hal.declare_publisher(keys.depth_key("head"), DepthImage)
         (camera,) = find_cameras(beside, robot, 80)
         camera.publish_preview()
         assert not images.has_subscriber()
-        with open_session(Link(endpoint, "worm")) as far:
-            seen = far.declare_reader(keys.preview_key(keys.depth_key("head")), Preview)
+        with open_session(ConnectionSettings(endpoint, "worm")) as far:
+            seen = far.declare_reader(keys.preview_key(keys.depth_key("head")), ImagePreview)
             wait_until(lambda: camera.publish_preview() or images.has_subscriber(), "the image fetched")
             images.put(depth(3))
-            found: list[Preview] = []
+            found: list[ImagePreview] = []
             wait_until(lambda: camera.publish_preview() or found.extend(seen.drain()) or found, "a preview")
             assert found[0].tick == 3
             assert found[0].width == 80

@@ -13,11 +13,19 @@ import zenoh
 from snakesim_gnc.control.state_reports import TELEMETRY_PERIOD_S
 from snakesim_hal.host.status_reporter import STATUS_PERIOD_NS
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.safety import lifecycle, limiter
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import VERSIONS, DepthImage, Description, Done, JointCommand, JointState, Mode
+from snakesim_hal.wire.messages import (
+    VERSIONS,
+    DepthImage,
+    JointCommand,
+    JointMode,
+    JointState,
+    RobotDescription,
+    TickDone,
+)
 from snakesim_operator.this_computer.schemas import generate_contract_files
 from snakesim_testing.hal.small_robots import make_description
 from snakesim_testing.harness.endpoint import find_free_endpoint
@@ -53,12 +61,12 @@ def test_whole_numbers_flags_and_null_say_what_they_mean(path: str) -> None:
 
 
 def test_the_modes_are_told_with_their_numbers_and_units() -> None:
-    reported = json.loads(published_contract()["messages/JointCommand.json"])["$defs"]["Mode"]["description"]
+    reported = json.loads(published_contract()["messages/JointCommand.json"])["$defs"]["JointMode"]["description"]
     for mode, unit in (
-        (Mode.PASSIVE, "ignored"),
-        (Mode.POSITION, "rad"),
-        (Mode.VELOCITY, "rad/s"),
-        (Mode.TORQUE, "N·m"),
+        (JointMode.PASSIVE, "ignored"),
+        (JointMode.POSITION, "rad"),
+        (JointMode.VELOCITY, "rad/s"),
+        (JointMode.TORQUE, "N·m"),
     ):
         assert re.search(rf"^{mode.value} {mode.name.lower()}: .*\b{unit}$", reported, re.MULTILINE), mode
 
@@ -96,10 +104,10 @@ def test_the_endpoint_is_the_default() -> None:
 
 ROWS = {
     "`actuator/joints`": (keys.JOINT_COMMAND, JointCommand),
-    "`hal/clock`, `hal/done/*`": (keys.done_key("control"), Done),
+    "`hal/clock`, `hal/done/*`": (keys.done_key("control"), TickDone),
     "`sensor/depth/*`, `sensor/color/*`": (keys.depth_key("head"), DepthImage),
     "other streams": (keys.JOINTS, JointState),
-    "`hal/description`, `hal/status`": (keys.DESCRIPTION, Description),
+    "`hal/description`, `hal/status`": (keys.DESCRIPTION, RobotDescription),
 }
 
 
@@ -110,7 +118,7 @@ def test_streams_are_sent_with_the_priorities_of_the_table(name: str, lossless: 
     row = next(line for line in PROTOCOL.splitlines() if line.startswith(f"| {name} |"))
     priority, congestion, express = (cell.strip() for cell in row.strip("|").split("|")[1:])
     latched = key == keys.DESCRIPTION
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, plain(endpoint) as stranger:
+    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal, plain(endpoint) as stranger:
         arrived = stranger.declare_subscriber(key)
         publisher = (
             hal.declare_latched_publisher(key, message)
@@ -130,8 +138,8 @@ def test_streams_are_sent_with_the_priorities_of_the_table(name: str, lossless: 
 
 def test_a_plain_client_gets_the_latched_description_by_a_query() -> None:
     endpoint, robot = find_free_endpoint(), make_description()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal:
-        hal.declare_latched_publisher(keys.DESCRIPTION, Description).put(robot)
+    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal:
+        hal.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(robot)
         with plain(endpoint) as stranger:
             assert "`hal/description/@adv/**`" in PROTOCOL
             replies = list(stranger.get("hal/description/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY, timeout=5.0))

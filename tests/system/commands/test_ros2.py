@@ -20,10 +20,10 @@ import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.network.streams import Reader
+from snakesim_hal.network.session import ConnectionSettings, open_session
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Intent, Trajectory
+from snakesim_hal.wire.messages import Clock, LocomotionIntent, Trajectory
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ros2_rig import SERVICE_HASHES
@@ -325,8 +325,8 @@ def _steers(ros: RosSide, endpoint: str) -> None:
     twist = kind["Twist"](kind["Vector3"](0.1, 0.0, 0.0), kind["Vector3"](0.0, 0.0, 0.2))
     payload = bytes(STORE.serialize_cdr(twist, "geometry_msgs/msg/Twist"))
     key = ros.key("cmd_vel", "geometry_msgs/msg/Twist")
-    with open_session(Link(endpoint, "planar13_camera")) as robot:
-        intents = robot.declare_reader(keys.INTENT, Intent)
+    with open_session(ConnectionSettings(endpoint, "planar13_camera")) as robot:
+        intents = robot.declare_reader(keys.INTENT, LocomotionIntent)
         plans = robot.declare_reader(keys.TRAJECTORY, Trajectory)
 
         def followed() -> bool:
@@ -364,7 +364,7 @@ def _outlasts_a_frozen_router(ros: RosSide, router: int, endpoint: str) -> None:
     images = ros.session.declare_subscriber(
         ros.key("head/depth/image_raw", "sensor_msgs/msg/Image"), handlers.RingChannel(1)
     )
-    with open_session(Link(endpoint, "planar13_camera")) as robot:
+    with open_session(ConnectionSettings(endpoint, "planar13_camera")) as robot:
         clocks = robot.declare_reader(keys.CLOCK, Clock)
         os.kill(router, signal.SIGSTOP)
         try:
@@ -378,6 +378,6 @@ def _outlasts_a_frozen_router(ros: RosSide, router: int, endpoint: str) -> None:
     images.undeclare()
 
 
-def _within(seconds: float, clocks: Reader[Clock]) -> list[Clock]:
+def _within(seconds: float, clocks: SampleReader[Clock]) -> list[Clock]:
     time.sleep(seconds)
     return clocks.drain()

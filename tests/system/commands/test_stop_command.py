@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError, RefusedError
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.cli import main
 from snakesim_operator.robot_commands import command, stop
-from snakesim_testing.hal.local_network import Follower, running_follower, running_host
+from snakesim_testing.hal.local_network import SineFollower, running_follower, running_host
 from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.command import snakesim
@@ -24,7 +24,7 @@ def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
         assert stop.stop_robots(RobotSelection(at), said.append) == 0
         assert said == [f"lab/worm: stopped: {run.status.reason} ({at})"]
         assert run.status.lifecycle == "estop"
-        with open_session(Link(at, "lab/deaf")) as deaf:
+        with open_session(ConnectionSettings(at, "lab/deaf")) as deaf:
             deaf.declare_alive("hal")
             said.clear()
             assert stop.stop_robots(RobotSelection(at), said.append) == 1
@@ -45,9 +45,9 @@ def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
 
 
 def test_stop_answer_without_matching_status_is_not_trusted() -> None:
-    with running_host(make_run_config()) as run, running_follower(run.link, Follower()):
+    with running_host(make_run_config()) as run, running_follower(run.link, SineFollower()):
         run.arm()
-        with open_session(Link(run.link.endpoint, "lab/other")) as impostor:
+        with open_session(ConnectionSettings(run.link.endpoint, "lab/other")) as impostor:
             impostor.declare_alive("hal")
             impostor.on_query(
                 keys.LIFECYCLE, lambda question: question.reply(Answer(ok=True, reason="done", lifecycle="disarmed"))

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Intent, Status, Trajectory
+from snakesim_hal.wire.messages import ControlState, LocomotionIntent, RobotStatus, Trajectory
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Running, running_snakesim
+from snakesim_testing.runs.command import RunningCommand, running_snakesim
 from snakesim_testing.runs.keyboard import LEFT, UP, at_the_keyboard
 
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[3] / "examples" / "steer.py"
-NOTHING = Intent(timestamp_ns=0, requester="nobody")
+NOTHING = LocomotionIntent(timestamp_ns=0, requester="nobody")
 
 
 class Way:
@@ -37,7 +37,7 @@ class Way:
 
 
 def lifecycle(session: Session) -> str:
-    found = session.wait_for_latched(keys.STATUS, Status, 5.0)
+    found = session.wait_for_latched(keys.STATUS, RobotStatus, 5.0)
     return "" if found is None else found.lifecycle
 
 
@@ -45,8 +45,8 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with running_snakesim(out, "peg_row", "--clock-mode", "realtime", "--duration", "300") as run:
         run.wait_for("Locomoting")
-        with open_session(Link(run.endpoint, "planar13")) as session:
-            intents, way = session.declare_reader(keys.INTENT, Intent), Way(session)
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
+            intents, way = session.declare_reader(keys.INTENT, LocomotionIntent), Way(session)
             with at_the_keyboard(run, tmp_path) as lost:
                 assert intents.drain() == []
                 assert lost.shows("nothing requested yet") is None
@@ -82,7 +82,7 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
     """A robot on its way, whose processes wait for one another."""
     out = tmp_path_factory.mktemp("lockstep") / "run"
     with running_snakesim(out, "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
@@ -100,10 +100,13 @@ def frozen(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: Running, tmp_path: Path) -> None:
+def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: RunningCommand, tmp_path: Path) -> None:
     """By the robot's own account; it has not gone."""
     why, run = " waits for navigation's answer to tick ", in_lockstep
-    with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
+    with (
+        open_session(ConnectionSettings(run.endpoint, "planar13")) as session,
+        at_the_keyboard(run, tmp_path) as operator,
+    ):
         operator.type(UP)
         operator.shows("requested: +0.05 m/s")
         states, found = session.declare_reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
@@ -118,7 +121,7 @@ def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: Running, tmp_pat
         assert "PowerOff" not in {one.state for one in found}
 
 
-def test_teleop_says_that_robot_stopped_sending(in_lockstep: Running, tmp_path: Path) -> None:
+def test_teleop_says_that_robot_stopped_sending(in_lockstep: RunningCommand, tmp_path: Path) -> None:
     with at_the_keyboard(in_lockstep, tmp_path) as operator:
         operator.shows("armed: ")
         with frozen(in_lockstep.part("host")):

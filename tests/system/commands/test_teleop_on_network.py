@@ -9,12 +9,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Intent
+from snakesim_hal.wire.messages import Clock, LocomotionIntent
 from snakesim_operator.robot_commands.teleop import command, joystick
 from snakesim_operator.robot_commands.teleop.command import TeleopLoop
-from snakesim_operator.robot_commands.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
+from snakesim_operator.robot_commands.teleop.joystick import ABS_Y, EV_ABS, EVENT, Joystick, JoystickAxis
 from snakesim_testing.hal.small_robots import make_clock
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
@@ -38,16 +38,19 @@ def test_a_stick_that_falls_silent_asks_for_nothing_any_more(monkeypatch: pytest
     monkeypatch.setattr(command, "STICK_AGE_S", SILENT_S)
     read, write = os.pipe()
     os.set_blocking(read, False)
-    link = Link(find_free_endpoint(), "worm")
-    with open_session(Link(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
-        heard, clocks = robot.declare_reader(keys.INTENT, Intent, depth=256), robot.declare_publisher(keys.CLOCK, Clock)
-        stick = Joystick(read, Axis(0, 255), Axis(0, 255))
+    link = ConnectionSettings(find_free_endpoint(), "worm")
+    with open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
+        heard, clocks = (
+            robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256),
+            robot.declare_publisher(keys.CLOCK, Clock),
+        )
+        stick = Joystick(read, JoystickAxis(0, 255), JoystickAxis(0, 255))
         teleop = TeleopLoop(session, link, 0.2, None, stick)
         loop = threading.Thread(target=teleop.run)
         monkeypatch.setattr(command, "call_on_stop_signals", lambda _stop: None)  # of the main thread alone
         monkeypatch.setattr(signal, "signal", lambda *_: None)
         loop.start()
-        intents, ticks = list[Intent](), itertools.count(1)
+        intents, ticks = list[LocomotionIntent](), itertools.count(1)
 
         def speeds_at_last(count: int) -> set[float | None]:
             clocks.put(make_clock(next(ticks), arm_session=1, clock_mode="realtime"))
@@ -77,9 +80,12 @@ def event(at_s: float, axis: int, value: int) -> bytes:
 def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFixture[str]) -> None:
     read, write = os.pipe()
     os.set_blocking(read, False)
-    link = Link(find_free_endpoint(), "worm")
-    with open_session(Link(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
-        heard, clocks = robot.declare_reader(keys.INTENT, Intent, depth=256), robot.declare_publisher(keys.CLOCK, Clock)
+    link = ConnectionSettings(find_free_endpoint(), "worm")
+    with open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
+        heard, clocks = (
+            robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256),
+            robot.declare_publisher(keys.CLOCK, Clock),
+        )
 
         def be_a_robot_and_a_hand() -> None:
             os.write(write, event(time.monotonic(), ABS_Y, 0))
@@ -90,7 +96,7 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
 
         hand = threading.Thread(target=be_a_robot_and_a_hand)
         hand.start()
-        stick = Joystick(read, Axis(0, 255), Axis(0, 255))
+        stick = Joystick(read, JoystickAxis(0, 255), JoystickAxis(0, 255))
         assert TeleopLoop(session, link, 0.2, None, stick).run() == 1
         hand.join()
         stick.close()

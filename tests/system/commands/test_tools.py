@@ -19,7 +19,7 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
 from snakesim_testing.runs.command import (
     SNAKESIM_COMMAND,
-    Running,
+    RunningCommand,
     make_environment,
     run_to_end,
     running_armed_snakesim,
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.e2e
 TUTORIAL = Path("docs/tutorials/write-a-controller.md").resolve()
 
 
-def echoed(run: Running, key: str, count: int, *more: str) -> list[dict[str, Any]]:
+def echoed(run: RunningCommand, key: str, count: int, *more: str) -> list[dict[str, Any]]:
     """What `snakesim topic echo` prints, each line read as JSON."""
     ended = command.tell(run, "topic", "echo", key, "--count", str(count), *more)
     assert ended.code == 0 and ended.err == "", ended.err

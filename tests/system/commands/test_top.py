@@ -6,26 +6,26 @@ import threading
 
 import pytest
 
-from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.monitoring.top import TrafficSnapshot, show_traffic
-from snakesim_operator.monitoring.traffic import MAX_ARRIVAL_TIMES, MAX_KEYS, Traffic
+from snakesim_operator.monitoring.traffic import MAX_ARRIVAL_TIMES, MAX_KEYS, NetworkTraffic
 from snakesim_testing.hal.small_robots import make_clock, make_description, make_joint_command, make_joint_state
 from snakesim_testing.harness.endpoint import find_free_endpoint
 
 MS = 1_000_000
 
 
-def arrival(key: str, message: Message, at_ms: float) -> Arrival:
-    return Arrival(key, encode(message), format_encoding(type(message)), round(at_ms * MS))
+def arrival(key: str, message: Message, at_ms: float) -> ReceivedSample:
+    return ReceivedSample(key, encode(message), format_encoding(type(message)), round(at_ms * MS))
 
 
 def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
-    robot, traffic = make_description(), Traffic()
+    robot, traffic = make_description(), NetworkTraffic()
     for tick in range(100):
         traffic.add(
             arrival(
@@ -48,12 +48,12 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
 
 
 def test_top_foreign_keys_are_bounded_and_harmless_to_terminal() -> None:
-    traffic = Traffic("worm")
-    traffic.add(Arrival("sensor/joints", b"noise", format_encoding(JointState), 0))
+    traffic = NetworkTraffic("worm")
+    traffic.add(ReceivedSample("sensor/joints", b"noise", format_encoding(JointState), 0))
     for i in range(MAX_KEYS + 10):
-        traffic.add(Arrival(f"evil/{i}", b"x", "", i))
+        traffic.add(ReceivedSample(f"evil/{i}", b"x", "", i))
     for i in range(2 * MAX_ARRIVAL_TIMES):
-        traffic.add(Arrival("evil/0", b"x", "", i * MS))
+        traffic.add(ReceivedSample("evil/0", b"x", "", i * MS))
     lines = traffic.measure_keys(MS)
     assert len(lines) == MAX_KEYS
     assert traffic.keys_left_out == 11
@@ -75,7 +75,7 @@ def test_a_table_for_scripts_from_a_real_network() -> None:
             if over.wait(0.02):
                 return
 
-    with open_session(Link(endpoint, "worm", listen=True)) as session:
+    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
         teller = threading.Thread(target=tell_time, args=(session,))
         teller.start()
         try:

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from snakesim_operator.features.console.robot_data.run_playback import RunPlayback
-from snakesim_operator.features.console.scene.drawing import Surroundings, draw
+from snakesim_operator.features.console.scene.drawing import TrueSurroundings, draw
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 
@@ -67,7 +67,7 @@ def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
     assert end_s - begin_s == pytest.approx(0.99, abs=0.03)
     moment = recorded.make_snapshot(begin_s + 0.5)
     row = record.find_nearest_row(begin_s + 0.5)
-    drawing, nodes = draw(moment, Surroundings(record.config)), record.find_body_points_w(row)
+    drawing, nodes = draw(moment, TrueSurroundings(record.config)), record.find_body_points_w(row)
     assert drawing is not None
     assert nodes is not None
     assert drawing.hinges_w == pytest.approx(nodes[1:-1])

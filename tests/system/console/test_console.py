@@ -10,20 +10,20 @@ from urllib.parse import urlsplit
 import pytest
 
 from snakesim_hal.model.scenario import load_scenario
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlParameters, JointState, Status
+from snakesim_hal.wire.messages import ControlParameters, JointState, RobotStatus
 from snakesim_operator.features.console.operations import PageLog, RobotOperations
-from snakesim_operator.features.console.page.page import Page
+from snakesim_operator.features.console.page.page import ConsolePage
 from snakesim_operator.features.console.robot_data.snapshot import make_expected_snapshot
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.page import origin_of
 from snakesim_testing.harness.processes import assert_no_process_left, find_processes_with
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, Tab, open_chromium
+from snakesim_testing.operator.browser import CHROMIUM, MISSING, BrowserTab, open_chromium
 from snakesim_testing.operator.ready_stop import ReadyStop
 from snakesim_testing.operator.served_console import running_console
-from snakesim_testing.runs.command import Running, running_snakesim
+from snakesim_testing.runs.command import RunningCommand, running_snakesim
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
@@ -83,7 +83,7 @@ TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab
 def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
     with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
-        Page(server, None, None, PageLog(), recorded="a run")
+        ConsolePage(server, None, None, PageLog(), recorded="a run")
         page = browser.open("about:blank", *SMALL)
         for prefers in ("light", "dark"):
             page.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": prefers}])
@@ -104,9 +104,9 @@ def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
     """And a wide screen shows the tabs in one line."""
     config, log = load_scenario("triplet").config, PageLog()
     with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
-        Page(server, None, RobotOperations(Link(find_free_endpoint(), "planar13"), log), log).show_snapshot(
-            make_expected_snapshot(config)
-        )
+        ConsolePage(
+            server, None, RobotOperations(ConnectionSettings(find_free_endpoint(), "planar13"), log), log
+        ).show_snapshot(make_expected_snapshot(config))
         page = browser.open(address, 400, 800, 0.5)
         page.wait_for("planar13")
         for tab in ("Joints", "State", "Signals", "Log"):
@@ -135,8 +135,8 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
         page = browser.open(f"http://localhost:{port}{urlsplit(address).path}signals", *SMALL)
         page.wait_for("Self-test: ready")
         assert SILENT not in page.text()
-        with open_session(Link(run.endpoint, "planar13")) as session:
-            status = session.wait_for_latched(keys.STATUS, Status, 10.0)
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
+            status = session.wait_for_latched(keys.STATUS, RobotStatus, 10.0)
             assert status is not None and status.lifecycle != "estop", "another site has stopped the robot"
             front = console_process(run, ".front")
             os.kill(front, signal.SIGSTOP)
@@ -152,7 +152,10 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
                 page.wait_for("planar13: stopped")
             finally:
                 os.kill(pages, signal.SIGCONT)
-            assert session.wait_for_latched(keys.STATUS, Status, 10.0, lambda one: one.lifecycle == "estop") is not None
+            assert (
+                session.wait_for_latched(keys.STATUS, RobotStatus, 10.0, lambda one: one.lifecycle == "estop")
+                is not None
+            )
 
 
 # What another site tries, if it knows the token.
@@ -165,7 +168,7 @@ ANOTHER_SITE = """
 """
 
 
-def console_process(run: Running, part: str = "") -> int:
+def console_process(run: RunningCommand, part: str = "") -> int:
     """Return the process id of the pages, or of the front server."""
     found = find_processes_with("cmdline", f"snakesim_operator.features.console{part}\0")
     return next(pid for pid, line in found if f"\0{run.endpoint}\0" in line)
@@ -203,13 +206,13 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
     assert_no_process_left(tmp_path / "run")
 
 
-def change_settings(tab: Tab, run: Running) -> None:
+def change_settings(tab: BrowserTab, run: RunningCommand) -> None:
     """Of the controller, while it runs, by typing one into the page."""
     tab.click("Parameters")
     tab.wait_for("amplitude_rad, rad")
     tab.type("amplitude_rad, rad", "0.4")
     tab.click("Apply")
-    with open_session(Link(run.endpoint, "planar13")) as session:
+    with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
         in_force = session.wait_for_latched(
             keys.PARAMETERS_IN_FORCE, ControlParameters, 10.0, lambda one: one.requester == "viewer 1"
         )
@@ -217,12 +220,12 @@ def change_settings(tab: Tab, run: Running) -> None:
     assert '"amplitude_rad":0.4' in in_force.parameters
 
 
-def stop_in(tab: Tab, run: Running) -> float:
+def stop_in(tab: BrowserTab, run: RunningCommand) -> float:
     """Press the emergency stop's key in a page; seconds until the motors are off. Then the joints coast to rest."""
-    with open_session(Link(run.endpoint, "planar13")) as session:
+    with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
         joints, status = (
             session.declare_reader(keys.JOINTS, JointState),
-            session.declare_latched_reader(keys.STATUS, Status),
+            session.declare_latched_reader(keys.STATUS, RobotStatus),
         )
         wait_until(lambda: any(fastest_rad_s(one) > 0.05 for one in joints.drain()), "moving joints")
         pressed_s = time.monotonic()

@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_testing.harness.stalling_relay import StallingRelay
 from snakesim_testing.operator.console_wait import LIMIT_S, until
-from snakesim_testing.operator.viewer import Viewer, viewing
+from snakesim_testing.operator.viewer import ConsoleViewer, viewing
 from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.checked_robot import make_checked_folder
 from snakesim_testing.runs.command import run_in_background, running_snakesim
@@ -41,7 +41,7 @@ def test_console_arms_unchecked_robot_only_by_explicit_confirmation(home: Path) 
 
 async def arm_unchecked(address: str) -> None:
     async with viewing(address) as socket:
-        viewer = Viewer(socket)
+        viewer = ConsoleViewer(socket)
         await viewer.come()
         watching = asyncio.create_task(viewer.watch())
         await until(lambda: viewer.shows("armed by snakesim run"), "an armed robot")
@@ -81,7 +81,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         StallingRelay(parts.hostname, parts.port) as relay,
         viewing(f"http://127.0.0.1:{relay.port}{parts.path}") as socket,
     ):
-        viewer = Viewer(socket)
+        viewer = ConsoleViewer(socket)
         await viewer.come()
         watching = asyncio.create_task(viewer.watch())
         await until(lambda: viewer.shows("not checked: its joints have not been checked"), "the table")
@@ -108,7 +108,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
     await until(lambda: read_setpoints(home)["lifecycle"] != "armed", "the end of a step whose viewer has left")
 
 
-async def armed(viewer: Viewer, home: Path) -> None:
+async def armed(viewer: ConsoleViewer, home: Path) -> None:
     """Jog joint_2, which arms the robot."""
     await until(lambda: viewer.shows("<div>done") or viewer.shows("<div>ended"), "the end of the step before")
     await viewer.choose("Joint (0: all)", 2)
@@ -117,7 +117,7 @@ async def armed(viewer: Viewer, home: Path) -> None:
     await until(lambda: read_setpoints(home)["lifecycle"] != "disarmed", "armed")
 
 
-async def moved_and_stood(viewer: Viewer, relay: StallingRelay, home: Path) -> bool:
+async def moved_and_stood(viewer: ConsoleViewer, relay: StallingRelay, home: Path) -> bool:
     """Hold the button, let it go, also while the network stalls; False when the robot was stopped meanwhile."""
     await armed(viewer, home)
     await until(lambda: stopped(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0], "one joint with current")

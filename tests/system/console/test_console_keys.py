@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Intent, Status, Trajectory
+from snakesim_hal.wire.messages import LocomotionIntent, RobotStatus, Trajectory
 from snakesim_testing.operator.console_wait import LIMIT_S, until
-from snakesim_testing.operator.viewer import Viewer, viewing
+from snakesim_testing.operator.viewer import ConsoleViewer, viewing
 from snakesim_testing.runs.command import running_snakesim
 
 pytestmark = pytest.mark.e2e
@@ -25,18 +25,18 @@ def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -
 
 async def drive_and_stop(address: str, endpoint: str) -> None:
     async with viewing(address) as others:
-        other = Viewer(others)
+        other = ConsoleViewer(others)
         await other.come()
         watching = asyncio.create_task(other.watch())
         await until(lambda: other.shows("armed by snakesim run"), "an armed robot")
-        with open_session(Link(endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(endpoint, "planar13")) as session:
             intents, paths = (
-                session.declare_reader(keys.INTENT, Intent),
+                session.declare_reader(keys.INTENT, LocomotionIntent),
                 session.declare_reader(keys.TRAJECTORY, Trajectory),
             )
-            status = session.declare_latched_reader(keys.STATUS, Status)
+            status = session.declare_latched_reader(keys.STATUS, RobotStatus)
             async with viewing(address) as mine:
-                driver = Viewer(mine)
+                driver = ConsoleViewer(mine)
                 await driver.come()
                 driving = asyncio.create_task(driver.watch())
                 await until(lambda: driver.has("Take control"), "the controls")
@@ -64,7 +64,7 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
         watching.cancel()
 
 
-async def hold(viewer: Viewer, key: str, done: Callable[[], bool], what: str = "an effect") -> None:
+async def hold(viewer: ConsoleViewer, key: str, done: Callable[[], bool], what: str = "an effect") -> None:
     """Hold a key, as its keyboard repeats it."""
     deadline = asyncio.get_running_loop().time() + LIMIT_S
     while not done():

@@ -16,7 +16,7 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, Browser, Tab, open_chromium
+from snakesim_testing.operator.browser import CHROMIUM, MISSING, BrowserTab, ChromiumBrowser, open_chromium
 from verification.screenshots import recording
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSI
 READABLE_PX = 9.0  # height of a text
 
 
-def searched(tab: Tab, words: str, then: str) -> None:
+def searched(tab: BrowserTab, words: str, then: str) -> None:
     """Type a search, and press what has this label."""
     tab.value(
         f"(() => {{ const field = document.getElementById('search'); field.value = {json.dumps(words)};"
@@ -33,7 +33,7 @@ def searched(tab: Tab, words: str, then: str) -> None:
     tab.click(then)
 
 
-def cells(tab: Tab) -> dict[str, list[str]]:
+def cells(tab: BrowserTab) -> dict[str, list[str]]:
     """What the tables say of each signal."""
     rows = tab.value(
         "[...document.querySelectorAll('tr')].map(row => [...row.cells].map(cell => cell.innerText.trim()))"
@@ -96,7 +96,7 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
     assert (tmp_path / "signals.png").read_bytes().startswith(b"\x89PNG")
 
 
-def labels_of_the_report_are_read_on_a_phone(browser: Browser, record: RunRecord, folder: Path) -> None:
+def labels_of_the_report_are_read_on_a_phone(browser: ChromiumBrowser, record: RunRecord, folder: Path) -> None:
     """Those of the scales in its drawings; a browser is there, and so is a run."""
     (folder / "report.html").write_text(render_report(record, summarize_run(record, "complete")), encoding="utf-8")
     phone = browser.open((folder / "report.html").as_uri(), 400, 900)
@@ -113,7 +113,7 @@ def labels_of_the_report_are_read_on_a_phone(browser: Browser, record: RunRecord
 AXIS = "document.querySelector('.plot').layout.yaxis.range"
 
 
-def point(tab: Tab, share: float, *, press: bool = False) -> None:
+def point(tab: BrowserTab, share: float, *, press: bool = False) -> None:
     """Move the pointer to a share of the time in the first plot."""
     at = tab.value(
         "(() => { const plot = document.querySelector('.plot'), r = plot.getBoundingClientRect(),"

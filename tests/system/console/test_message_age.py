@@ -8,9 +8,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
+from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, ControlAdmission
 from snakesim_operator.features.console.web.message_age import MAX_UNANSWERED, MessageAge, PageAction
-from snakesim_testing.harness.page import Page
+from snakesim_testing.harness.page import ViewerPage
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
 from snakesim_testing.operator.served_console import running_console
@@ -99,7 +99,7 @@ def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
     done: list[str] = []
     late: list[float] = []
     with running_console(ReadyStop()) as (server, _):
-        admission = Admission()
+        admission = ControlAdmission()
         group = server.gui.add_button_group("Robot", ("Arm", "Disarm"))
         hold = server.gui.add_button("Hold")
         stop = server.gui.add_button("Stop")
@@ -145,7 +145,7 @@ def test_console_page_without_scene_may_view_and_stop() -> None:
     with running_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("EMERGENCY STOP  (Esc)")
         server.admission.admit_control(button, handler=lambda viewer, _action: stopped.append(viewer))
-        with Page(address, draws=False) as page:
+        with ViewerPage(address, draws=False) as page:
             page.click("EMERGENCY STOP  (Esc)")
             wait_until(lambda: stopped == [0], "the stop", 10.0)
             assert server.count_viewers() == 1
@@ -164,7 +164,7 @@ def test_a_real_page_answers_what_it_is_asked(capfd: pytest.CaptureFixture[str])
     with running_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("Go")
         server.admission.admit_control(button, handler=act)
-        with Page(address) as page:
+        with ViewerPage(address) as page:
             wait_until(lambda: server.get_clients(), "a viewer", 10.0)
             page.click("Go")
             wait_until(lambda: ages, "a press", 10.0)

@@ -6,7 +6,7 @@ from typing import Any
 import viser
 
 from snakesim_testing.operator.served_console import running_console
-from snakesim_testing.operator.viewer import ASKED, Viewer, viewing
+from snakesim_testing.operator.viewer import ASKED, ConsoleViewer, viewing
 
 CHANGES = 200
 LIMIT_S = 20.0
@@ -18,7 +18,7 @@ def test_a_slow_page_gets_the_newest_state_only() -> None:
 
         async def slow() -> list[str]:
             async with viewing(address) as socket:
-                viewer = Viewer(socket)
+                viewer = ConsoleViewer(socket)
                 await viewer.come()
                 changing = asyncio.create_task(_change(text))
                 batch = await _until_asked(viewer)
@@ -40,7 +40,7 @@ def test_a_page_that_keeps_up_gets_every_change() -> None:
 
         async def quick() -> list[str]:
             async with viewing(address) as socket:
-                viewer = Viewer(socket)
+                viewer = ConsoleViewer(socket)
                 await viewer.come()
                 seen = list[str]()
                 for i in range(5):
@@ -60,7 +60,7 @@ async def _change(text: viser.GuiTextHandle) -> None:
         await asyncio.sleep(0.002)
 
 
-async def _until_asked(viewer: Viewer) -> list[dict[str, Any]]:
+async def _until_asked(viewer: ConsoleViewer) -> list[dict[str, Any]]:
     """All messages up to the question whether they have been shown."""
     found = list[dict[str, Any]]()
     while not any(message["type"] == ASKED for message in found):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import M_PER_N, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
@@ -31,9 +31,9 @@ def test_scene_force_without_contact_is_dashed_until_contact():
 
 def test_scene_perceived_shapes_are_drawn_until_forgotten():
     found = [
-        Obstacle(name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, touched=True),
-        Obstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, touched=True),
-        Obstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), touched=True),
+        KnownObstacle(name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, touched=True),
+        KnownObstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, touched=True),
+        KnownObstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), touched=True),
     ]
     with running_console() as (server, _):
         scene = RobotScene(server.scene, make_description(), None)

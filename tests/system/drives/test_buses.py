@@ -10,7 +10,7 @@ import pytest
 from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.mixed import MixedBackend, MixedSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.wire.messages import ClockMode, Mode
+from snakesim_hal.wire.messages import ClockMode, JointMode
 from snakesim_testing.benches.emulated_drives import DrivesOfAnyType
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.hal.small_robots import make_run_config
@@ -97,7 +97,7 @@ def test_mixed_drive_families_move_as_one_robot(opened: Opens) -> None:
     described = robot.backend.describe()
     assert [joint.serial[:4] for joint in described.joints] == ["3855", "3855", "", ""]
     assert described.emulated
-    assert [joint.supports_mode(Mode.VELOCITY) for joint in described.joints] == [True] * 4, (
+    assert [joint.supports_mode(JointMode.VELOCITY) for joint in described.joints] == [True] * 4, (
         "as its file says; a run narrows it"
     )
     assert robot.run(30, "disarmed") == []

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from snakesim_operator.results.metrics.advance import ForwardProgress
-from snakesim_operator.run.in_process import Result, simulate
+from snakesim_operator.run.in_process import InProcessResult, simulate
 from snakesim_testing.runs.whole_run import load_run_config
 
 LOST_S = 3.0
 
 
-def over_can(*sets: str) -> Result:
+def over_can(*sets: str) -> InProcessResult:
     """The shipped scenario with nothing changed but the backend and these."""
     return simulate(load_run_config("surveyed_clutter", "backend=can", *sets), until_goal=True)
 

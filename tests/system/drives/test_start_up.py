@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from snakesim_testing.benches import homing_drives
-from snakesim_testing.harness.command import Running, running_snakesim
+from snakesim_testing.harness.command import RunningCommand, running_snakesim
 from snakesim_testing.harness.wait import wait_until
 
 BACKEND = f"{homing_drives.__file__}:HomingBackend"
@@ -20,7 +20,7 @@ def test_status_names_the_start_up_step_until_the_robot_is_armed(tmp_path: Path)
         run.interrupt()
 
 
-def find_step(run: Running) -> str:
+def find_step(run: RunningCommand) -> str:
     """Return the status if it names the step, or nothing: a busy host may not answer in time."""
     status = run.run_tool("status").out
     return status if "): homing, " in status else ""

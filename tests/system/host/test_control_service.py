@@ -10,7 +10,7 @@ import pytest
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.controller import ControllerCommand, Observation, Telemetry, make_position_setpoints
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
+from snakesim_hal.wire.messages import Clock, FaultRequest, JointCommand, JointState, LocomotionIntent
 from snakesim_testing.gnc.services import ObservationRecorder, RunningServices, running_services
 from snakesim_testing.gnc.stage import require_value
 from snakesim_testing.hal.local_network import fast_thread_switching
@@ -110,12 +110,12 @@ def test_control_without_streams_withholds_them_until_they_return() -> None:
 def test_control_after_intent_expired_rests_and_says_why() -> None:
     with running_services() as made:
         clocks, operator = made.run.session.declare_reader(keys.CLOCK, Clock), made.run.session
-        intents = operator.declare_publisher(keys.INTENT, Intent)
+        intents = operator.declare_publisher(keys.INTENT, LocomotionIntent)
         made.run.arm()
         wait_until(lambda: sighted(made), "observations with everything in them")
         assert speed(made) == 0.2  # the mission's
         now_ns = clocks.drain()[-1].timestamp_ns
-        intents.put(Intent(timestamp_ns=now_ns, requester="ann", speed_m_s=0.1, valid_for_ns=500_000_000))
+        intents.put(LocomotionIntent(timestamp_ns=now_ns, requester="ann", speed_m_s=0.1, valid_for_ns=500_000_000))
         wait_until(lambda: speed(made) == 0.1, "the operator's speed")
         wait_until(lambda: speed(made) == 0.0, "no speed")
         stopped = next(
@@ -127,7 +127,7 @@ def test_control_after_intent_expired_rests_and_says_why() -> None:
         reported = made.wait_for_reason("the intent of ann has expired")
         assert reported.state == "Idle"
         assert "send a new one to go on" in reported.reason
-        intents.put(Intent(timestamp_ns=clocks.drain()[-1].timestamp_ns, requester="ann"))
+        intents.put(LocomotionIntent(timestamp_ns=clocks.drain()[-1].timestamp_ns, requester="ann"))
         wait_until(lambda: speed(made) == 0.2, "a new intent")
 
 

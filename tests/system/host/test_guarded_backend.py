@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ClockMode, Mode
+from snakesim_hal.wire.messages import ClockMode, JointMode
 from snakesim_testing.hal.local_network import LagBackend, running_commanded_host
 from snakesim_testing.hal.small_robots import make_pose, make_power, make_run_config
 from snakesim_testing.harness.wait import wait_until
@@ -34,7 +34,7 @@ def test_backend_error_is_latched_and_joints_are_made_safe(where: str, error: Ex
         causes = {fault.what: fault.cause for fault in run.host.authority.faults_since_start.faults}
         assert causes["backend_failed"] == cause.format(where)
         if where != "enact":
-            assert run.backend.enacted[-1].mode == [Mode.VELOCITY] * 3
+            assert run.backend.enacted[-1].mode == [JointMode.VELOCITY] * 3
 
 
 class Wrong(LagBackend):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.faults.injector import Injector
+from snakesim_hal.faults.injector import FaultInjector
 from snakesim_hal.faults.message_faults import MessageFaults
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
@@ -114,7 +114,7 @@ def test_sensors_that_are_dropped_do_not_arrive_and_come_back() -> None:
 # --- a part's own rules --------------------------------------------------------------------------------------
 
 
-def turn(injector: Injector, tick: int, arm_session: int) -> None:
+def turn(injector: FaultInjector, tick: int, arm_session: int) -> None:
     injector.update(tick * 10_000_000, arm_session, "armed" if arm_session else "disarmed")
 
 
@@ -122,7 +122,7 @@ def test_injected_plan_is_not_repeated_for_restarted_service() -> None:
     config = make_run_config(faults=["drop:actuator/joints@0.1"], allow_fault_injection=True)
     with connected_sessions("worm") as (session,):
         for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
-            injector = Injector("control", config, session, report_event=lambda _text, _now_s: None)
+            injector = FaultInjector("control", config, session, report_event=lambda _text, _now_s: None)
             turn(injector, 0, first_arming)
             for tick in range(1, 15):
                 turn(injector, tick, 1)
@@ -134,7 +134,7 @@ def test_injected_newer_fault_replaces_one_of_its_kind() -> None:
     config = make_run_config(faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"])
     notes: list[str] = []
     with connected_sessions("worm") as (session,):
-        injector = Injector(
+        injector = FaultInjector(
             "control", config, session, report_event=lambda text, now_s: notes.append(f"{now_s:g} {text}")
         )
         for tick in range(50):

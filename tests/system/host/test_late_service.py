@@ -5,9 +5,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from snakesim_hal.network.client import Client
-from snakesim_hal.network.session import Link, open_session
-from snakesim_testing.hal.local_network import Follower, running_follower, running_host
+from snakesim_hal.network.client import HostClient
+from snakesim_hal.network.session import ConnectionSettings, open_session
+from snakesim_testing.hal.local_network import SineFollower, running_follower, running_host
 from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.harness.wait import wait_until
 
@@ -17,10 +17,10 @@ pytestmark = pytest.mark.usefixtures("quick_threads")
 
 
 @contextmanager
-def navigation(link: Link) -> Iterator[Client]:
+def navigation(link: ConnectionSettings) -> Iterator[HostClient]:
     """A navigation service that answers only when the test says so."""
     with open_session(link) as session:
-        client = Client(session, "navigation")
+        client = HostClient(session, "navigation")
         client.wait_for_description()
         client.announce()
         yield client
@@ -29,14 +29,14 @@ def navigation(link: Link) -> Iterator[Client]:
 def test_host_does_not_await_an_answer_to_a_tick_that_a_service_has_not_received() -> None:
     config = make_run_config(clock_mode="lockstep", services=SERVICES, stall_limit_s=60.0)
     with running_host(config) as run, navigation(run.link) as slow:
-        with running_follower(run.link, Follower()):
+        with running_follower(run.link, SineFollower()):
             wait_until(lambda: run.status.waiting_for == ["navigation"], "control")
             slow.report_done(0)
             run.arm()
             assert run.request_lifecycle("disarm").ok  # an armed robot that loses its controller goes to fault
             wait_until(lambda: slow.newest_clock is not None and slow.newest_clock.tick == 1, "tick 1")
         wait_until(lambda: not run.host.participants["control"].is_connected, "control has left")
-        late = Follower()
+        late = SineFollower()
         with running_follower(run.link, late):
             wait_until(lambda: run.host.participants["control"].is_connected, "control is back")
             assert late.ticks_seen == [], "the host waits for navigation, and publishes nothing"

@@ -10,7 +10,7 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.plugins import SERVICES, register_plugin_temporarily
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import DepthImage
@@ -34,7 +34,7 @@ def images_of(config: RunConfig) -> list[DepthImage]:
     """What somebody who acts every tick reads, as the clock names it."""
     found: dict[int, DepthImage] = {}
     with register_plugin_temporarily(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
-        onlooker = Client(run.network.create_session(), "onlooker")
+        onlooker = HostClient(run.network.create_session(), "onlooker")
         images, ticks = onlooker.subscribe(HEAD, DepthImage), onlooker.iterate_ticks(0.0)
         for _ in run.iterate_ticks():
             while (clock := next(ticks)) is not None:

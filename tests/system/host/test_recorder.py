@@ -19,13 +19,13 @@ from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.safety.authority import TickOutput
-from snakesim_hal.wire.messages import Description, Mode
-from snakesim_testing.hal.local_network import Follower, running_follower, running_host
+from snakesim_hal.wire.messages import JointMode, RobotDescription
+from snakesim_testing.hal.local_network import SineFollower, running_follower, running_host
 from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_run_config
 from snakesim_testing.harness.wait import wait_until
 
 ROBOT = make_description()
-TOLD = TickOutput(SafeSetpoints([Mode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
+TOLD = TickOutput(SafeSetpoints([JointMode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
 ROW = BlackBox(ROBOT).layout.row_bytes
 
 
@@ -80,7 +80,7 @@ def test_recorder_writes_rows_within_a_second_and_all_at_end(tmp_path: Path, mem
     assert ticks_on_disk(tmp_path) == list(range(45))
     assert reported(tmp_path) == remembered(memory) == Numbers(45, 0, "")
     assert compute_digest(read_black_box(tmp_path / BLACK_BOX)[1]) == box.command_digest
-    assert msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=Description) == ROBOT
+    assert msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=RobotDescription) == ROBOT
     assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}
 
 
@@ -172,7 +172,7 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
     monkeypatch.setattr(under_test, "CLOSE_TIMEOUT_S", 0.3)
     with (
         running_host(make_run_config(clock_mode="lockstep"), max_ticks=75) as run,
-        running_follower(run.link, Follower()),
+        running_follower(run.link, SineFollower()),
     ):
         with HostRecordWriter(
             run.host.black_box, run.host.description, partial(create_host_record, run.host), tmp_path, memory

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.scenario import Override, load_scenario
+from snakesim_hal.model.scenario import KeyOverride, load_scenario
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import DepthImage, Mode
+from snakesim_hal.wire.messages import DepthImage, JointMode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
@@ -22,7 +22,7 @@ WALL = {"ground": {"friction": 0.0}, "box": [{"position_m": [4.0, 0.0], "size_m"
 SLOW = """
 import time
 from snakesim_sim_backend.sensors.depth import RayCamera
-from snakesim_hal.wire.messages import Ranges
+from snakesim_hal.wire.messages import RangeScan
 
 class Slow(RayCamera):
     def read(self, tick, timestamp_ns):
@@ -34,10 +34,10 @@ class Broken(RayCamera):
         raise OSError("lens cap on")
 
 class Mute(RayCamera):
-    message = Ranges
+    message = RangeScan
 
 class Plain:
-    message = Ranges
+    message = RangeScan
 """
 
 
@@ -77,14 +77,14 @@ def test_snapshot_shows_past_scene_and_arrives_after_delay(delay_s, ticks):
 
 
 def bytes_of_a_run(robot, seed=3):
-    config = load_scenario("peg_row", [Override("robot", robot, "--robot")]).config
+    config = load_scenario("peg_row", [KeyOverride("robot", robot, "--robot")]).config
     run = SimulatorRig(msgspec.structs.replace(config, seed=seed))
     reported = {}
     for tick in range(40):
         samples = run.sample()
         for key, message in (("joints", samples.joints), *samples.by_key.items()):
             reported[key] = reported.get(key, b"") + encode(message)
-        run.command([Mode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
+        run.command([JointMode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
         run.advance()
     run.sim.close()
     return reported

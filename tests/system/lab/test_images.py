@@ -5,7 +5,7 @@ import time
 
 import msgspec
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import DepthImage
@@ -20,12 +20,12 @@ SIZE = {"width": 1280, "height": 960, "depth": bytes(2 * 1280 * 960)}
 IMAGE = msgspec.convert({**make_plain_example(DepthImage), **SIZE, "tick": 1}, DepthImage)
 
 
-def link(lab: RunningLab, role: Role) -> Link:
+def link(lab: RunningLab, role: Role) -> ConnectionSettings:
     """As a rendered session file says; only the router that runs."""
     identity = lab.find_identity_by_role(role, OWN_ROBOT)
     path = lab.folder / f"{identity.common_name}.json5"
     path.write_text(json.dumps(lab.make_session_settings(identity, namespace=OWN_ROBOT)))
-    return Link.from_session_file(read_session(path), OWN_ROBOT)
+    return ConnectionSettings.from_session_file(read_session(path), OWN_ROBOT)
 
 
 def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: RunningLab) -> None:

@@ -19,15 +19,17 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.features.lab.certificates import Issuer, issue_certificate, load_or_create_authority
-from snakesim_operator.features.lab.identities import Identity
+from snakesim_operator.features.lab.certificates import CertificateIssuer, issue_certificate, load_or_create_authority
+from snakesim_operator.features.lab.identities import CertificateIdentity
 from snakesim_testing.lab.router_waits import eventually, settle
 from snakesim_testing.lab.small_lab import OTHER_ROBOT, OWN_ROBOT, RunningLab, open_zenoh_session
 
 COMMAND = f"{OWN_ROBOT}/actuator/joints"
 
 
-def with_certificate(lab: RunningLab, folder: Path, who: Identity, issuer: Issuer, life: timedelta) -> dict[str, Any]:
+def with_certificate(
+    lab: RunningLab, folder: Path, who: CertificateIdentity, issuer: CertificateIssuer, life: timedelta
+) -> dict[str, Any]:
     """Settings of a session with a certificate that the lab did not make."""
     certificate, key = issue_certificate(issuer, who, lab.lab, life)
     (folder / "own.pem").write_bytes(certificate)
@@ -71,11 +73,11 @@ def test_without_a_valid_certificate_nobody_is_let_in(lab: RunningLab, tmp_path:
     assert_told(lab, REASONS[flaw])
 
 
-def role_as_issuer(lab: RunningLab, own: Issuer) -> Issuer:
+def role_as_issuer(lab: RunningLab, own: CertificateIssuer) -> CertificateIssuer:
     """Somebody who signs with the certificate of a role."""
     certificate, key = issue_certificate(own, lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), lab.lab)
     private: Any = load_pem_private_key(key, None)
-    return Issuer(x509.load_pem_x509_certificate(certificate), private)
+    return CertificateIssuer(x509.load_pem_x509_certificate(certificate), private)
 
 
 def test_who_was_taken_out_of_the_lab_file_is_nobody(lab: RunningLab, tmp_path: Path) -> None:

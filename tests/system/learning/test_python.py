@@ -45,10 +45,10 @@ class Nod(snakesim.Controller):
 
 FAILING = """\
 import numpy as np
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 
 
-class Failing(Hold):
+class Failing(HoldPose):
     def update(self, observation):
         np.linalg.solve(np.zeros((2, 2)), np.ones(2))
 """
@@ -137,7 +137,8 @@ def test_compute_body_points_w_ends_at_the_head(result: snakesim.Result) -> None
 
 
 def test_a_path_and_a_shipped_name_are_controllers_too(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text("from snakesim_gnc.control.hold import Hold\n\n\nclass Mine(Hold):\n    pass\n")
+    source = "from snakesim_gnc.control.hold import HoldPose\n\n\nclass Mine(HoldPose):\n    pass\n"
+    (tmp_path / "mine.py").write_text(source)
     mine = snakesim.run("triplet", controller=f"{tmp_path}/mine.py:Mine", duration=0.5)
     assert mine.digest == snakesim.run("triplet", controller="hold", duration=0.5).digest
 

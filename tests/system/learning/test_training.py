@@ -12,7 +12,7 @@ import pytest
 import snakesim
 from snakesim.environments import SnakeEnv
 from snakesim.training.exported import read_learned_parameters, write_onnx_file
-from snakesim.training.form import FORMS, OBSERVE, Policy
+from snakesim.training.form import FORMS, OBSERVE, PolicyArrays
 from snakesim_gnc.control.policy import POLICY_FOLDER, PolicyModel
 from snakesim_operator.cli import main, make_parser
 from snakesim_testing.messages import raises_error
@@ -93,7 +93,7 @@ def test_the_file_computes_what_was_searched_with(tmp_path: Path) -> None:
     env = SnakeEnv("surveyed_clutter", observe=OBSERVE, duration=1)
     values = {name: one.start + one.sigma for name, one in FORMS["feeling"].items()}
     sizes = {name: len(part.names) for name, part in env.parts.items()}
-    policy = Policy.make_from_parameters(values, [joint.axis for joint in env.description.joints], sizes)
+    policy = PolicyArrays.make_from_parameters(values, [joint.axis for joint in env.description.joints], sizes)
     write_onnx_file(tmp_path / "policy.onnx", policy, values, 5, ["snakesim", "policy", "train"])
     model = PolicyModel(env.description, str(tmp_path / "policy.onnx"))
     random = np.random.default_rng(1)

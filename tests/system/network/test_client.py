@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import msgspec
 
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Done, Pose
+from snakesim_hal.wire.messages import Clock, Pose, TickDone
 from snakesim_testing.hal.local_network import wait_for_messages
 from snakesim_testing.hal.small_robots import make_clock, make_pose
 from snakesim_testing.harness.wait import wait_until
@@ -16,7 +16,7 @@ from snakesim_testing.harness.wait import wait_until
 def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Clock | None]:
     """The ticks of a service that was busy while all these clocks came."""
     host, service = sessions
-    client = Client(service, "control")
+    client = HostClient(service, "control")
     publisher = host.declare_publisher(keys.CLOCK, Clock, lossless=True)
     wait_until(publisher.has_subscriber, "the service listens", 5.0)
     for each in clocks:
@@ -44,7 +44,7 @@ def test_client_in_lockstep_ignores_sample_of_a_later_tick(
 ) -> None:
     """A delayed sensor has nothing at the first ticks, and a host that is ahead has already sent what comes then."""
     host, service = sessions
-    client = Client(service, "guidance")
+    client = HostClient(service, "guidance")
     feed, ticks = client.subscribe(keys.POSE, Pose), client.iterate_ticks(5.0)
     poses, clocks = (
         host.declare_publisher(key, kind, lossless=True) for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock))
@@ -75,8 +75,8 @@ def test_client_reports_done_for_a_tick_shown_again(
     sessions: tuple[Session, Session],
 ) -> None:
     host, service = sessions
-    client = Client(service, "control")
-    reports = host.declare_reader(keys.done_key("control"), Done)
+    client = HostClient(service, "control")
+    reports = host.declare_reader(keys.done_key("control"), TickDone)
     publisher = host.declare_publisher(keys.CLOCK, Clock, lossless=True)
     wait_until(publisher.has_subscriber, "the service listens", 5.0)
     ticks = client.iterate_ticks(5.0)
@@ -86,4 +86,4 @@ def test_client_reports_done_for_a_tick_shown_again(
         if arm_session == 0:
             client.commanded_tick = 0
         client.report_done(0)
-    assert wait_for_messages(reports, "the tick reported done") == [Done(tick=0)]
+    assert wait_for_messages(reports, "the tick reported done") == [TickDone(tick=0)]

@@ -13,25 +13,25 @@ from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.inbox import LIMITS, SAMPLES, CommandArrival
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.session import open_session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import ENCODING_PREFIX, MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
-    Description,
-    Done,
     EstopRequest,
     JointCommand,
+    JointMode,
     LeaseRequest,
-    Mode,
     Pose,
+    RobotDescription,
+    TickDone,
 )
 from snakesim_testing.hal.local_network import (
-    Follower,
     LagBackend,
+    SineFollower,
     connected_sessions,
     running_commanded_host,
     running_follower,
@@ -48,7 +48,7 @@ pytestmark = [
 
 
 def passive(points: SafeSetpoints) -> bool:
-    return set(points.mode) == {Mode.PASSIVE}
+    return set(points.mode) == {JointMode.PASSIVE}
 
 
 # --- lockstep --------------------------------------------------------------------------------------------------
@@ -57,7 +57,7 @@ def passive(points: SafeSetpoints) -> bool:
 def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]:
     with (
         running_host(make_run_config(), max_ticks=ticks) as run,
-        running_follower(run.link, Follower(amplitude_rad)) as control,
+        running_follower(run.link, SineFollower(amplitude_rad)) as control,
     ):
         run.arm()
         wait_until(run.has_ended, "the end of the run")
@@ -89,10 +89,10 @@ def test_a_slow_participant_is_waited_for() -> None:
     config = make_run_config(services={"control": {}, "guidance": {"decimation": 5, "latency_ticks": 5}})
     with (
         running_host(config, max_ticks=40) as run,
-        running_follower(run.link, Follower()),
+        running_follower(run.link, SineFollower()),
         open_session(run.link) as session,
     ):
-        client = Client(session, "guidance")
+        client = HostClient(session, "guidance")
         client.wait_for_description()
         client.announce()
         newest: dict[int, int] = {}
@@ -127,12 +127,12 @@ def test_client_that_stalls_loses_lease_and_joints_are_damped() -> None:
         assert expired.tick - stalled.tick in (4, 5, 6)  # one term of 50 ms in the robot's time
         assert run.host.authority.state == "fault"
         after = run.backend.enacted[-3:]
-        assert all(p.mode == [Mode.VELOCITY] * 3 and p.target == [0.0] * 3 for p in after)
+        assert all(p.mode == [JointMode.VELOCITY] * 3 and p.target == [0.0] * 3 for p in after)
 
 
 def test_client_that_leaves_is_named_and_robot_arms_again() -> None:
     with running_host(make_run_config()) as run:
-        with running_follower(run.link, Follower()) as control:
+        with running_follower(run.link, SineFollower()) as control:
             run.arm()
             wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
         run.wait_for_lifecycle("fault")
@@ -141,7 +141,7 @@ def test_client_that_leaves_is_named_and_robot_arms_again() -> None:
         assert "lease of control" in faults["lease_expired"]
         assert not run.request_lifecycle("arm").ok
         assert run.request_lifecycle("reset").ok
-        with running_follower(run.link, Follower()) as control:
+        with running_follower(run.link, SineFollower()) as control:
             run.arm()
             wait_until(lambda: len(control.armed_ticks) > 5, "five more ticks")
             assert run.status.lifecycle == "armed"
@@ -170,7 +170,10 @@ def test_client_estop_by_anyone_lasts_until_reset_and_arming() -> None:
 
 
 def test_client_second_holder_needs_higher_priority() -> None:
-    with running_host(make_run_config(clock_mode="realtime")) as run, running_follower(run.link, Follower()) as control:
+    with (
+        running_host(make_run_config(clock_mode="realtime")) as run,
+        running_follower(run.link, SineFollower()) as control,
+    ):
         run.arm()
         request = LeaseRequest(action="acquire", holder="teleop")
         answer = run.request(keys.LEASE, request)
@@ -202,7 +205,7 @@ def test_arming_waits_for_all_services_with_time_paused() -> None:
         answer = run.request_lifecycle("arm")
         assert not answer.ok
         assert answer.reason == "waiting for control"
-        with running_follower(run.link, Follower()) as control:
+        with running_follower(run.link, SineFollower()) as control:
             wait_until(lambda: len(control.ticks_seen) >= 3, "three showings of tick 0")
             assert set(control.ticks_seen) == {0}
             assert run.backend.advanced == 0
@@ -226,7 +229,7 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
     ]
     own = [
         format_encoding(JointCommand),
-        format_encoding(Done),
+        format_encoding(TickDone),
         format_encoding(LeaseRequest),
         format_encoding(EstopRequest),
     ]
@@ -238,7 +241,7 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
         "hal/done/*",
         "**",
     ]
-    with running_host(make_run_config()) as run, running_follower(run.link, Follower()) as control:
+    with running_host(make_run_config()) as run, running_follower(run.link, SineFollower()) as control:
         run.arm()
         put, get = run.session._zenoh.put, run.session._zenoh.get  # a stranger does not keep to our session
         for key, payload, encoding in itertools.product(samples, garbage, own + foreign):
@@ -251,7 +254,7 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
             for payload, encoding in itertools.product(garbage, own[2:] + foreign[:2]):
                 (reply,) = get(key, payload=payload, encoding=encoding, timeout=5.0)
                 assert reply.ok is not None
-                answer = Decoder(Answer).decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+                answer = MessageDecoder(Answer).decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
                 assert not answer.ok
                 assert answer.lifecycle == "armed"
         for pattern in ("hal/*", "**"):  # a tool that looks what is there
@@ -272,8 +275,10 @@ def test_host_ignores_commands_and_answers_of_a_stranger() -> None:
         own = host.authority.lease.epoch
         for epoch, done_tick in ((0, -1), (own + 6, -1), (own, 0)):
             sent = make_joint_command(host.description, 0.1, lease_epoch=epoch)
-            arrival = Arrival(keys.JOINT_COMMAND, encode(sent), format_encoding(JointCommand), time.monotonic_ns())
-            host._inbox.handle(CommandArrival(arrival, Decoder(JointCommand)))
+            arrival = ReceivedSample(
+                keys.JOINT_COMMAND, encode(sent), format_encoding(JointCommand), time.monotonic_ns()
+            )
+            host._inbox.handle(CommandArrival(arrival, MessageDecoder(JointCommand)))
             assert host.participants["control"].done_tick == done_tick
         assert host.authority.rejected_counts["wrong_epoch"] == 2
 
@@ -308,7 +313,7 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
 def test_realtime_keeps_its_deadlines_on_average() -> None:
     """As many periods pass as there is time for, and are answered; how many are late is for the computer to say."""
     config = make_run_config(clock_mode="realtime", rate_hz=50.0)
-    with running_host(config, max_ticks=50) as run, running_follower(run.link, Follower()):
+    with running_host(config, max_ticks=50) as run, running_follower(run.link, SineFollower()):
         run.arm()
         wait_until(run.has_ended, "the end of the run")
         assert run.host.armed_wall_time_s == pytest.approx(1.0, rel=0.1)
@@ -346,9 +351,9 @@ def test_free_waits_for_nobody() -> None:
 
 def test_client_that_joins_late_receives_description_status_and_setpoints() -> None:
     with running_commanded_host(make_run_config()) as (run, _), open_session(run.link) as late:
-        descriptions = late.declare_latched_reader(keys.DESCRIPTION, Description)
+        descriptions = late.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
         assert wait_for_messages(descriptions, "the description") == [run.host.description]
         applied, poses = late.declare_reader(keys.APPLIED, AppliedCommand), late.declare_reader(keys.POSE, Pose)
         commands = wait_for_messages(applied, "applied commands", 4)
-        assert all(c.sequence is not None and c.mode == [Mode.POSITION] * 3 for c in commands)
+        assert all(c.sequence is not None and c.mode == [JointMode.POSITION] * 3 for c in commands)
         assert all(pose.tick % 5 == 0 for pose in wait_for_messages(poses, "a pose"))

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from snakesim_hal.base.errors import StalledError
-from snakesim_hal.network.client import Client, Commander, Feed
+from snakesim_hal.network.client import Commander, HostClient, SampleFeed
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
@@ -18,7 +18,7 @@ from snakesim_testing.messages import raises_error
 
 def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
     robot, network = make_description(), LocalNetwork()
-    feed = Feed(network.create_session().declare_reader(keys.JOINTS, JointState), keys.JOINTS)
+    feed = SampleFeed(network.create_session().declare_reader(keys.JOINTS, JointState), keys.JOINTS)
     joints = network.create_session().declare_publisher(keys.JOINTS, JointState)
     assert feed.newest() is None
     assert feed.get_at_tick(0) is None
@@ -49,7 +49,7 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
 ) -> None:
     robot = make_description()
     with connected_sessions("worm", "worm") as (hal, session):
-        client = Client(session, "control")
+        client = HostClient(session, "control")
         feed = client.subscribe(keys.JOINTS, JointState)
         clocks = hal.declare_publisher(keys.CLOCK, Clock, lossless=True)
         joints = hal.declare_publisher(keys.JOINTS, JointState, lossless=True)
@@ -87,7 +87,7 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
 
 def test_commander_requests_free_lease_and_releases_passed_one() -> None:
     with running_host(make_run_config(clock_mode="realtime", services={})) as run, open_session(run.link) as session:
-        client = Client(session, "pilot")
+        client = HostClient(session, "pilot")
         commander = Commander(client, client.wait_for_description())
         other = LeaseRequest(action="acquire", holder="teleop", priority=200)
         assert run.request(keys.LEASE, other).ok

@@ -12,14 +12,14 @@ import msgspec
 import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.local_registry import LocalRobot, get_robot_state_folder, list_local_robots, register_robot
 from snakesim_hal.network.private_channel import HostEnd, HostMessage, StarterEnd, socket_pair
 from snakesim_hal.network.run_key import RUN_KEY, add_proof, has_valid_proof, new_run_key
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, make_arm_request
-from snakesim_testing.hal.local_network import Follower, running_follower, running_host
+from snakesim_hal.wire.messages import RobotDescription, make_arm_request
+from snakesim_testing.hal.local_network import SineFollower, running_follower, running_host
 from snakesim_testing.hal.small_robots import make_description, make_run_config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
@@ -39,11 +39,11 @@ def test_identity_service_of_a_run_ignores_forged_description(monkeypatch: pytes
     monkeypatch.setenv(RUN_KEY, new_run_key())
     with running_host(make_run_config()) as run, open_session(run.link) as stranger, open_session(run.link) as own:
         forged = msgspec.structs.replace(run.host.description, emulated=True, lease_ns=10**9)
-        stranger.declare_latched_publisher(keys.DESCRIPTION, Description).put(forged)
-        assert Client(own, "control").wait_for_description() == run.host.description
+        stranger.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(forged)
+        assert HostClient(own, "control").wait_for_description() == run.host.description
         monkeypatch.setenv(RUN_KEY, new_run_key())  # a service of another run, on the wrong network
         with pytest.raises(NotConnectedError):
-            Client(own, "control").wait_for_description(timeout_s=0.3)
+            HostClient(own, "control").wait_for_description(timeout_s=0.3)
 
 
 def test_a_run_is_armed_over_its_private_channel() -> None:
@@ -51,7 +51,7 @@ def test_a_run_is_armed_over_its_private_channel() -> None:
     starter = StarterEnd(ours)
     with (
         running_host(make_run_config(clock_mode="realtime"), starter_channel=HostEnd(its)) as run,
-        running_follower(run.link, Follower()),
+        running_follower(run.link, SineFollower()),
     ):
 
         def ready() -> bool:

@@ -4,12 +4,12 @@ import math
 from unittest import mock
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.host.inbox import Inbox
+from snakesim_hal.host.inbox import HostInbox
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.network.streams import Query
+from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import Answer, Done, JointCommand, LeaseRequest
+from snakesim_hal.wire.messages import Answer, JointCommand, LeaseRequest, TickDone
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 from snakesim_testing.messages import raises_error
 
@@ -19,15 +19,18 @@ REQUEST = LeaseRequest(action="acquire", holder="control")
 def test_local_network_delivers_matching_keys_and_latched_values_later() -> None:
     network = LocalNetwork()
     one, other = network.create_session(), network.create_session()
-    every, reader = other.declare_reader(keys.DONE_ALL, Done), other.declare_reader(keys.done_key("control"), Done)
-    publisher = one.declare_latched_publisher(keys.done_key("control"), Done)
+    every, reader = (
+        other.declare_reader(keys.DONE_ALL, TickDone),
+        other.declare_reader(keys.done_key("control"), TickDone),
+    )
+    publisher = one.declare_latched_publisher(keys.done_key("control"), TickDone)
     assert publisher.has_subscriber()
-    publisher.put(Done(tick=1))
-    publisher.put(Done(tick=2))
-    one.declare_publisher(keys.done_key("guidance"), Done).put(Done(tick=3))
+    publisher.put(TickDone(tick=1))
+    publisher.put(TickDone(tick=2))
+    one.declare_publisher(keys.done_key("guidance"), TickDone).put(TickDone(tick=3))
     assert [done.tick for done in reader.drain()] == [1, 2]
     assert [done.tick for done in every.drain()] == [1, 2, 3]
-    assert other.wait_for_latched(keys.done_key("control"), Done, 0.0) == Done(tick=2)
+    assert other.wait_for_latched(keys.done_key("control"), TickDone, 0.0) == TickDone(tick=2)
     other.close()
     assert not publisher.has_subscriber()
 
@@ -42,7 +45,7 @@ def test_tokens_come_and_go_with_their_session() -> None:
 
 
 def test_who_is_asked_answers_before_the_question_returns() -> None:
-    network, asked = LocalNetwork(), list[Query]()
+    network, asked = LocalNetwork(), list[IncomingQuery]()
     host, client = network.create_session(), network.create_session()
     host.on_query(keys.LEASE, asked.append)
     answer = Answer(ok=True, reason="", epoch=7, lifecycle="disarmed", host="a")
@@ -62,9 +65,9 @@ def test_who_is_asked_answers_before_the_question_returns() -> None:
 def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -> None:
     network = LocalNetwork()
     sender, one, other = network.create_session(), network.create_session(), network.create_session()
-    readers = [session.declare_reader(keys.done_key("control"), Done) for session in (one, other)]
-    sent = Done(tick=4)
-    sender.declare_publisher(keys.done_key("control"), Done).put(sent)
+    readers = [session.declare_reader(keys.done_key("control"), TickDone) for session in (one, other)]
+    sent = TickDone(tick=4)
+    sender.declare_publisher(keys.done_key("control"), TickDone).put(sent)
     (first,), (second,) = (reader.drain() for reader in readers)
     assert first is second
     assert first == sent
@@ -75,9 +78,13 @@ def test_each_reader_checks_what_no_reader_could_decode() -> None:
     network = LocalNetwork()
     sender, one, other = network.create_session(), network.create_session(), network.create_session()
     key = keys.done_key("control")
-    readers = [one.declare_reader(key, Done), other.declare_reader(key, Done), other.declare_reader(key, Answer)]
-    publisher = sender.declare_publisher(key, Done)
-    publisher.put(Done(tick=4), encode(Done(tick=-4)))
+    readers = [
+        one.declare_reader(key, TickDone),
+        other.declare_reader(key, TickDone),
+        other.declare_reader(key, Answer),
+    ]
+    publisher = sender.declare_publisher(key, TickDone)
+    publisher.put(TickDone(tick=4), encode(TickDone(tick=-4)))
     assert [reader.drain() for reader in readers] == [[], [], []]
     assert one.rejected == {"malformed": 1}
     assert other.rejected == {"malformed": 1, "unknown_message": 1}
@@ -88,7 +95,7 @@ def test_host_shares_no_command_with_the_readers_of_its_process() -> None:
     sender, reading, host = network.create_session(), network.create_session(), network.create_session()
     reader = reading.declare_reader(keys.JOINT_COMMAND, JointCommand)
     receiver = mock.Mock()
-    inbox = Inbox(host, receiver, [], lambda _query, _answer: None)
+    inbox = HostInbox(host, receiver, [], lambda _query, _answer: None)
     sender.declare_publisher(keys.JOINT_COMMAND, JointCommand).put(make_joint_command(make_description(), 0.1))
     (read,) = reader.drain()
     read.target[0] = 3.0  # as a careless service might

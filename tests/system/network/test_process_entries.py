@@ -13,7 +13,7 @@ from snakesim_hal.network.process_entries import (
 from snakesim_hal.network.session import Session
 from snakesim_hal.programs.preflight import validate_backend_config
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Process
+from snakesim_hal.wire.messages import ProcessInfo
 from snakesim_testing.harness.wait import wait_until
 
 
@@ -84,7 +84,7 @@ def test_process_entry_with_other_version_is_reported_while_alive(
         5.0,
     )
     newer = msgspec.structs.replace(own, name="control", messages={**own.messages, "JointCommand": 2, "Leap": 1})
-    shown = there.declare_latched_publisher(key, Process)
+    shown = there.declare_latched_publisher(key, ProcessInfo)
     shown.put(newer)
     wait_until(
         lambda: "message JointCommand version 2 (here " in "".join(entries.find_problems(own, ["control"])),

@@ -8,7 +8,7 @@ import zenoh
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.network.session_file import read_session
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
@@ -28,7 +28,7 @@ def test_session_file_connects_sessions_and_stock_zenoh_at_router(tmp_path: Path
     router = tmp_path / "router.json5"
     router.write_text(f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
     path = written(tmp_path, f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {QUIET}}}')
-    link = Link.from_session_file(read_session(path), "worm")
+    link = ConnectionSettings.from_session_file(read_session(path), "worm")
     assert link.endpoint == endpoint
     assert link.namespace == "worm"
     with (
@@ -68,6 +68,10 @@ def test_session_file_that_contradicts_requirements_is_refused_by_name(text: str
 def test_a_file_for_one_robot_is_no_way_to_another(tmp_path: Path) -> None:
     settings = {"mode": "client", "connect": {"endpoints": ["tcp/10.0.0.1:7447"]}, "namespace": "worm"}
     session = read_session(written(tmp_path, json.dumps(settings)))
-    assert Link.from_session_file(session).namespace == Link.from_session_file(session, "worm").namespace == "worm"
+    assert (
+        ConnectionSettings.from_session_file(session).namespace
+        == ConnectionSettings.from_session_file(session, "worm").namespace
+        == "worm"
+    )
     with raises_error(ConfigError, code="network/session-file", field="worm"):
-        Link.from_session_file(session, "eel")
+        ConnectionSettings.from_session_file(session, "eel")

@@ -11,9 +11,9 @@ from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.route import Route
-from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.client import Commander, HostClient
 from snakesim_hal.network.robot_mismatch import find_mismatch
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 from snakesim_hal.wire.messages import (
@@ -21,14 +21,14 @@ from snakesim_hal.wire.messages import (
     Clock,
     Contacts,
     DepthImage,
-    Description,
     Imu,
-    Intent,
     JointState,
     LeaseRequest,
+    LocomotionIntent,
     Message,
+    RobotDescription,
     Trajectory,
-    World,
+    WorldModel,
 )
 from snakesim_hal.wire.quantities import Quaternion
 from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
@@ -52,10 +52,10 @@ def contacts(link: int) -> Contacts:
     return Contacts(tick=0, timestamp_ns=0, contacts=[make_link_contact(link)])
 
 
-def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> World:
-    example = make_plain_example(World)
+def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> WorldModel:
+    example = make_plain_example(WorldModel)
     example["contacts"][0]["link"] = link
-    return msgspec.convert({**example, "base_orientation_wxyz": orientation}, World)
+    return msgspec.convert({**example, "base_orientation_wxyz": orientation}, WorldModel)
 
 
 def imu(link: list[int], rates: int) -> Imu:
@@ -99,7 +99,7 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
         (image(bytes(12), turned=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
         (trajectory((0.0, 0.0), (1.0, 0.0)), None),
         (trajectory((0.0, 0.0), (1.0, 0.0), (1.0, 0.0)), "no_path"),
-        (Intent(timestamp_ns=0, requester="operator"), None),
+        (LocomotionIntent(timestamp_ns=0, requester="operator"), None),
     ],
 )
 def test_a_message_that_cannot_be_of_this_robot(message: Message, why: str | None) -> None:
@@ -116,22 +116,25 @@ def test_what_passes_as_a_path_makes_a_route() -> None:
 
 def served(hal: Session) -> None:
     """A HAL that shows its robot and nothing else."""
-    hal.declare_latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
+    hal.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(ROBOT)
 
 
 def test_stranger_invalid_intent_is_counted_and_ignored() -> None:
     with connected_sessions("worm", "worm") as (hal, session):
         served(hal)
-        client = Client(session, "navigation")
-        intents, joints = client.subscribe(keys.INTENT, Intent), client.subscribe(keys.JOINTS, JointState)
+        client = HostClient(session, "navigation")
+        intents, joints = client.subscribe(keys.INTENT, LocomotionIntent), client.subscribe(keys.JOINTS, JointState)
         assert client.wait_for_description() == client.wait_for_description() == ROBOT  # asked again, it is remembered
         clocks = hal.declare_publisher(keys.CLOCK, Clock)
-        asked, felt = hal.declare_publisher(keys.INTENT, Intent), hal.declare_publisher(keys.JOINTS, JointState)
+        asked, felt = (
+            hal.declare_publisher(keys.INTENT, LocomotionIntent),
+            hal.declare_publisher(keys.JOINTS, JointState),
+        )
         wait_until(
             lambda: clocks.has_subscriber() and asked.has_subscriber() and felt.has_subscriber(), "everybody heard"
         )
         for speed in (0.1, 0.2):
-            asked.put(Intent(timestamp_ns=5, requester="operator", speed_m_s=speed))
+            asked.put(LocomotionIntent(timestamp_ns=5, requester="operator", speed_m_s=speed))
         felt.put(make_joint_state(ROBOT, 0.1, tick=3))
         felt.put(msgspec.structs.replace(make_joint_state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
         ticks = client.iterate_ticks()
@@ -158,7 +161,7 @@ def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
         )
         with raises_error(NotConnectedError, code="network/no-answer"):
             session.send_request(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
-        commander = Commander(Client(session, "control"), ROBOT)
+        commander = Commander(HostClient(session, "control"), ROBOT)
         time.sleep(0.3)  # it asks at most so often
         assert not commander.ensure_lease(CLOCK)
         assert commander.lease_refusal is not None
@@ -185,9 +188,9 @@ def test_large_images_arrive_where_they_are_expected() -> None:
     """A robot's own processes know its cameras; to everybody else more than a MiB is too long."""
     endpoint, largest = find_free_endpoint(), 2 * 1280 * 960
     with (
-        open_session(Link(endpoint, "worm", listen=True, max_bytes=largest)) as hal,
-        open_session(Link(endpoint, "worm", max_bytes=largest)) as session,
-        open_session(Link(endpoint, "worm")) as small,
+        open_session(ConnectionSettings(endpoint, "worm", listen=True, max_bytes=largest)) as hal,
+        open_session(ConnectionSettings(endpoint, "worm", max_bytes=largest)) as session,
+        open_session(ConnectionSettings(endpoint, "worm")) as small,
     ):
         readers = [each.declare_reader(keys.depth_key("head"), DepthImage) for each in (session, small)]
         publisher = hal.declare_publisher(keys.depth_key("head"), DepthImage, lossless=True)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.runs.whole_run import load_run_config, run_controller
 
 BEHIND_M = 2.8  # the tail has left the step
@@ -13,7 +13,7 @@ def test_a_whole_snake_climbs_over_a_step(height_m: float) -> None:
     near = ("scene.step.0.position_m=[2.3,0.0]", f"scene.step.0.height_m={height_m}", "control.search_after_s=0.0")
     whole = run_controller(load_run_config("mamba_step", *near), duration_s=11.0)
     assert whole.moved_m > BEHIND_M
-    assert (whole.record.mode == Mode.TORQUE.value).any()  # on the level it pushes by torque
+    assert (whole.record.mode == JointMode.TORQUE.value).any()  # on the level it pushes by torque
 
 
 @pytest.mark.slow

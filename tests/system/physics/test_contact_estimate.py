@@ -14,10 +14,10 @@ from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushe
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.model.plugins import BACKENDS, register_plugin_temporarily
-from snakesim_hal.model.scenario import Override, load_scenario, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Imu, Pose
+from snakesim_hal.wire.messages import Imu, Pose, RobotDescription
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.state.truth import TrueState
 
@@ -65,9 +65,9 @@ def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
 
 
 @lru_cache(maxsize=1)
-def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samples, list[Push]]]]:
+def watched(scenario: str, *settings: str) -> tuple[RobotDescription, list[tuple[Samples, list[Push]]]]:
     """A run's robot, and its samples with what was true; the last run is kept, to be judged in another way."""
-    sets = (Override(text[1:], None, text) if text.startswith("-") else parse_set_option(text) for text in settings)
+    sets = (KeyOverride(text[1:], None, text) if text.startswith("-") else parse_set_option(text) for text in settings)
     config = load_scenario(scenario, [parse_set_option("duration_s=3"), *sets]).config
     seen: list[tuple[Samples, list[Push]]] = []
 
@@ -86,13 +86,13 @@ def watched(scenario: str, *settings: str) -> tuple[Description, list[tuple[Samp
         return run.host.description, seen
 
 
-def pushes(robot: Description, felt: list[EstimatedPush]) -> list[Push]:
+def pushes(robot: RobotDescription, felt: list[EstimatedPush]) -> list[Push]:
     """Where along the body."""
     starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
     return [(starts[c.link] + c.distance_from_rear_joint_m, -int(np.sign(c.normal_l[1])), c.force_n) for c in felt]
 
 
-def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
+def true_pushes(robot: RobotDescription, truth: TrueState) -> list[Push]:
     """The simulator's contacts, tail to head."""
     lengths = [link.length_m for link in robot.links]
     starts = np.append(0.0, np.cumsum(lengths))

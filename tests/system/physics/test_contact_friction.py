@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.state.contacts import ObstacleContactReader
 from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body
@@ -95,7 +95,7 @@ def test_friction_state_restored_continues_unchanged() -> None:
     body.for_s(1.0)
     other = mujoco.MjData(body.model)
     mujoco.mj_setState(body.model, other, saved, WHOLE)
-    Physics(body.sim, other).step(500)
+    PhysicsStepper(body.sim, other).step(500)
     assert other.qpos.tolist() == body.data.qpos.tolist()
 
 
@@ -107,7 +107,7 @@ def test_friction_of_body_moved_after_restore_is_zero() -> None:
     mujoco.mj_copyData(other, body.model, body.data)
     other.xfrc_applied[:] = 0.0
     other.qpos[1] += 0.01
-    physics = Physics(body.sim, other)
+    physics = PhysicsStepper(body.sim, other)
     physics.step(2)
     before = float(other.qvel[0])
     physics.step(50)

@@ -10,11 +10,11 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.run.in_process import simulate
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_testing.sim.gliding import SURFACES, Glider, glide_without_mujoco
+from snakesim_testing.sim.gliding import SURFACES, GlidingSnake, glide_without_mujoco
 from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body
-from snakesim_testing.sim.waves import Wave, integrate_momentum_balance, simulate_wave
+from snakesim_testing.sim.waves import JointWave, integrate_momentum_balance, simulate_wave
 
 HU = DirectionalFriction(0.11, 0.14, 0.19)
 SCALES = {"skin": {"forward": 0.11, "backward": 0.14, "sideways": 0.19}}
@@ -23,7 +23,7 @@ WHEELS = {"wheels": {"radius_m": 0.03, "bearing_radius_m": 0.003, "bearing_frict
 CLOTH = {"friction": 0.19}
 MUD = {"friction": 0.0, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 3.0}}
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
-WAVE = Wave(0.3, 0.7, 4.0)
+WAVE = JointWave(0.3, 0.7, 4.0)
 GHOST_MM_S = 1.0
 # Of the drag. On hills MuJoCo shares the weight among contacts that come and go.
 DRAG_TOLERANCE = {"flat ground": 0.01, "level hills": 0.015, "step": 0.01, "top of an obstacle": 0.01}
@@ -40,7 +40,7 @@ def test_dragging_takes_the_coefficient_of_the_direction(
     surface: str, direction: tuple[float, float], expected: tuple[float, float]
 ) -> None:
     """Within 1 %, and on hills within 1.5 %."""
-    glider = Glider(surface, SCALES)
+    glider = GlidingSnake(surface, SCALES)
     force_n = glider.drag(0.2 * np.array(direction), 0.6)
     assert np.abs(force_n) / (glider.mass_kg * G) == pytest.approx(
         expected, abs=DRAG_TOLERANCE[surface] * max(expected)
@@ -53,7 +53,7 @@ def test_it_stands_within_the_half_ellipses_and_slides_beyond(surface: str, angl
     direction = np.array([np.cos(angle_rad), np.sin(angle_rad)])
     along = HU.forward if direction[0] > 0 else HU.backward
     limit = 1.0 / np.hypot(direction[0] / along, direction[1] / HU.sideways)
-    glider = Glider(surface, SCALES)
+    glider = GlidingSnake(surface, SCALES)
     glider.push(0.95 * limit * direction)
     glider.go(0.5)
     at = glider.position_w
@@ -69,7 +69,7 @@ def test_it_stands_within_the_half_ellipses_and_slides_beyond(surface: str, angl
 def test_gliding_body_comes_to_rest_where_an_independent_integrator_says(
     surface: str, velocity: tuple[float, float]
 ) -> None:
-    glider = Glider(surface, SCALES)
+    glider = GlidingSnake(surface, SCALES)
     glider.throw(np.array(velocity))
     start = glider.position_w
     glider.go(1.5)
@@ -98,8 +98,8 @@ def test_wave_drifts_as_a_momentum_balance_says(
 
 
 def test_mirrored_snake_moves_mirrored() -> None:
-    wave = Wave(0.3, 0.7, 4.0, bend=0.04)
-    mirrored = Wave(-0.3, 0.7, 4.0, bend=-0.04)
+    wave = JointWave(0.3, 0.7, 4.0, bend=0.04)
+    mirrored = JointWave(-0.3, 0.7, 4.0, bend=-0.04)
     plain = simulate_wave(wave, CLOTH, SCALES).center[-1]
     assert np.linalg.norm(plain) > 0.02
     assert simulate_wave(mirrored, CLOTH, SCALES).center[-1] == pytest.approx(plain * [1.0, -1.0], abs=1e-6)
@@ -140,7 +140,7 @@ def test_ground_takes_all_the_energy_that_a_writhing_snake_loses(robot: dict[str
 
 
 def loss_j(
-    slip: Floats, feet_w: Floats, robot: dict[str, Any], ground: dict[str, Any], physics: Physics, step_s: float
+    slip: Floats, feet_w: Floats, robot: dict[str, Any], ground: dict[str, Any], physics: PhysicsStepper, step_s: float
 ) -> float:
     """Return the energy that feet lose in a step, by the law of sliding."""
     links = np.diff(feet_w, axis=0)
@@ -171,7 +171,7 @@ def kinetic_energy_j(model: mujoco.MjModel, data: mujoco.MjData) -> float:
 
 @pytest.mark.parametrize("surface", list(SURFACES))
 def test_restored_state_continues_to_the_bit(surface: str) -> None:
-    glider = Glider(surface, SCALES)
+    glider = GlidingSnake(surface, SCALES)
     glider.throw(np.array([0.5, 0.3]))
     glider.go(0.1)
     saved = np.empty(mujoco.mj_stateSize(glider.model, WHOLE))
@@ -179,7 +179,7 @@ def test_restored_state_continues_to_the_bit(surface: str) -> None:
     other = mujoco.MjData(glider.model)
     mujoco.mj_setState(glider.model, other, saved, WHOLE)
     glider.physics.step(200)
-    Physics(glider.sim, other).step(200)
+    PhysicsStepper(glider.sim, other).step(200)
     assert other.qpos.tobytes() == glider.data.qpos.tobytes()
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 import snakesim
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.metrics.force_tracking import measure_force_tracking
 
 ROUGH = {"scene.pegs_along_route.0.friction": 0.3, "mission.assumed_obstacle_friction": 0.3}
@@ -43,7 +43,7 @@ def test_drives_without_torque_mode_push_by_their_shape():
     only_position = {"robot.drive.modes": ["position"]}
     found = snakesim.run("peg_row", controller="obstacle_aided", duration=4, set=only_position)
     assert (found.summary.advance_m or 0.0) > 0.7
-    assert Mode.TORQUE not in found.record.mode
+    assert JointMode.TORQUE not in found.record.mode
 
 
 @pytest.mark.slow

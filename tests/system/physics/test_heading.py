@@ -5,7 +5,7 @@ import pytest
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Intent, World
+from snakesim_hal.wire.messages import LocomotionIntent, WorldModel
 
 DENSE = parse_set_option("scene.random_field.0.density_per_m2=12")
 
@@ -16,12 +16,15 @@ def _moved_to_the_left_m(heading_w_rad: float, seconds: int, seed: int) -> float
     ).config
     with InProcessRun(config) as run:
         session = run.network.create_session()
-        intents, worlds = session.declare_publisher(keys.INTENT, Intent), session.declare_reader(keys.WORLD, World)
+        intents, worlds = (
+            session.declare_publisher(keys.INTENT, LocomotionIntent),
+            session.declare_reader(keys.WORLD, WorldModel),
+        )
         places: list[float] = []
         for turn, _ in enumerate(run.iterate_ticks()):
             if turn % 20 == 0:
                 intents.put(
-                    Intent(
+                    LocomotionIntent(
                         timestamp_ns=run.host.build_status().timestamp_ns, requester="ann", heading_w_rad=heading_w_rad
                     )
                 )

@@ -9,9 +9,9 @@ import pytest
 
 from snakesim_hal.model.scene import Cylinder, make_route
 from snakesim_hal.safety.limiter import compute_bumpless_target
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.gnc.stage import require_value
-from snakesim_testing.runs.whole_run import Run, load_run_config, run_controller
+from snakesim_testing.runs.whole_run import RecordedTicks, load_run_config, run_controller
 
 TRIPLET = "controllers.obstacle_triplet"
 STARTED = 50  # ticks until the body has moved far enough to be seen moving
@@ -19,12 +19,12 @@ FADE_MAX = 0.2  # period / blend_s + speed * period / blend_m at 0.9 m/s
 
 
 @cache
-def triplet(*sets: str) -> Run:
+def triplet(*sets: str) -> RecordedTicks:
     """The case study, as shipped or changed; several tests look at the same run."""
     return run_controller(load_run_config("triplet", *sets))
 
 
-def propelled(whole: Run) -> list[int]:
+def propelled(whole: RecordedTicks) -> list[int]:
     return [turn for turn in whole.turns if turn is not None]
 
 
@@ -58,7 +58,7 @@ def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
     whole = run_controller(
         load_run_config("triplet"), duration_s=8.0, ticks_without_world=blind, ticks_without_trajectory=lost
     )
-    where, pushes = whole.path_s_m, (whole.record.mode == Mode.TORQUE).any(axis=1)
+    where, pushes = whole.path_s_m, (whole.record.mode == JointMode.TORQUE).any(axis=1)
     assert pushes[150:200].all()
     assert not pushes[gap.start + 2 : gap.stop].any()
     assert pushes[450:500].all()
@@ -67,7 +67,9 @@ def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
     held = np.abs(whole.record.torque_nm[280:400]).max(axis=1)
     assert held.max() < 0.5 * np.abs(whole.record.torque_nm[150:200]).max()
     steps = np.abs(np.diff(whole.record.target, axis=0))[190:460]
-    angles = (whole.record.mode[1:] == Mode.POSITION)[190:460] & (whole.record.mode[:-1] == Mode.POSITION)[190:460]
+    angles = (whole.record.mode[1:] == JointMode.POSITION)[190:460] & (whole.record.mode[:-1] == JointMode.POSITION)[
+        190:460
+    ]
     assert steps[angles].max() < 0.03  # rad; the limiter would allow 0.075
     assert set(whole.states[gap.start + 2 : gap.stop]) <= {"NotLocomoting", "Idle"}
 
@@ -75,20 +77,20 @@ def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
 def test_triplet_has_one_torque_joint_and_others_in_position():
     whole = triplet()
     pushing = np.array([report.propulsion_joint is not None for report in whole.reports])
-    torque_joints = (whole.record.mode == Mode.TORQUE).sum(axis=1)
+    torque_joints = (whole.record.mode == JointMode.TORQUE).sum(axis=1)
     lag = whole.record.config.services["control"].latency_ticks - 1  # periods from a controller's word to its deed
     assert (torque_joints[lag + 1 :] == pushing[1 : len(pushing) - lag]).all()
-    assert np.isin(whole.record.mode, [Mode.TORQUE, Mode.POSITION]).all()
+    assert np.isin(whole.record.mode, [JointMode.TORQUE, JointMode.POSITION]).all()
 
 
 def test_triplet_only_propulsion_joint_leaves_its_reference():
     """As in the paper's Figure 12."""
     whole = triplet()
     off = np.abs(whole.record.angle_rad - np.array([report.reference_rad for report in whole.reports]))
-    torque = whole.record.mode == Mode.TORQUE
+    torque = whole.record.mode == JointMode.TORQUE
     assert 0.1 < off[torque].max() < 0.7
     settled = np.array(
-        [whole.record.mode[max(i - 40, 0) : i + 1].max(axis=0) == Mode.POSITION for i in range(len(off))]
+        [whole.record.mode[max(i - 40, 0) : i + 1].max(axis=0) == JointMode.POSITION for i in range(len(off))]
     )
     assert np.median(off[settled]) < 0.02
 
@@ -103,8 +105,8 @@ def test_triplet_case_study_commands_are_smooth_and_never_limited():
     steps = np.abs(np.diff(whole.record.target, axis=0))
     same = np.diff(whole.record.mode, axis=0) == 0
     limits = whole.record.config.robot.limits
-    assert steps[same & (whole.record.mode[1:] == Mode.TORQUE)].max() < limits.torque_rate_nm_s * 0.01
-    assert steps[same & (whole.record.mode[1:] == Mode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
+    assert steps[same & (whole.record.mode[1:] == JointMode.TORQUE)].max() < limits.torque_rate_nm_s * 0.01
+    assert steps[same & (whole.record.mode[1:] == JointMode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
 
 
 def test_no_command_jumps_at_a_hand_over():
@@ -112,11 +114,11 @@ def test_no_command_jumps_at_a_hand_over():
     whole, record = triplet(), triplet().record
     switches = 0
     for i, j in zip(*np.nonzero(np.diff(record.mode, axis=0)), strict=True):
-        tick, mode = i + 1, Mode(int(record.mode[i + 1, j]))
+        tick, mode = i + 1, JointMode(int(record.mode[i + 1, j]))
         angle, speed, torque = (float(x[tick, j]) for x in (record.angle_rad, record.velocity_rad_s, record.torque_nm))
         steady = compute_bumpless_target(record.description.joints[j], mode, angle, speed, torque)
         report = whole.reports[tick]
-        if mode == Mode.POSITION:
+        if mode == JointMode.POSITION:
             way = abs(steady - report.reference_rad[j])
         else:
             full_nm = record.description.joints[j].torque_limit_nm - require_value(report.torque_headroom_nm)

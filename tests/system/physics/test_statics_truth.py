@@ -17,13 +17,13 @@ from snakesim_gnc.control.obstacle_triplet import TripletSolution, compute_bendi
 from snakesim_gnc.control.obstacle_triplet.statics import add_tether_force
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Limits, Motor
+from snakesim_hal.model.joints import JointMotor, MotionLimits
 from snakesim_hal.model.route import Route, place_chain_on_route, sample_sine_curve
-from snakesim_hal.model.scenario import RunConfig, Start
+from snakesim_hal.model.scenario import RunConfig, StartPlacement
 from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, WaypointRoute
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.settings import SimSettings, Tether
+from snakesim_sim_backend.settings import SimSettings, TetherSettings
 from snakesim_testing.runs.whole_run import load_run_config
 
 PROPULSION_N = 35.0
@@ -37,7 +37,7 @@ class Bench:
     """A snake between three pegs that touch it, and the solution for it."""
 
     config: RunConfig
-    tether: Tether
+    tether: TetherSettings
     joint: int
     solved: TripletSolution
     loads_nm: Floats  # of every joint, for the solved forces
@@ -87,7 +87,7 @@ def make_bench(seed: int) -> Bench | None:
     pushes = add_tether_force(solved.forces_n, normals, -PROPULSION_N * tangents[0])
     return Bench(
         config=make_config(points, pegs, tail_s),
-        tether=Tether(
+        tether=TetherSettings(
             link=links[0],
             point_m=float(places[0] - starts[links[0]]),
             direction_w=(-float(tangents[0][0]), -float(tangents[0][1])),
@@ -101,7 +101,7 @@ def make_bench(seed: int) -> Bench | None:
 def make_config(points: np.ndarray, pegs: list[Cylinder], tail_s_m: float) -> RunConfig:
     """A robot of stiff joints and endless torque, on ice."""
     base = load_run_config("triplet")
-    motor = Motor(
+    motor = JointMotor(
         stiffness_nm_per_rad=4000,
         damping_nm_s_per_rad=40,
         velocity_gain_nm_s_per_rad=40,
@@ -109,13 +109,13 @@ def make_config(points: np.ndarray, pegs: list[Cylinder], tail_s_m: float) -> Ru
         armature_kg_m2=0.01,
         viscous_nm_s_per_rad=0.02,
     )
-    limits = Limits(angle_rad=1.5, speed_rad_s=100, acceleration_rad_s2=1e4, torque_nm=1000, torque_rate_nm_s=1e5)
+    limits = MotionLimits(angle_rad=1.5, speed_rad_s=100, acceleration_rad_s2=1e4, torque_nm=1000, torque_rate_nm_s=1e5)
     waypoints = WaypointRoute(points_m=[(x, y) for x, y in points.tolist()])
     return msgspec.structs.replace(
         base,
         robot=msgspec.structs.replace(base.robot, motor=motor, limits=limits),
         scene=SceneFile(name="bench", ground=Ground(friction=0.0), route=waypoints, cylinder=pegs),
-        start=Start(tail_s_m=tail_s_m),
+        start=StartPlacement(tail_s_m=tail_s_m),
     )
 
 
@@ -124,8 +124,8 @@ def settle(bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0) ->
     backend = SimBackend(bench.config, SimSettings(timestep_s=0.001, tether=bench.tether))
     count, torque_nm = bench.config.robot.chain.modules, bench.config.robot.limits.torque_nm
     angles = np.array(backend.true_state().angles_rad)
-    mode = [Mode.POSITION] * count
-    mode[bench.joint] = Mode.TORQUE
+    mode = [JointMode.POSITION] * count
+    mode[bench.joint] = JointMode.TORQUE
     tensions, forces = [], []
     for tick in range(round((RISE_S + HOLD_S) * 100)):
         risen = share * min(tick / (RISE_S * 100), 1.0)

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
-from snakesim_hal.network.session import Link
+from snakesim_hal.network.session import ConnectionSettings
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.recorder_process import record_to_file
 from snakesim_operator.run import children
 from snakesim_operator.run.children import start_child, stop_children
 from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.run_files import RunFiles
-from snakesim_operator.run.supervisor import Supervisor
+from snakesim_operator.run.supervisor import RunSupervisor
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
@@ -57,7 +57,7 @@ def test_recorder_that_waits_for_a_network_ends_at_once(tmp_path: Path) -> None:
 
 def test_recording_that_is_stopped_before_there_is_a_network_says_so(tmp_path: Path) -> None:
     with raises_error(NotConnectedError, code="network/nothing-listens"):
-        record_to_file(Link(find_free_endpoint(), "worm"), tmp_path / RECORDING_FILENAME, lambda: False)
+        record_to_file(ConnectionSettings(find_free_endpoint(), "worm"), tmp_path / RECORDING_FILENAME, lambda: False)
     assert not (tmp_path / RECORDING_FILENAME).exists()
 
 
@@ -65,7 +65,7 @@ def test_child_that_is_ended_while_it_starts_is_reported_as_such(tmp_path: Path)
     printed: list[str] = []
     files = RunFiles(tmp_path, printed.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stop_port:
-        supervisor = Supervisor(files, RunEnding(), printed.append, stop_port)
+        supervisor = RunSupervisor(files, RunEnding(), printed.append, stop_port)
         supervisor.start("recorder", recorder_arguments(tmp_path), vital=False)
         supervisor.end_all_processes()
     files.close()

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, CaseOutcome, compute_code_digest, run_case
-from snakesim_operator.features.evaluate.suite import Suite, make_cases
+from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases
 
 ENDLESS = """
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 
 
-class Endless(Hold):
+class Endless(HoldPose):
     def update(self, observation):
         while True:
             pass
@@ -23,7 +23,7 @@ def ran(controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s
     """What comes of the first case."""
     goal = {"kind": "heading", "distance_m": 0.3}
     always = {"duration_s": duration_s, "mission.goal": goal}
-    suite = Suite(scenario="peg_row", set=always, give_up_s=give_up_s, limit_s=limit_s)
+    suite = EvaluationSuite(scenario="peg_row", set=always, give_up_s=give_up_s, limit_s=limit_s)
     case = make_cases(suite, "here", [controller], 1, first_field=1)[0]
     return run_case(case.config, compute_code_digest(), case.stall_timeout_s, case.timeout_s)
 

@@ -9,7 +9,7 @@ from queue import SimpleQueue
 import msgspec
 import pytest
 
-from snakesim_hal.base.workers import Worker, start_restarting_thread
+from snakesim_hal.base.workers import BackgroundThread, start_restarting_thread
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.network.private_channel import HostEnd, socket_pair
 from snakesim_hal.network.stop_port import Reply, open_stop_port, request_stop, start_stop_server
@@ -50,7 +50,7 @@ def test_a_worker_that_is_over_does_not_begin_again() -> None:
 
 
 def test_a_job_that_raises_costs_nothing_but_its_own_result() -> None:
-    worker = Worker("hammer")
+    worker = BackgroundThread("hammer")
 
     def fail() -> None:
         raise BrokenError("no file is left")
@@ -113,6 +113,6 @@ def test_what_stops_a_robot_is_served_after_an_error(tmp_path: Path) -> None:
 
 
 def test_a_jobs_thread_is_there_before_it_is_needed() -> None:
-    worker = Worker("hammer")
+    worker = BackgroundThread("hammer")
     wait_until(lambda: any(thread.name == "hammer" for thread in threading.enumerate()), "the thread", 5.0)
     worker.close()

@@ -10,7 +10,7 @@ import pytest
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import (
     SNAKESIM_COMMAND,
-    Running,
+    RunningCommand,
     make_environment,
     run_to_end,
     running_armed_snakesim,
@@ -45,7 +45,7 @@ print(json.dumps({
 class Recording:
     """`snakesim record --episodes`, at its keyboard."""
 
-    def __init__(self, run: Running, cwd: Path) -> None:
+    def __init__(self, run: RunningCommand, cwd: Path) -> None:
         command = ("record", "--endpoint", run.endpoint, "--episodes", "demos", "--task", "through the field")
         self.process = subprocess.Popen(
             [*SNAKESIM_COMMAND, *command],
@@ -79,7 +79,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def _demonstrate(run: Running, home: Path) -> None:
+def _demonstrate(run: RunningCommand, home: Path) -> None:
     at = Recording(run, home)
     with at_the_keyboard(run, home) as terminal:
         wait_until(lambda: "Enter begins an episode" in at.printed, "the recorder at the robot", 20.0)

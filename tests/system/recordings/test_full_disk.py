@@ -51,9 +51,9 @@ def test_export_on_full_disk_is_named_and_leaves_nothing(
 def write_learning_curve(folder: Path) -> None:
     # Imported here: it takes a second, and each worker imports this file.
     from snakesim.training.curve import write_curve
-    from snakesim.training.search import Generation
+    from snakesim.training.search import SearchGeneration
 
-    write_curve(folder, [Generation(0, 10, 0.1, 0.2, None, None, None)] * 200)
+    write_curve(folder, [SearchGeneration(0, 10, 0.1, 0.2, None, None, None)] * 200)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlParameters, ParametersRequest
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.writer import RecordingWriter
-from snakesim_operator.robot_commands.parameters import Parameter, parse_parameters
+from snakesim_operator.robot_commands.parameters import RobotParameter, parse_parameters
 from snakesim_testing.runs.in_process_command import snakesim
 
 CHANGED_AT = 30  # turns
@@ -80,8 +80,8 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
 
 
 def test_ranges_are_told_in_words() -> None:
-    assert Parameter("a", 1.0, "s", minimum=0.0, maximum=5.0).range_text == ">= 0, <= 5"
-    assert Parameter("a", 1.0, "s", minimum=0.0, excludes_minimum=True).range_text == "> 0"
-    assert Parameter("a", "x", choices=("x", "y")).range_text == "x or y"
-    assert Parameter("a", 0.3, "N").value_with_unit == "0.3 N"
-    assert Parameter("a", 0.3, "1").value_with_unit == "0.3"
+    assert RobotParameter("a", 1.0, "s", minimum=0.0, maximum=5.0).range_text == ">= 0, <= 5"
+    assert RobotParameter("a", 1.0, "s", minimum=0.0, excludes_minimum=True).range_text == "> 0"
+    assert RobotParameter("a", "x", choices=("x", "y")).range_text == "x or y"
+    assert RobotParameter("a", 0.3, "N").value_with_unit == "0.3 N"
+    assert RobotParameter("a", 0.3, "1").value_with_unit == "0.3"

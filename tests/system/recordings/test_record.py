@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.host.latch import ESTOP
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
+from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, RobotStatus
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import REPORT_FILENAME
 from snakesim_testing.harness.endpoint import find_free_endpoint
@@ -47,8 +47,8 @@ def handles(pid: int, number: signal.Signals) -> bool:
     return bool(int(status.partition("SigCgt:")[2].split()[0], 16) >> (number - 1) & 1)
 
 
-def newest_status(session: Session) -> Status:
-    found = session.wait_for_latched(keys.STATUS, Status, TIMEOUT_S)
+def newest_status(session: Session) -> RobotStatus:
+    found = session.wait_for_latched(keys.STATUS, RobotStatus, TIMEOUT_S)
     assert found is not None
     return found
 
@@ -58,7 +58,7 @@ def newest_status(session: Session) -> Status:
 
 def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG) as run:
-        with open_session(Link(run.endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             wait_until(lambda: newest_status(session).tick > 100, "two seconds")
             host, tick = run.part("host"), newest_status(session).tick
         os.kill(host, signal.SIGKILL)
@@ -81,7 +81,7 @@ def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG) as run:
-        with open_session(Link(run.endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             wait_until(lambda: newest_status(session).tick > 75, "one and a half seconds")
             tick = newest_status(session).tick
         os.kill(run.process.pid, signal.SIGKILL)
@@ -263,7 +263,7 @@ def test_record_on_hanging_disk_delays_nothing(tmp_path: Path, hangs: Path) -> N
     with running_armed_snakesim(tmp_path / "run", *LONG, "--stay") as run:
         wait_until(lambda: (tmp_path / "run" / "host.json").is_file(), "the first numbers on disk")
         hangs.touch()
-        with open_session(Link(run.endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             before = newest_status(session).tick
             time.sleep(1.0)
             assert newest_status(session).tick - before >= 0.8 * RATE_HZ

@@ -14,9 +14,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Description
+from snakesim_hal.wire.messages import Clock, RobotDescription
 from snakesim_operator.playback.play import play_recording
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
@@ -99,8 +99,8 @@ def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
     )
     player.start()
     wait_until(lambda: bool(said), "the player")
-    with open_session(Link(endpoint, "again"), 5.0) as session:
-        robots = session.declare_latched_reader(keys.DESCRIPTION, Description)
+    with open_session(ConnectionSettings(endpoint, "again"), 5.0) as session:
+        robots = session.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
         clocks, began = session.declare_reader(keys.CLOCK, Clock), time.monotonic()
         found = list[Clock]()
         wait_until(lambda: bool(found.extend(clocks.drain())) or bool(found and found[-1].tick == 99), "the last tick")

@@ -17,12 +17,12 @@ from mcap.reader import make_reader
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.network.session import Link, open_session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.session import ConnectionSettings, open_session
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.custom_sample import make_message_schema
-from snakesim_hal.wire.messages import Clock, CustomSample, Description, Done, Intent
+from snakesim_hal.wire.messages import Clock, CustomSample, LocomotionIntent, RobotDescription, TickDone
 from snakesim_hal.wire.quantities import bounded
 from snakesim_operator.recording import tap as tap_module
 from snakesim_operator.recording.reader import RecordingReader
@@ -44,14 +44,19 @@ class Whisker(CustomSample, frozen=True, kw_only=True):
     bend_rad: Annotated[float, bounded(-2.0, 2.0, "rad")]
 
 
-def done(tick: int, service: str = "control") -> Arrival:
-    return Arrival(keys.done_key(service), encode(Done(tick=tick)), format_encoding(Done), time.monotonic_ns())
+def done(tick: int, service: str = "control") -> ReceivedSample:
+    return ReceivedSample(
+        keys.done_key(service), encode(TickDone(tick=tick)), format_encoding(TickDone), time.monotonic_ns()
+    )
 
 
 def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
     recording = RecordingWriter(tmp_path / "a.mcap")
-    intent = Arrival(
-        keys.INTENT, encode(Intent(timestamp_ns=5, requester="anna")), format_encoding(Intent), time.monotonic_ns()
+    intent = ReceivedSample(
+        keys.INTENT,
+        encode(LocomotionIntent(timestamp_ns=5, requester="anna")),
+        format_encoding(LocomotionIntent),
+        time.monotonic_ns(),
     )
     negative = msgspec.structs.replace(done(0), payload=msgspec.msgpack.encode({"tick": -1}))
     sent = [clock(7), done(8), done(2_000_000), intent, done(6, "guidance"), negative]
@@ -157,14 +162,14 @@ def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None
     network = LocalNetwork()
     tap, publisher = (
         MessageTap(network.create_session()),
-        network.create_session().declare_publisher(keys.done_key("control"), Done),
+        network.create_session().declare_publisher(keys.done_key("control"), TickDone),
     )
     for tick in range(2000):
-        publisher.put(Done(tick=tick))
+        publisher.put(TickDone(tick=tick))
     kept = tap.take_arrivals()
     assert sum(len(arrival.payload) for arrival in kept) <= 1000
     assert len(kept) + tap.dropped_count_by_key[keys.done_key("control")] == 2000
-    publisher.put(Done(tick=1))
+    publisher.put(TickDone(tick=1))
     assert len(tap.take_arrivals()) == 1
 
 
@@ -174,12 +179,12 @@ def test_recording_in_lockstep_waits_for_slow_disk_only(monkeypatch: pytest.Monk
     network = LocalNetwork()
     tap, publisher = (
         MessageTap(network.create_session()),
-        network.create_session().declare_publisher(keys.done_key("control"), Done),
+        network.create_session().declare_publisher(keys.done_key("control"), TickDone),
     )
     tap.is_lossless = True
     began = time.monotonic()
     for tick in range(200):
-        publisher.put(Done(tick=tick))
+        publisher.put(TickDone(tick=tick))
     assert 0.2 <= time.monotonic() - began < 0.5
     assert tap.dropped_count_by_key.total() + len(tap.take_arrivals()) == 200
 
@@ -194,11 +199,11 @@ def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> Non
 
 def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
     endpoint, told = find_free_endpoint(), threading.Event()
-    link, path = Link(endpoint, "planar13"), tmp_path / "a.mcap"
+    link, path = ConnectionSettings(endpoint, "planar13"), tmp_path / "a.mcap"
     recorder = threading.Thread(
         target=lambda: record_to_file(link, path, lambda: not told.is_set(), wait_for_host_exit=True)
     )
-    with open_session(Link(endpoint, "planar13", listen=True)) as host:
+    with open_session(ConnectionSettings(endpoint, "planar13", listen=True)) as host:
         host.declare_alive(HAL)
         clocks = host.declare_publisher(keys.CLOCK, Clock, lossless=True)
         recorder.start()
@@ -217,10 +222,10 @@ def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
 def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     own = keys.custom_key("left")
-    early = Arrival(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0)
+    early = ReceivedSample(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0)
     schema = make_message_schema(Whisker, "test")
     described = encode(msgspec.structs.replace(make_description(), custom={own: schema}))
-    robot = Arrival(keys.DESCRIPTION, described, format_encoding(Description), 0)
+    robot = ReceivedSample(keys.DESCRIPTION, described, format_encoding(RobotDescription), 0)
     recording = RecordingWriter(path)
     for arrival in (early, clock(4), robot, msgspec.structs.replace(early, monotonic_ns=1)):
         recording.write_arrival(arrival)

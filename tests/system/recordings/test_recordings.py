@@ -12,7 +12,7 @@ from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_operator.recording.message import RECORDING_FILENAME
@@ -61,7 +61,9 @@ def test_recordings_report_ticks_that_never_reached_the_recorder(run: Path, tmp_
     recording = RecordingWriter(tmp_path / RECORDING_FILENAME)
     for message in RecordingReader(run / RECORDING_FILENAME).read_messages():
         if not 0.5e9 < message.robot_time_ns < 1.5e9:
-            recording.write_arrival(Arrival(message.key, message.payload, message.encoding, message.wall_time_ns))
+            recording.write_arrival(
+                ReceivedSample(message.key, message.payload, message.encoding, message.wall_time_ns)
+            )
     recording.close({})
     assert RunRecord.load(tmp_path / RECORDING_FILENAME).missing == []  # nothing in the file itself tells
     ended = snakesim("recording", "report", ".", cwd=tmp_path)

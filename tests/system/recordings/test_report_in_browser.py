@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.operator.browser import CHROMIUM, MISSING, open_chromium
-from snakesim_testing.operator.recorded_triplet import Reader, read, triplet
+from snakesim_testing.operator.recorded_triplet import ReportReader, read, triplet
 
 DRAWN = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
 OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
@@ -20,7 +20,7 @@ def record() -> RunRecord:
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 @pytest.mark.parametrize("width", [1400, 400])
 def test_every_chart_of_a_report_is_drawn_without_errors(record: RunRecord, tmp_path: Path, width: int) -> None:
-    reader: Reader = read(record)
+    reader: ReportReader = read(record)
     page = tmp_path / "report.html"
     page.write_text(reader.html)
     with open_chromium() as browser:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.runs.lab_programs import Lab
+from snakesim_testing.runs.lab_programs import LabPrograms
 
 
 @pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Lab]:
+def lab(tmp_path: Path) -> Iterator[LabPrograms]:
     with contextlib.ExitStack() as stack:
-        yield Lab(tmp_path, stack)
+        yield LabPrograms(tmp_path, stack)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.messages import Messages
+from snakesim_testing.messages import StoredMessages
 from snakesim_testing.runs.in_process_command import snakesim
 
 ROBOT = Path("snakesim_hal/shipped/robots/planar13.toml").resolve()
@@ -56,7 +56,7 @@ def list_files(folder: Path) -> set[Path]:
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_one_clear_error_and_nothing_started(folder: Path, wrong: str, messages: Messages) -> None:
+def test_one_clear_error_and_nothing_started(folder: Path, wrong: str, messages: StoredMessages) -> None:
     before = list_files(folder)
     ended = snakesim(*WRONG[wrong], cwd=folder)
     assert ended.code == 2, ended.out + ended.err

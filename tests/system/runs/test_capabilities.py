@@ -1,12 +1,12 @@
 """What joints can do and measure: what needs no more runs. Who says that it needs more is refused: refusals.toml."""
 
 from snakesim_gnc.control.guarded import GuardedController
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.controller import NoParameters, Observation
 from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.hal.small_robots import make_joint_state
 from snakesim_testing.messages import raises_error
@@ -20,14 +20,14 @@ def test_position_servos_without_measurements_run_undemanding_controllers() -> N
     assert result.summary.ended == "complete"
     assert (result.summary.path_distance_m or 0.0) > 0.1
     assert not result.record.torque_nm.any(), "what is not measured is not told"
-    assert set(result.record.mode.flat) <= {Mode.PASSIVE, Mode.POSITION}
+    assert set(result.record.mode.flat) <= {JointMode.PASSIVE, JointMode.POSITION}
 
 
 def test_controller_without_declared_needs_is_named_at_first_command() -> None:
-    class Pushes(Hold):
+    class Pushes(HoldPose):
         def update(self, observation):  # pyright: ignore
             command = super().update(observation)
-            command.setpoints.mode[1] = Mode.TORQUE
+            command.setpoints.mode[1] = JointMode.TORQUE
             return command
 
     config = load_scenario("triplet", [parse_set_option(text) for text in SERVOS]).config

@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 
 import snakesim
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
 from snakesim_operator.features.console.page.custom_sensors import format_sensor_table
 from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
@@ -58,7 +58,7 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             assert abs(bent.bend_rad) <= bent.bend_max_rad
             assert 0 <= live.age_s(bent) < 1.0
             namespace = live.description.robot
-        with open_session(Link(endpoint=started.endpoint, namespace=namespace)) as session:
+        with open_session(ConnectionSettings(endpoint=started.endpoint, namespace=namespace)) as session:
             watch = LiveRobot(session)
 
             def shown() -> bool:

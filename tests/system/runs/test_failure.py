@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Mode, Status
+from snakesim_hal.wire.messages import JointMode, RobotStatus
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import read_summary, run_to_summary, running_armed_snakesim, snakesim
@@ -23,8 +23,8 @@ LONG = ["triplet", "--controller", "hold", "--duration", "600"]
 @pytest.mark.parametrize("clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
 def test_killed_controller_leads_to_safe_joints_and_failed_run(tmp_path: Path, clock_mode: str) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
-        with open_session(Link(run.endpoint, "planar13")) as session:
-            statuses = session.declare_reader(keys.STATUS, Status)
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
+            statuses = session.declare_reader(keys.STATUS, RobotStatus)
             wait_until(lambda: bool(statuses.drain()), "a status")
             os.kill(run.part("control"), signal.SIGKILL)
             wait_until(lambda: any("lease of control expired" in one.reason for one in statuses.drain()), "the reason")
@@ -35,10 +35,10 @@ def test_killed_controller_leads_to_safe_joints_and_failed_run(tmp_path: Path, c
     record = RunRecord.load(tmp_path / "run")
     lease_ticks = round(record.description.lease_ns / record.config.period_ns)
     assert expired.tick - lost.tick <= lease_ticks + 2
-    last_commanded = int(np.flatnonzero((record.mode == Mode.POSITION).any(axis=1))[-1])
+    last_commanded = int(np.flatnonzero((record.mode == JointMode.POSITION).any(axis=1))[-1])
     after = record.mode[last_commanded + 1 :]
     assert len(after) > 50
-    assert (after == Mode.VELOCITY).all()
+    assert (after == JointMode.VELOCITY).all()
     assert (record.target[last_commanded + 1 :] == 0).all()  # damped
     told_later = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
     assert told_later.code == 1
@@ -51,14 +51,14 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, cloc
     """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
     (tmp_path / "wave.py").write_text(
         "from snakesim_hal.controller import ControllerCommand, RequestedSetpoints\n"
-        "from snakesim_gnc.control.hold import Hold\n"
-        "from snakesim_hal.wire.messages import Mode\n\n\n"
-        "class Wave(Hold):\n"
+        "from snakesim_gnc.control.hold import HoldPose\n"
+        "from snakesim_hal.wire.messages import JointMode\n\n\n"
+        "class Wave(HoldPose):\n"
         "    def update(self, observation):\n"
         "        if observation.time_s < 0.5:\n"
         "            return super().update(observation)\n"
         "        angles = list(observation.joints.angle_rad)[:-1]\n"
-        "        return ControllerCommand(RequestedSetpoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
+        "        return ControllerCommand(RequestedSetpoints([JointMode.POSITION] * len(angles), angles, [7.0] * 13))\n"
     )
     flags = ["--controller", "./wave.py:Wave", "--clock-mode", clock_mode, "--duration", "60"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
@@ -79,8 +79,8 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, cloc
 def test_slow_controller_is_named_as_cause_of_stop(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(
         "import time\n\n"
-        "from snakesim_gnc.control.hold import Hold\n\n\n"
-        "class Slow(Hold):\n"
+        "from snakesim_gnc.control.hold import HoldPose\n\n\n"
+        "class Slow(HoldPose):\n"
         "    def update(self, observation):\n"
         "        time.sleep(0.1)\n"
         "        return super().update(observation)\n"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
@@ -63,10 +63,10 @@ def test_isolated_joint_is_passive_while_run_continues(tmp_path: Path, backend: 
     left = RunRecord.load(tmp_path / "run")
     modes, limits = left.mode, left.torque_limit_nm
     before, after = slice(50, 95), slice(106, 150)
-    assert (modes[before, 4] == Mode.POSITION).all()
-    assert (modes[after, 4] == Mode.PASSIVE).all()
+    assert (modes[before, 4] == JointMode.POSITION).all()
+    assert (modes[after, 4] == JointMode.PASSIVE).all()
     assert (limits[after, 4] == 0.0).all()
-    assert (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
+    assert (np.delete(modes, 4, axis=1)[after] != JointMode.PASSIVE).all()
 
 
 def test_the_list_is_there_without_a_robot(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     """A backend that does not say that it is emulated counts as real."""
     (tmp_path / "bench.py").write_text(
         "import sys\nfrom pathlib import Path\n\nimport msgspec\n"
-        "from snakesim_gnc.control.hold import Hold\n"
+        "from snakesim_gnc.control.hold import HoldPose\n"
         "from snakesim_sim_backend.backend import SimBackend\n\n"
         "def tell(part):\n"
         "    loaded = [name for name in sys.modules if name.startswith('snakesim_hal.faults.')]\n"
@@ -97,7 +97,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         "    def advance(self):\n"
         "        super().advance()\n"
         "        tell('host')\n\n"
-        "class Telling(Hold):\n"
+        "class Telling(HoldPose):\n"
         "    def update(self, observation):\n"
         "        tell('control')\n"
         "        return super().update(observation)\n"

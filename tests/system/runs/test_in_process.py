@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.model.scenario import Override, load_scenario, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, load_scenario, parse_set_option
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.results.run_reader import CONFIG_FILENAME, REPORT_FILENAME, SUMMARY_FILENAME
@@ -33,10 +33,10 @@ def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
 
 
 FAILING = """
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 
 
-class Failing(Hold):
+class Failing(HoldPose):
     def update(self, observation):
         if observation.tick == 20:
             raise ValueError("no idea")
@@ -47,7 +47,7 @@ class Failing(Hold):
 def test_in_process_controller_error_ends_in_safe_stop(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(FAILING)
     result = simulate(
-        load_scenario("triplet", [Override("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config
+        load_scenario("triplet", [KeyOverride("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config
     )
     assert "control ended: controller" in result.summary.ended
     assert "no idea" in result.summary.ended
@@ -66,17 +66,17 @@ from typing import Any
 
 import pytest
 
-from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.hold import HoldPose
 
 
-class Endless(Hold):
+class Endless(HoldPose):
     def update(self, observation):
         while observation.tick > 20:
             Path("begun").touch()
         return super().update(observation)
 
 
-class Compiled(Hold):
+class Compiled(HoldPose):
     def update(self, observation):
         if observation.tick > 20:
             Path("begun").touch()
@@ -89,7 +89,7 @@ def test_in_process_controller_that_hangs_ends_in_safe_stop(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_TIMEOUT_S", 2.0)
     (tmp_path / "endless.py").write_text(ENDLESS)
-    changes = [Override("controller", "./endless.py:Endless", "the test"), parse_set_option("start_limit_s=1")]
+    changes = [KeyOverride("controller", "./endless.py:Endless", "the test"), parse_set_option("start_limit_s=1")]
     result = simulate(load_scenario("triplet", changes).config)
     assert "control ended: " in result.summary.ended, result.summary.ended
     assert "took longer than 2 s in one tick; if it needs so long, allow it with --set" in result.summary.ended

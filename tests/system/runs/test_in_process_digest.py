@@ -7,19 +7,19 @@ import pytest
 
 from snakesim_hal.model.files import list_shipped_names
 from snakesim_hal.model.scenario import load_scenario, parse_set_option, read_config
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, DepthImage, World
+from snakesim_hal.wire.messages import ControlState, DepthImage, WorldModel
 from snakesim_operator.results.run_log import RunRecord as Record
 from snakesim_operator.results.run_reader import CONFIG_FILENAME
-from snakesim_operator.run.in_process import Result, simulate
+from snakesim_operator.run.in_process import InProcessResult, simulate
 from snakesim_testing.runs.command import run_to_summary
 
 pytestmark = pytest.mark.e2e
 
 
-def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
+def same_both_ways(out: Path, scenario: str, *arguments: str) -> InProcessResult:
     """Run it in processes, then its effective configuration in this one; both must agree in every tick."""
     ended, summary = run_to_summary(out, scenario, *arguments)
     assert ended.code == 0, ended.out + ended.err
@@ -37,7 +37,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
     return ours
 
 
-def _stands(said: ControlState | World) -> bool:
+def _stands(said: ControlState | WorldModel) -> bool:
     return isinstance(said, ControlState) and said.reason.startswith("robot time is paused")
 
 
@@ -61,7 +61,7 @@ def test_in_process_digest_of_robot_is_unchanged_by_camera(tmp_path: Path) -> No
         "peg_row", [parse_set_option("duration_s=0.5"), parse_set_option("robot=planar13_camera")]
     ).config
     with InProcessRun(config) as run:
-        client = Client(run.network.create_session(), "onlooker")
+        client = HostClient(run.network.create_session(), "onlooker")
         images, client_ticks = client.subscribe(keys.depth_key("head"), DepthImage), client.iterate_ticks(0.0)
         read: list[tuple[int, int]] = []
         for _ in run.iterate_ticks():

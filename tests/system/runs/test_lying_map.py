@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.service import Guidance
+from snakesim_gnc.guidance.service import GuidanceService
 from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_hal.model.plugins import SERVICES, register_plugin_temporarily
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_hal.model.scene import Cylinder
-from snakesim_hal.network.client import Client
-from snakesim_hal.wire.messages import World
+from snakesim_hal.network.client import HostClient
+from snakesim_hal.wire.messages import WorldModel
 from snakesim_operator.results.metrics.map_score import score_map
 from snakesim_operator.run.in_process import simulate
 
@@ -21,22 +21,22 @@ LIES = [Cylinder(position_m=(1.75 + 0.3 * k, 0.55 * (-1) ** k), radius_m=0.07, n
 HOW = ("robot=planar13_camera", "controller=path_following", "control.look_ahead_m=0.1", "duration_s=2.5")
 
 
-class Deceived(Guidance):
+class Deceived(GuidanceService):
     """Guidance whose configuration has another scene than the simulator's."""
 
-    seen: ClassVar[list[World]] = []
+    seen: ClassVar[list[WorldModel]] = []
 
-    def __init__(self, client: Client, config: RunConfig) -> None:
+    def __init__(self, client: HostClient, config: RunConfig) -> None:
         scene = msgspec.structs.replace(config.scene, cylinder=LIES, pegs_along_route=[], random_field=[])
         super().__init__(client, msgspec.structs.replace(config, scene=scene))
 
 
-def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[World], RunConfig]:
+def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[WorldModel], RunConfig]:
     """What guidance told in a run on a row of pegs."""
     config = load_scenario(
         "peg_row", [parse_set_option(text) for text in (*HOW, f'mission.map="{map_}"', *more)]
     ).config
-    with register_plugin_temporarily(SERVICES, "guidance", Deceived if deceived else Guidance):
+    with register_plugin_temporarily(SERVICES, "guidance", Deceived if deceived else GuidanceService):
         result = simulate(config)
     assert result.summary.ended == "complete"
     assert (result.summary.path_distance_m or 0) > 0.3

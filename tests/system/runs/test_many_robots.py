@@ -6,16 +6,16 @@ from collections import Counter
 
 import pytest
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.network.session_file import read_session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.lab_programs import Lab
+from snakesim_testing.runs.lab_programs import LabPrograms
 
 pytestmark = pytest.mark.e2e
 
@@ -43,12 +43,12 @@ class Listener:
         self.heard: Counter[str] = Counter()
         self.foreign: Counter[str] = Counter()
         self._decoders = {
-            keys.JOINTS: (Decoder(JointState), lambda message: len(message.angle_rad)),
-            keys.JOINT_COMMAND: (Decoder(JointCommand), lambda message: len(message.target)),
-            keys.APPLIED: (Decoder(AppliedCommand), lambda message: len(message.target)),
+            keys.JOINTS: (MessageDecoder(JointState), lambda message: len(message.angle_rad)),
+            keys.JOINT_COMMAND: (MessageDecoder(JointCommand), lambda message: len(message.target)),
+            keys.APPLIED: (MessageDecoder(AppliedCommand), lambda message: len(message.target)),
         }
 
-    def take(self, arrival: Arrival) -> None:
+    def take(self, arrival: ReceivedSample) -> None:
         """In Zenoh's threads."""
         split = keys.split_namespace(arrival.key)
         namespace, key = split or ("", arrival.key)
@@ -63,7 +63,7 @@ class Listener:
 @pytest.mark.parametrize(
     "form", ["quick", pytest.param("a million messages", marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )
-def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
+def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: LabPrograms) -> None:
     lab.start("start", "router", str(lab.router_file))
     (lab.folder / "plain.toml").write_text(SCENE)
     hosts = {}
@@ -75,7 +75,7 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
         lab.start("start", "service", "control", str(path), *network)
     wait_until(lambda: lab.tell("status").out.count("next: `snakesim robot arm") == 2, "both ready")
     listener = Listener()
-    with open_session(Link.from_session_file(read_session(lab.session))) as session:
+    with open_session(ConnectionSettings.from_session_file(read_session(lab.session))) as session:
         session.on_arrival("**", listener.take)
         only_one_is_armed_when_one_is_named(lab)
         for namespace, (robot, _, _) in ROBOTS.items():
@@ -96,7 +96,7 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
     print(f"{dict(listener.heard)} messages in {took_s:.0f} s, 0 foreign", file=sys.stderr)
 
 
-def only_one_is_armed_when_one_is_named(lab: Lab) -> None:
+def only_one_is_armed_when_one_is_named(lab: LabPrograms) -> None:
     """A command that names no robot goes to none of two; one that names the wrong robot is refused by the right one."""
     for arguments in (("robot", "arm", "planar13", "sim"), ("robot", "disarm")):
         ended = lab.tell(*arguments)

@@ -9,14 +9,14 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
-from snakesim_testing.runs.lab_programs import SCENARIO, Lab
+from snakesim_testing.runs.lab_programs import SCENARIO, LabPrograms
 
 pytestmark = pytest.mark.e2e
 
 SERVICES = ("guidance", "navigation", "control")
 
 
-def test_programs_started_in_any_order_equal_one_run(lab: Lab) -> None:
+def test_programs_started_in_any_order_equal_one_run(lab: LabPrograms) -> None:
     for name in SERVICES[:2]:
         lab.service(name)
     other_goal = lab.service("control", "--set", "mission.speed_m_s=0.3")
@@ -44,7 +44,9 @@ def test_programs_started_in_any_order_equal_one_run(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_operator_names_the_network_once_by_flag_or_environment(
+    lab: LabPrograms, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (endpoint,) = read_session(lab.session).endpoints
     monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))
     for ended in (lab.tell("robot", "disarm"), command.snakesim("robot", "disarm", cwd=lab.folder)):

@@ -7,9 +7,9 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import SimulatorRequest, Status
+from snakesim_hal.wire.messages import RobotStatus, SimulatorRequest
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.processes import assert_no_process_left
@@ -34,9 +34,9 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
             return ended.out + ended.err
 
         run.wait_for("network:")
-        with open_session(Link(run.endpoint, "planar13"), 30.0) as session:
-            statuses = session.declare_latched_reader(keys.STATUS, Status)
-            seen: list[Status] = []
+        with open_session(ConnectionSettings(run.endpoint, "planar13"), 30.0) as session:
+            statuses = session.declare_latched_reader(keys.STATUS, RobotStatus)
+            seen: list[RobotStatus] = []
 
             def shows(lifecycle: str, tick: int) -> bool:
                 seen.extend(statuses.drain())

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import REPORT_FILENAME
 from snakesim_operator.results.summary import RunSummary
@@ -45,12 +45,12 @@ def test_control_without_stream_holds_and_continues_when_it_returns(tmp_path: Pa
     assert ended.code == 0 and summary.faults == [] and summary.ended == "complete", ended.out
     record = RunRecord.load(tmp_path / "run")
     time_s = record.time_s - record.time_s[0]
-    pushes = (record.mode == Mode.TORQUE).any(axis=1)
+    pushes = (record.mode == JointMode.TORQUE).any(axis=1)
     held = (time_s > FROM_S + limit_s + 0.1) & (time_s < TO_S)
     assert pushes[time_s < FROM_S].any()
     assert not pushes[held].any()
     assert pushes[time_s > TO_S + 0.5].any()
-    assert (record.mode[held] == Mode.POSITION).all()
+    assert (record.mode[held] == JointMode.POSITION).all()
     reported = [state for state in record.control_states if state.reason.startswith(f"{key} is 0.")]
     assert reported
     assert all(state.state == "NotLocomoting" for state in reported)

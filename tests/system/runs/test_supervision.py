@@ -8,13 +8,13 @@ from typing import Literal
 
 import pytest
 
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
+from snakesim_hal.wire.messages import Answer, FaultRequest, LifecycleRequest, RobotDescription, RobotStatus
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.harness.processes import assert_no_process_left, find_processes_of_run
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import Running, read_summary, running_armed_snakesim, running_snakesim
+from snakesim_testing.runs.command import RunningCommand, read_summary, running_armed_snakesim, running_snakesim
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -29,11 +29,11 @@ class Robot:
     """A run as somebody on its network sees it."""
 
     def __init__(self, session: Session) -> None:
-        self._session, self._statuses = session, session.declare_latched_reader(keys.STATUS, Status)
-        self._status: Status | None = None
+        self._session, self._statuses = session, session.declare_latched_reader(keys.STATUS, RobotStatus)
+        self._status: RobotStatus | None = None
 
-    def status(self) -> Status:
-        def heard() -> Status | None:
+    def status(self) -> RobotStatus:
+        def heard() -> RobotStatus | None:
             self._status = (self._statuses.drain() or [self._status])[-1]
             return self._status
 
@@ -41,7 +41,7 @@ class Robot:
         assert self._status is not None
         return self._status
 
-    def reaches(self, lifecycle: str) -> Status:
+    def reaches(self, lifecycle: str) -> RobotStatus:
         wait_until(lambda: self.status().lifecycle == lifecycle, f"lifecycle {lifecycle}", BACK_S)
         return self.status()
 
@@ -49,7 +49,7 @@ class Robot:
         wait_until(lambda: self.status().ready_to_arm, "ready to arm", BACK_S)
 
     def tell(self, action: Literal["arm", "reset"]) -> Answer:
-        robot = self._session.wait_for_latched(keys.DESCRIPTION, Description, BACK_S)
+        robot = self._session.wait_for_latched(keys.DESCRIPTION, RobotDescription, BACK_S)
         assert robot is not None
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
@@ -70,11 +70,11 @@ class Robot:
         return self._session.send_request(keys.fault_key("run"), request, 5.0)
 
 
-def pids(run: Running, *names: str) -> dict[str, int]:
+def pids(run: RunningCommand, *names: str) -> dict[str, int]:
     return {name: run.part(name) for name in names}
 
 
-def interrupt(run: Running) -> RunSummary:
+def interrupt(run: RunningCommand) -> RunSummary:
     assert run.interrupt() == 130 and "report:" in run.printed(), run.printed()
     return read_summary(run.out)
 
@@ -82,7 +82,7 @@ def interrupt(run: Running) -> RunSummary:
 @pytest.mark.parametrize("clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
 def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode: str) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay") as run:
-        with open_session(Link(run.endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             first, services = robot.reaches("armed"), pids(run, *SERVICES)
             os.kill(run.part("host"), signal.SIGKILL)
@@ -103,7 +103,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode
 
 def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
-        with open_session(Link(run.endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot, before = Robot(session), run.part("control")
             os.kill(before, signal.SIGKILL)
             robot.reaches("fault")
@@ -126,7 +126,7 @@ def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -
 @pytest.mark.slow  # a row of the fault table
 def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
-        with open_session(Link(run.endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
             before = pids(run, "host", *SERVICES)
@@ -156,7 +156,7 @@ def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> Non
 @pytest.mark.slow  # rows of the fault table
 def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
-        with open_session(Link(run.endpoint, "planar13")) as session:
+        with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
             assert robot.fault("freeze", "control", for_s=0.5).ok

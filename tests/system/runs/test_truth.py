@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import ControlState
@@ -19,8 +19,8 @@ from snakesim_testing.runs.in_process_command import run_to_summary
 
 STILL = (
     "from snakesim_hal.controller import ControllerCommand, make_position_setpoints\n"
-    "from snakesim_gnc.control.hold import Hold\n\n\n"
-    "class Still(Hold):\n"
+    "from snakesim_gnc.control.hold import HoldPose\n\n\n"
+    "class Still(HoldPose):\n"
     "    def update(self, observation):\n"
     "        return ControllerCommand(super().update(observation).setpoints)\n"
 )
@@ -61,8 +61,10 @@ def test_missing_clock_after_end_of_run_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "run" / RECORDING_FILENAME).unlink()
     recording = RecordingWriter(tmp_path / "run" / RECORDING_FILENAME)
     for reported in before:
-        recording.write_arrival(Arrival(reported.key, reported.payload, reported.encoding, reported.wall_time_ns))
-    reported = Arrival(keys.CONTROL_STATE, encode(gone), format_encoding(ControlState), 0)
+        recording.write_arrival(
+            ReceivedSample(reported.key, reported.payload, reported.encoding, reported.wall_time_ns)
+        )
+    reported = ReceivedSample(keys.CONTROL_STATE, encode(gone), format_encoding(ControlState), 0)
     recording.write_arrival(reported)  # as control reports it while a host writes a long record
     recording.close({})
     again = summarize_run(RunRecord.load(tmp_path / "run"), "complete")

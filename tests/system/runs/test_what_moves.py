@@ -11,7 +11,7 @@ import pytest
 from snakesim_can_backend.can_drives import backend as can_family
 from snakesim_can_backend.driver import modules
 from snakesim_drivers.kit.bus import BusSpec
-from snakesim_drivers.kit.buses import Buses
+from snakesim_drivers.kit.buses import RobotBuses
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_type import DriverTypeContext
 from snakesim_drivers.kit.readings import DriveReadings
@@ -88,7 +88,7 @@ def test_emulation_is_stated_only_without_real_drives(
         opened_buses += part.driver_type.plan_buses(context)
     in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads
     assert (
-        Buses(in_turn, DriveReadings(config.robot.joint_table, clock.now_ns), opened_buses, clock.now_ns).emulated
+        RobotBuses(in_turn, DriveReadings(config.robot.joint_table, clock.now_ns), opened_buses, clock.now_ns).emulated
         == emulated
     )
 

@@ -14,7 +14,7 @@ from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, load_can_settings
 from snakesim_can_backend.commands import COMMANDS
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
-from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode
+from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, ModuleState, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns
@@ -100,11 +100,11 @@ def test_the_dbc_file_needs_a_folder(tmp_path: Path) -> None:
 # --- scan --------------------------------------------------------------------------------------------------
 
 
-def identity(node: int, serial: int) -> Frame:
+def identity(node: int, serial: int) -> CanFrame:
     return load_layouts()[Opcode.IDENTITY].encode(node, serial=serial, firmware_major=1, protocol=1, emulated=1)
 
 
-def scanned(*frames_on_bus: Frame) -> tuple[list[dict[str, str]], list[Frame]]:
+def scanned(*frames_on_bus: CanFrame) -> tuple[list[dict[str, str]], list[CanFrame]]:
     """Scan a bus on which these frames arrive, and return the rows of the scan and the frames that it sent."""
     channel = f"scan-{uuid.uuid4().hex[:8]}"
     wire = VirtualWire(channel)

@@ -17,7 +17,7 @@ from snakesim.environments.array_limiter import (
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, MeasuredState
 from snakesim_hal.safety.limit_names import find_active_limits
 from snakesim_hal.safety.limiter import limit_command
-from snakesim_hal.wire.messages import Description, JointCommand, Mode
+from snakesim_hal.wire.messages import JointCommand, JointMode, RobotDescription
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 
 ROBOTS = 40
@@ -25,7 +25,7 @@ JOINTS = 3
 ROUNDS = 30
 
 
-def make_robot(random: np.random.Generator) -> Description:
+def make_robot(random: np.random.Generator) -> RobotDescription:
     """A robot whose joints have limits of their own; some cannot move."""
     robot = make_description()
     joints = [
@@ -50,8 +50,8 @@ def draw(random: np.random.Generator, scale: float) -> Any:
     return np.where(random.random((ROBOTS, JOINTS)) < 0.3, special, values)
 
 
-@pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
-def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: Mode) -> None:
+@pytest.mark.parametrize("mode", [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE])
+def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: JointMode) -> None:
     random = np.random.default_rng(int(mode))
     robots = [make_robot(random) for _ in range(ROBOTS)]
     limits_of_robot = [JointLimits.from_description(robot) for robot in robots]

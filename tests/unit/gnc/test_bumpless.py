@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.control.bumpless import BumplessTransfer
 from snakesim_hal.safety.limiter import compute_bumpless_target
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.gnc.stage import make_robot
 from snakesim_testing.hal.small_robots import make_joint_state
 
@@ -15,7 +15,7 @@ ROBOT = make_robot(4)
 values = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
 
 
-def bumpless(mode: Mode, angle, velocity, torque):
+def bumpless(mode: JointMode, angle, velocity, torque):
     """What the HAL's own limiter takes for the target that changes nothing."""
     parts = zip(ROBOT.joints, angle, velocity, torque, strict=True)
     return [compute_bumpless_target(joint, mode, q, speed, push) for joint, q, speed, push in parts]
@@ -26,7 +26,7 @@ def test_bumpless_starts_from_present_motor_targets(angle, velocity, torque, ref
     hand_over = BumplessTransfer(ROBOT)
     hand_over.start_in_position_mode(make_joint_state(ROBOT, angle, velocity, torque), np.array(reference))
     targets = hand_over.compute_position_targets_rad(np.array(reference))
-    assert targets == pytest.approx(bumpless(Mode.POSITION, angle, velocity, torque))
+    assert targets == pytest.approx(bumpless(JointMode.POSITION, angle, velocity, torque))
 
 
 @given(values, values, values, values, st.floats(-5, 5), st.floats(0, 1))
@@ -38,7 +38,7 @@ def test_nothing_jumps_by_more_than_the_fade(angle, velocity, torque, reference,
     hand_over.advance_ramps(1.0)
     hand_over.switch_torque_joint(1, measured, reference)
     hand_over.advance_ramps(fade)
-    held = bumpless(Mode.POSITION, angle, velocity, torque)
+    held = bumpless(JointMode.POSITION, angle, velocity, torque)
     position = hand_over.compute_position_targets_rad(reference)[2]
     assert abs(position - held[2]) <= fade * abs(held[2] - reference[2]) + 1e-9
     assert abs(hand_over.compute_torque_target_nm(wanted) - torque[1]) <= fade * abs(wanted - torque[1]) + 1e-9

@@ -10,17 +10,17 @@ from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_gnc.navigation.platform_rises import PlatformRises
 from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle, Rise
+from snakesim_hal.wire.messages import KnownObstacle, PathRise
 from snakesim_testing.gnc.stage import make_robot
 
-RISE = Rise(from_s_m=1.0, to_s_m=1.6, height_m=0.1)
+RISE = PathRise(from_s_m=1.0, to_s_m=1.6, height_m=0.1)
 AXES = ["yaw", "pitch"] * 9
 STRAIGHT = [(0.0, 0.0), (4.0, 0.0)]
 
 
-def platform(x_m: float, length_m: float, yaw_rad: float = 0.0) -> Obstacle:
+def platform(x_m: float, length_m: float, yaw_rad: float = 0.0) -> KnownObstacle:
     half = (0.5 * length_m, 0.5, 0.05)
-    return Obstacle(
+    return KnownObstacle(
         name="step", shape="box", position_w=(x_m, 0.0, 0.05), half_size_m=half, height_m=0.1, yaw_rad=yaw_rad
     )
 

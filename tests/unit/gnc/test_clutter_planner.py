@@ -23,7 +23,7 @@ from snakesim_hal.model.scenario import (
     parse_set_option,
     place_obstacles,
 )
-from snakesim_hal.wire.messages import Obstacle, Trajectory, World
+from snakesim_hal.wire.messages import KnownObstacle, Trajectory, WorldModel
 from snakesim_testing.gnc.stage import make_world
 
 TURN_S = 0.08  # a plan takes some of them
@@ -32,7 +32,7 @@ SEARCH = SearchParameters(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
 
 
 @cache
-def field(density: float = 8.0) -> tuple[list[Obstacle], np.ndarray]:
+def field(density: float = 8.0) -> tuple[list[KnownObstacle], np.ndarray]:
     """Obstacles, and the nodes of the body where it is laid down."""
     flags = ("scene.random_field.0.seed=1", f"scene.random_field.0.density_per_m2={density}")
     config = load_scenario("surveyed_clutter", [parse_set_option(flag) for flag in flags]).config
@@ -41,11 +41,11 @@ def field(density: float = 8.0) -> tuple[list[Obstacle], np.ndarray]:
     return [placed.obstacle for placed in place_obstacles(config)], body
 
 
-def world(at_s: float, obstacles: list[Obstacle]) -> World:
+def world(at_s: float, obstacles: list[KnownObstacle]) -> WorldModel:
     return make_world(tick=round(100 * at_s), timestamp_ns=round(at_s * SECOND), obstacles=obstacles)
 
 
-def planner(known: list[Obstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:
+def planner(known: list[KnownObstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:
     return ClutterPlanner(goal or HeadingGoal(), known, search_parameters=SEARCH, update_period_s=TURN_S)
 
 
@@ -53,7 +53,7 @@ def planned(
     made: ClutterPlanner,
     body: np.ndarray,
     at_s: float = 0.0,
-    seen: list[Obstacle] | None = None,
+    seen: list[KnownObstacle] | None = None,
     heading_rad: float | None = None,
 ) -> Trajectory:
     """The trajectory of a turn and, without the body or time going on, of those until it is no longer searched."""
@@ -132,7 +132,9 @@ def test_only_what_is_seen_is_planned_around() -> None:
     _, body = field()
     made = planner(None)
     blind = planned(made, body)
-    wall = Obstacle(name="wall", shape="box", position_w=(2.2, 0.0, 0.1), half_size_m=(0.05, 0.4, 0.1), height_m=0.2)
+    wall = KnownObstacle(
+        name="wall", shape="box", position_w=(2.2, 0.0, 0.1), half_size_m=(0.05, 0.4, 0.1), height_m=0.2
+    )
     points = np.array(blind.path_w)
     assert min(compute_outline_distance_m(wall, p) for p in points) < 0.0  # it does not know yet
     seen = planned(made, body, 0.2, [wall])

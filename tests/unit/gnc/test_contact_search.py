@@ -8,29 +8,29 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from snakesim.training.form import Policy
+from snakesim.training.form import PolicyArrays
 from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave
 from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedParameters
 from snakesim_gnc.control.policy import POLICY_FOLDER
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import ControllerCommand
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle
-from snakesim_testing.gnc.stage import Stage, make_contact, make_stage
+from snakesim_hal.wire.messages import KnownObstacle
+from snakesim_testing.gnc.stage import ObservationStage, make_contact, make_stage
 
 TAIL_S_M = 0.3
 SEARCHES = "in search of contacts"
 JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.03
 
 
-def searching(*, among_pegs: bool = False, **parameters: float) -> tuple[Stage, ObstacleAided]:
+def searching(*, among_pegs: bool = False, **parameters: float) -> tuple[ObservationStage, ObstacleAided]:
     """A body on its path that searches for contacts after a second, unless configured otherwise."""
     stage = make_stage()
     stage.pegs = stage.pegs if among_pegs else []
     return stage, ObstacleAided(stage.robot, ObstacleAidedParameters(**{"search_after_s": 1.0, **parameters}))
 
 
-def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[ControllerCommand]:
+def stands(controller: ObstacleAided, stage: ObservationStage, ticks: range) -> list[ControllerCommand]:
     """What is commanded while the body stays where it is."""
     return [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in ticks]
 
@@ -122,7 +122,7 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     session = onnxruntime.InferenceSession(POLICY_FOLDER / "lab.onnx")
     learned = msgspec.json.decode(session.get_modelmeta().custom_metadata_map["snakesim.learned"])
     sizes = {"time_s": 1, "goal_bearing": 2, "angle_rad": 13, "velocity_rad_s": 13, "torque_nm": 13, "contact_n": 14}
-    policy = Policy.make_from_parameters(learned, ["yaw"] * 13, sizes)
+    policy = PolicyArrays.make_from_parameters(learned, ["yaw"] * 13, sizes)
     goal = [np.cos(bearing_rad), np.sin(bearing_rad)]
     seen = [passed_s, *goal, *joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm, *forces_n]
     felt = replace(
@@ -135,7 +135,7 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     assert wave == pytest.approx(policy.compute_targets(np.array(seen, np.float32)), abs=1e-4)
 
 
-def felt_by(stage: Stage, torque_nm: float = 0.0) -> np.ndarray:
+def felt_by(stage: ObservationStage, torque_nm: float = 0.0) -> np.ndarray:
     """Angles of all joints of a straight body, whatever path there is."""
     joints = stage.make_observation(0, TAIL_S_M, torque_nm=torque_nm).joints
     straight = msgspec.structs.replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
@@ -181,9 +181,9 @@ def test_contact_search_of_moving_body_does_not_start(speed_m_s: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "pegs", [[], [Obstacle(name="p", shape="cylinder", position_w=(0.5, 0.12, 0.1), radius_m=0.05)]]
+    "pegs", [[], [KnownObstacle(name="p", shape="cylinder", position_w=(0.5, 0.12, 0.1), radius_m=0.05)]]
 )
-def test_contact_search_of_u_shaped_body_raises_no_error(pegs: list[Obstacle]) -> None:
+def test_contact_search_of_u_shaped_body_raises_no_error(pegs: list[KnownObstacle]) -> None:
     stage = make_stage()
     turn = np.linspace(-np.pi / 2, np.pi / 2, 40)
     bend = np.column_stack([0.7 + 0.12 * np.cos(turn), 0.12 + 0.12 * np.sin(turn)])

@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_gnc.control.freshness import AgeLimits
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Description, SensorDescription, Trajectory, World
+from snakesim_hal.wire.messages import RobotDescription, SensorDescription, Trajectory, WorldModel
 from snakesim_testing.gnc.stage import make_world
 from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_run_config
 
@@ -20,7 +20,7 @@ SECOND = 10**9
 NOW = 100 * SECOND
 
 
-def robot(**rates: float) -> Description:
+def robot(**rates: float) -> RobotDescription:
     """With sensors of these rates in Hz, each with a delay of 0.05 s."""
     sensors = [SensorDescription(key=f"sensor/{name}", rate_hz=rate, delay_s=0.05) for name, rate in rates.items()]
     return msgspec.structs.replace(make_description(), sensors=sensors)
@@ -30,7 +30,7 @@ def limits(config: RunConfig | None = None, **rates: float) -> AgeLimits:
     return AgeLimits.from_config(config or make_run_config(services=SCHEDULE), robot(**rates))
 
 
-def world(**changes: Any) -> World:
+def world(**changes: Any) -> WorldModel:
     return make_world(
         **({"tick": 9_990, "timestamp_ns": NOW, "pose_timestamp_ns": NOW, "contacts_timestamp_ns": NOW} | changes)
     )

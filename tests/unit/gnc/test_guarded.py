@@ -10,7 +10,7 @@ import pytest
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.messages import JointMode, RobotDescription
 from snakesim_testing.gnc.stage import make_stage
 from snakesim_testing.messages import raises_error
 
@@ -23,7 +23,7 @@ WHO = r"^controller ./wave.py:Wave \(class Wave\): "
 class Wave(Controller[Any]):
     """Answers whatever it is given."""
 
-    def __init__(self, robot: Description, parameters: Any) -> None:
+    def __init__(self, robot: RobotDescription, parameters: Any) -> None:
         super().__init__(robot, parameters)
         self.answer = parameters
         if isinstance(parameters, Exception):
@@ -52,7 +52,7 @@ def made_of(setpoints: Any, telemetry: Any = None) -> ControllerCommand:
 
 
 def test_guarded_valid_answer_passes_unchanged() -> None:
-    for answer in (ControllerCommand(GOOD), points(target=[1, 0.5, -2]), points(mode=list(Mode)[:3])):
+    for answer in (ControllerCommand(GOOD), points(target=[1, 0.5, -2]), points(mode=list(JointMode)[:3])):
         assert update(answer) is answer
 
 
@@ -64,7 +64,7 @@ def test_guarded_valid_answer_passes_unchanged() -> None:
         made_of([0.0] * 3),
         made_of(GOOD, "moving"),
         points(target=[0.0] * 2),
-        points(mode=[Mode.POSITION] * 4),
+        points(mode=[JointMode.POSITION] * 4),
         points(torque_limit_nm=[]),
         points(target=np.zeros(3)),
         points(target=[0.0, math.nan, 0.0]),
@@ -75,7 +75,7 @@ def test_guarded_valid_answer_passes_unchanged() -> None:
         points(target=["1", 0.0, 0.0]),
         points(torque_limit_nm=[7.0, -1.0, 7.0]),
         points(mode=[1, 1, 1]),
-        points(mode=[Mode.POSITION, 7, "x"]),
+        points(mode=[JointMode.POSITION, 7, "x"]),
         reported(reason=None),
         reported(usable_push_points="3"),
         reported(propulsion_joint=3),

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_gnc.control.live_parameters import LiveParameters
 from snakesim_hal.model.scenario import load_scenario
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, ControlParameters, ParametersRequest
@@ -29,7 +29,7 @@ class Bench:
     def __init__(self) -> None:
         network = LocalNetwork()
         config = load_scenario("triplet", []).config
-        self.parameters = LiveParameters(Client(network.create_session(), "control"), config)
+        self.parameters = LiveParameters(HostClient(network.create_session(), "control"), config)
         self.parameters.configure(make_description())
         self.anew: list[bool] = []
         network.run_responders = lambda: self.anew.append(self.parameters.answer_requests(CLOCK))

@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 from snakesim_gnc.control.push import BodyContacts, find_body_contacts, solve_push
 from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.path_search.margin import MAX_CONTACT_FORCE_N, compute_margins_n
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, compute_body_points, make_stage
 
 SEEDS = st.integers(0, 2**31)
 
 
-def touching(tail_s_m: float, pegs: list[Obstacle] | None = None) -> tuple[np.ndarray, BodyContacts, np.ndarray]:
+def touching(tail_s_m: float, pegs: list[KnownObstacle] | None = None) -> tuple[np.ndarray, BodyContacts, np.ndarray]:
     """Nodes of a body on the usual route, what touches it, and its joints' change of angle per metre of the way."""
     stage = make_stage()
     nodes = compute_body_points(stage, tail_s_m)
-    outlines = Outlines.from_obstacles(stage.pegs if pegs is None else pegs)
+    outlines = ObstacleOutlines.from_obstacles(stage.pegs if pegs is None else pegs)
     slope = (angles_of(compute_body_points(stage, tail_s_m + 0.01)) - angles_of(nodes)) / 0.01
     return nodes, find_body_contacts(nodes, BODY_RADIUS_M, outlines, max_gap_m=0.03, friction=0.0), slope
 

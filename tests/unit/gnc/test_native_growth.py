@@ -16,7 +16,7 @@ from snakesim_gnc.navigation.path_search.search_parameters import SearchParamete
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 from snakesim_gnc.navigation.path_search.specified_growth import NumpyExpander
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_native import load
 
 BODY_M = 1.0
@@ -34,18 +34,18 @@ def make_body(random: np.random.Generator) -> Floats:
     return resample_evenly(np.column_stack([x, y - y[-1]]))
 
 
-def make_obstacles(random: np.random.Generator, body_w: Floats) -> list[Obstacle]:
+def make_obstacles(random: np.random.Generator, body_w: Floats) -> list[KnownObstacle]:
     """Return cylinders and turned boxes on an irregular lattice, some of which touch the body's sides."""
     spacing_m = random.uniform(0.18, 0.35)
     columns = np.arange(-1.2, 1.8, spacing_m)
     rows = np.arange(-0.8, 0.8, spacing_m)
-    obstacles: list[Obstacle] = []
+    obstacles: list[KnownObstacle] = []
     for x, y in np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2) + random.uniform(0.0, 0.1, 2):
         place_w = np.array([x, y]) + random.uniform(-0.2, 0.2, 2) * spacing_m
         radius_m = float(random.uniform(0.02, 0.05))
         if np.hypot(*(body_w - place_w).T).min() < 1.3 * radius_m + 0.045:
             continue
-        obstacle = Obstacle(
+        obstacle = KnownObstacle(
             name=f"obstacle{len(obstacles)}",
             shape="box" if random.random() < 0.4 else "cylinder",
             position_w=(float(place_w[0]), float(place_w[1]), 0.1),

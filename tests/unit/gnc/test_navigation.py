@@ -4,28 +4,28 @@ from typing import Any
 
 import pytest
 
-from snakesim_gnc.navigation.intents import MAX_VALIDITY_NS, DesiredMotion, Intents
+from snakesim_gnc.navigation.intents import MAX_VALIDITY_NS, DesiredMotion, IntentTracker
 from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Intent, Obstacle, World
+from snakesim_hal.wire.messages import KnownObstacle, LocomotionIntent, WorldModel
 from snakesim_testing.gnc.stage import make_world
 
 MISSION_M_S = 0.2
 MISSION = DesiredMotion(MISSION_M_S)
 SECOND = 10**9
 ROUTE = Route([(0.0, 0.0), (1.0, 0.0), (10.0, 0.0)])
-PEG = Obstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_m=0.05, height_m=0.2)
+PEG = KnownObstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_m=0.05, height_m=0.2)
 
 
-def intent(at_s: float, **more: Any) -> Intent:
-    return Intent(**{"timestamp_ns": round(at_s * SECOND), "requester": "ann", "speed_m_s": 0.1, **more})
+def intent(at_s: float, **more: Any) -> LocomotionIntent:
+    return LocomotionIntent(**{"timestamp_ns": round(at_s * SECOND), "requester": "ann", "speed_m_s": 0.1, **more})
 
 
-def world(tail_x_m: float, timestamp_ns: int = 0) -> World:
+def world(tail_x_m: float, timestamp_ns: int = 0) -> WorldModel:
     return make_world(timestamp_ns=timestamp_ns, base_position_w=(tail_x_m, 0.0, 0.0))
 
 
-def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:
+def desired(intents: IntentTracker, newest: LocomotionIntent | None, at_s: float) -> tuple[float, str]:
     found = intents.choose_motion(newest, round(at_s * SECOND))
     return found.speed_m_s, found.reason
 
@@ -53,7 +53,7 @@ def test_navigation_stops_at_the_end_of_path() -> None:
 
 
 def test_intent_expires_after_its_validity_and_robot_stops() -> None:
-    intents = Intents(MISSION_M_S)
+    intents = IntentTracker(MISSION_M_S)
     assert desired(intents, None, 0.0) == (MISSION_M_S, "")
     asked = intent(1.0)
     assert desired(intents, asked, 1.2) == (0.1, "as ann wants it")
@@ -69,10 +69,10 @@ def test_intent_expires_after_its_validity_and_robot_stops() -> None:
 
 
 def test_intent_validity_is_shortened_but_never_extended_beyond_maximum() -> None:
-    intents, brief = Intents(MISSION_M_S), intent(0.0, valid_for_ns=SECOND // 2)
+    intents, brief = IntentTracker(MISSION_M_S), intent(0.0, valid_for_ns=SECOND // 2)
     assert desired(intents, brief, 0.5)[0] == 0.1
     assert desired(intents, brief, 0.6)[0] == 0.0
-    intents, endless = Intents(MISSION_M_S), intent(0.0, valid_for_ns=2**62)
+    intents, endless = IntentTracker(MISSION_M_S), intent(0.0, valid_for_ns=2**62)
     assert desired(intents, endless, MAX_VALIDITY_NS / SECOND)[0] == 0.1
     speed, why = desired(intents, endless, MAX_VALIDITY_NS / SECOND + 0.1)
     assert speed == 0.0
@@ -83,7 +83,7 @@ def test_intent_validity_is_shortened_but_never_extended_beyond_maximum() -> Non
     ("at_s", "words"), [(20.2, "stamped 10.2 s ahead of the robot's clock"), (8.0, "has expired: it is 2 s old")]
 )
 def test_intent_with_future_or_old_timestamp_is_refused(at_s: float, words: str) -> None:
-    intents = Intents(MISSION_M_S)
+    intents = IntentTracker(MISSION_M_S)
     speed, why = desired(intents, intent(at_s), 10.0)
     assert speed == MISSION_M_S
     assert words in why  # nobody has taken over from the mission
@@ -94,18 +94,18 @@ def test_intent_with_future_or_old_timestamp_is_refused(at_s: float, words: str)
 
 
 def test_a_clock_that_the_sender_heard_first_is_no_future() -> None:
-    assert desired(Intents(MISSION_M_S), intent(1.09), 1.0)[0] == 0.1
+    assert desired(IntentTracker(MISSION_M_S), intent(1.09), 1.0)[0] == 0.1
 
 
 @pytest.mark.parametrize("speed_m_s", [10.1, -11.0, 1e5])
 def test_navigation_intent_speed_is_limited_by_mission(speed_m_s: float) -> None:
-    speed, why = desired(Intents(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
+    speed, why = desired(IntentTracker(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
     assert speed == MISSION_M_S
     assert f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why
 
 
 def test_intent_direction_holds_while_standing_until_mission_resumes() -> None:
-    intents = Intents(MISSION_M_S)
+    intents = IntentTracker(MISSION_M_S)
     assert intents.choose_motion(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
     expired = intents.choose_motion(None, 2 * SECOND)
     assert expired.speed_m_s == 0.0
@@ -115,20 +115,20 @@ def test_intent_direction_holds_while_standing_until_mission_resumes() -> None:
 
 
 def test_intent_before_a_robot_restart_is_ignored_afterwards() -> None:
-    intents, asked = Intents(MISSION_M_S), intent(50.0)
+    intents, asked = IntentTracker(MISSION_M_S), intent(50.0)
     assert desired(intents, asked, 50.1)[0] == 0.1
     intents.reset()
     speed, why = desired(intents, None, 0.0)
     assert speed == 0.0
     assert "the intent of ann was for another start of the robot" in why
     assert desired(intents, None, 50.1)[0] == 0.0
-    fresh = Intents(MISSION_M_S)
+    fresh = IntentTracker(MISSION_M_S)
     fresh.reset()
     assert desired(fresh, None, 0.0) == (MISSION_M_S, "")
 
 
 def test_intent_sent_before_a_stop_does_not_move_robot() -> None:
-    intents = Intents(MISSION_M_S)
+    intents = IntentTracker(MISSION_M_S)
     assert desired(intents, intent(1.0, valid_for_ns=5 * SECOND), 1.1)[0] == 0.1
     assert desired(intents, intent(2.0, go=False, valid_for_ns=5 * SECOND), 2.1) == (0.0, "ann wants it to stop")
     late = intent(1.5, valid_for_ns=5 * SECOND, speed_m_s=0.3)

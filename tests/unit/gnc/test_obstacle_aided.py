@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedParameters
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.gnc.stage import make_stage
 
 HELD_NM = 0.6  # that every joint is measured with
@@ -16,11 +16,11 @@ def test_obstacle_aided_leaving_torque_mode_holds_with_present_torque(lost: str)
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
     observations = [stage.make_observation(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
     pushing = [controller.update(observation) for observation in observations][-1].setpoints
-    assert set(pushing.mode) == {Mode.TORQUE}
+    assert set(pushing.mode) == {JointMode.TORQUE}
     assert np.abs(pushing.target).max() > 0.1
 
     holding = controller.update(stage.make_observation(40, 1.0, torque_nm=HELD_NM, without=lost)).setpoints
-    assert set(holding.mode) == {Mode.POSITION}
+    assert set(holding.mode) == {JointMode.POSITION}
     stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
     by_spring_nm = (np.array(holding.target) - observations[-1].joints.angle_rad) * stiffness
     assert by_spring_nm == pytest.approx(HELD_NM, rel=0.1)
@@ -31,4 +31,4 @@ def test_obstacle_aided_body_without_push_holds_in_position_mode():
     stage.pegs = []
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
     commands = [controller.update(stage.make_observation(tick, 1.0)) for tick in range(40)]
-    assert set(commands[-1].setpoints.mode) == {Mode.POSITION}
+    assert set(commands[-1].setpoints.mode) == {JointMode.POSITION}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, TripletParameters
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.gnc.stage import PERIOD_S, make_contact, make_stage, require_value
 
 TAIL_S_M = 0.3
@@ -15,7 +15,7 @@ def make_controller(stage, **parameters) -> ObstacleTriplet:
 
 
 def torque_joints(command) -> list[int]:
-    return [i for i, mode in enumerate(command.setpoints.mode) if mode == Mode.TORQUE]
+    return [i for i, mode in enumerate(command.setpoints.mode) if mode == JointMode.TORQUE]
 
 
 def stay(controller, stage, ticks, **more):
@@ -219,7 +219,7 @@ def test_a_new_path_moves_no_target_at_once():
     before = stay(controller, stage, 50).setpoints
     stage.path_id = 1
     after = controller.update(stage.make_observation(50, TAIL_S_M + 0.05)).setpoints
-    steady = [i for i in range(13) if before.mode[i] == after.mode[i] == Mode.POSITION]
+    steady = [i for i in range(13) if before.mode[i] == after.mode[i] == JointMode.POSITION]
     assert len(steady) >= 11
     for i in steady:
         assert after.target[i] == pytest.approx(before.target[i], abs=0.03)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.path_following import PathFollowing, PathFollowingParameters
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.gnc.stage import compute_body_points, make_stage
 
 TAIL_S_M = 0.3
@@ -18,7 +18,7 @@ def test_path_following_held_body_is_commanded_at_most_look_ahead():
     stage = make_stage()
     controller = make_controller(stage, look_ahead_m=0.03)
     command = [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in range(200)][-1]
-    assert set(command.setpoints.mode) == {Mode.POSITION}
+    assert set(command.setpoints.mode) == {JointMode.POSITION}
     nodes = compute_body_points(stage, TAIL_S_M + 0.03)
     headings = np.arctan2(*np.diff(nodes)[::-1])
     assert command.setpoints.target == pytest.approx(np.diff(headings), abs=0.01)

@@ -9,24 +9,24 @@ from snakesim_gnc.control.contact_forces import NetContactForce
 from snakesim_gnc.control.push import find_body_contacts, solve_push
 from snakesim_gnc.control.push_report import explain_push_standstill, make_push_point_messages
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import make_robot, make_world
 
 BODY = PlanarBody(make_robot())
 NODES = np.vstack([np.array(BODY.body_points_s_m), 0.06 * np.sin(2 * np.pi * np.array(BODY.body_points_s_m) / 0.6)])
 
 
-def peg(name: str, x: float, side: int) -> Obstacle:
+def peg(name: str, x: float, side: int) -> KnownObstacle:
     """A peg beside the wave at an inflection, 1 mm off the body."""
     slope = 0.06 * 2 * np.pi / 0.6 * np.cos(2 * np.pi * x / 0.6)
     left = np.array([-slope, 1.0]) / np.hypot(slope, 1.0)
     place = np.array([x, 0.0]) + side * (0.05 + 0.04 + 0.001) * left
-    return Obstacle(name=name, shape="cylinder", position_w=(*place.tolist(), 0.1), radius_m=0.05, height_m=0.2)
+    return KnownObstacle(name=name, shape="cylinder", position_w=(*place.tolist(), 0.1), radius_m=0.05, height_m=0.2)
 
 
-def pushing(pegs: Sequence[Obstacle]):
-    touches = find_body_contacts(NODES, 0.04, Outlines.from_obstacles(pegs), max_gap_m=0.03, friction=0.0)
+def pushing(pegs: Sequence[KnownObstacle]):
+    touches = find_body_contacts(NODES, 0.04, ObstacleOutlines.from_obstacles(pegs), max_gap_m=0.03, friction=0.0)
     return touches, solve_push(NODES, touches, np.zeros(len(NODES[0]) - 2), contact_gap_scale_m=0.005)
 
 
@@ -51,7 +51,7 @@ def test_push_report_forces_sum_to_requested_push() -> None:
         ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 9.0, 30.0, "no obstacle touches the body"),
     ],
 )
-def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
+def test_a_stall_has_a_class(pegs: tuple[KnownObstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
     nothing = NetContactForce(
         max_contact_n=0.0, forward_n=0.0, backward_n=0.0, blocking_obstacle="", touched_obstacles=frozenset()
     )

@@ -19,7 +19,7 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
 )
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_hal.model.route import Route
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import (
     BODY_RADIUS_M,
     CLEARANCE_M,
@@ -68,7 +68,7 @@ def test_a_peg_is_met_at_its_inflection():
     ids=["ball on the left", "ball on the right", "corner of a turned box"],
 )
 def test_selection_beside_straight_path_uses_nearest_obstacle_point(y_m, shape, clearance_m):
-    contact = plan_contact(STRAIGHT, Obstacle(name="it", position_w=(2.0, y_m, 0.0), **shape), 0.04, **NEAR)
+    contact = plan_contact(STRAIGHT, KnownObstacle(name="it", position_w=(2.0, y_m, 0.0), **shape), 0.04, **NEAR)
     assert contact.point_w == pytest.approx((2.0, 0.0), abs=1e-3)
     assert contact.normal_w == pytest.approx((0.0, -math.copysign(1.0, y_m)))
     assert contact.side == -math.copysign(1.0, y_m)
@@ -76,7 +76,7 @@ def test_selection_beside_straight_path_uses_nearest_obstacle_point(y_m, shape, 
 
 
 def test_a_box_that_the_path_runs_into_has_no_clearance():
-    box = Obstacle(name="box", shape="box", position_w=(2.0, -0.05, 0.0), half_size_m=(0.1, 0.1, 0.1))
+    box = KnownObstacle(name="box", shape="box", position_w=(2.0, -0.05, 0.0), half_size_m=(0.1, 0.1, 0.1))
     contact = plan_contact(STRAIGHT, box, 0.04, **NEAR)
     assert contact.clearance_m < -0.04
     assert contact.side == 1

@@ -5,7 +5,7 @@ import pytest
 
 from snakesim_gnc.control.contact_forces import MeasuredContacts, NetContactForce
 from snakesim_gnc.control.obstacle_triplet.stall import StallDetector, explain_stall
-from snakesim_hal.wire.messages import World
+from snakesim_hal.wire.messages import WorldModel
 from snakesim_testing.gnc.stage import make_contact, make_world, require_value
 
 
@@ -36,7 +36,7 @@ def test_forgetting_starts_a_new_window():
     assert stalled_after(stall_watch, 0.9) is None
 
 
-def world_with(*forces: tuple[str, float, float], timestamp_ns: int = 1) -> World:
+def world_with(*forces: tuple[str, float, float], timestamp_ns: int = 1) -> WorldModel:
     """Contacts with these forces in x and y."""
     contacts = [make_contact(name, (ahead_n, across_n, 0.0)) for name, ahead_n, across_n in forces]
     return make_world(contacts=contacts, contacts_timestamp_ns=timestamp_ns)

@@ -140,9 +140,9 @@ def test_controller_preflight_refuses_other_classes_with_instructions(wrong: str
 
 def test_preflight_calls_the_check_of_a_controller(tmp_path: Path) -> None:
     (tmp_path / "picky.py").write_text(
-        "from snakesim_gnc.control.hold import Hold\n"
+        "from snakesim_gnc.control.hold import HoldPose\n"
         "from snakesim_hal.base.errors import ConfigError\n\n\n"
-        "class Picky(Hold):\n"
+        "class Picky(HoldPose):\n"
         "    @classmethod\n"
         "    def check(cls, robot, parameters):\n"
         "        raise ConfigError(f'{cls.__name__} does not move {robot.robot}')\n"

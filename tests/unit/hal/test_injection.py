@@ -10,7 +10,7 @@ from docs.site.kinds_table import PAGE, with_table
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import (
     FAULT_KINDS,
-    Injection,
+    FaultInjection,
     InjectionPlan,
     describe_fault_kinds,
     parse_injection,
@@ -40,18 +40,18 @@ seconds = st.floats(0.0, 1e4).map(lambda s: round(s, 2))
 
 
 @st.composite
-def injections(draw: st.DrawFn) -> Injection:
+def injections(draw: st.DrawFn) -> FaultInjection:
     sort = draw(st.sampled_from(sorted(FAULT_KINDS)))
     name = draw(st.sampled_from(sorted(FAULT_KINDS[sort])))
     start_s = draw(seconds)
     end_s = draw(st.one_of(st.just(inf), seconds.map(lambda s: round(start_s + s + 0.01, 2))))
     amount = FAULT_KINDS[sort][name].amount
     drawn = None if amount is None else draw(st.sampled_from([amount.min_value, amount.default, amount.max_value]))
-    return Injection(name, draw(st.sampled_from(TARGETS[sort])), start_s, end_s, drawn)
+    return FaultInjection(name, draw(st.sampled_from(TARGETS[sort])), start_s, end_s, drawn)
 
 
 @given(injections())
-def test_texts_go_both_ways(injection: Injection) -> None:
+def test_texts_go_both_ways(injection: FaultInjection) -> None:
     there = parse_injection(str(injection))
     assert str(there) == str(injection)
     assert there.kind == injection.kind
@@ -97,13 +97,13 @@ def test_what_is_not_there_cannot_go_wrong() -> None:
 
 
 def test_a_request_is_checked_like_a_text() -> None:
-    assert validate_and_complete_injection(Injection("drop", keys.JOINTS)).amount == 1.0
+    assert validate_and_complete_injection(FaultInjection("drop", keys.JOINTS)).amount == 1.0
     with raises_error(ConfigError, code="injection/unknown-fault"):
-        validate_and_complete_injection(Injection("mute", "control"), "mute control")
+        validate_and_complete_injection(FaultInjection("mute", "control"), "mute control")
 
 
 @given(st.lists(injections(), max_size=8), st.lists(seconds, max_size=8))
-def test_injection_plan_yields_each_change_once_in_time_order(given_: list[Injection], looks: list[float]) -> None:
+def test_injection_plan_yields_each_change_once_in_time_order(given_: list[FaultInjection], looks: list[float]) -> None:
     plan, seen = InjectionPlan(given_), []
     for now_s in [*sorted(looks), inf]:
         due = plan.pop_due_transitions(now_s)

@@ -9,7 +9,7 @@ import pytest
 
 from docs.site.commands_page import PAGE, make_page
 from snakesim_hal.model.plugins import COMMANDS, list_installed_plugins, register_plugin_temporarily
-from snakesim_hal.programs.commands import Command, Noun
+from snakesim_hal.programs.commands import Command, CommandGroup
 from snakesim_operator.cli import CommandParser, MainParser, find_subparsers, main, make_parser
 
 MAX_COMMANDS = 25
@@ -116,7 +116,7 @@ LOWER = Command(
     add=lambda parser: parser.add_argument("mm", type=int),  # pyright: ignore[reportArgumentType]
     examples=("arm_rest lower 5", "arm_rest lower 20"),
 )
-NOUN = Noun(name="arm_rest", heading="robot", help="Move the arm rest.")
+NOUN = CommandGroup(name="arm_rest", heading="robot", help="Move the arm rest.")
 
 
 def added(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import pytest
 import serial
 
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_serial_backend.wire import USB_LATENCY_S, Pty, SerialWire, latency_s
+from snakesim_serial_backend.wire import USB_LATENCY_S, PseudoTerminal, SerialWire, latency_s
 from snakesim_testing.messages import raises_error
 
 
@@ -20,7 +20,7 @@ def test_the_latency_timer_is_the_adapters(tmp_path: Path) -> None:
 
 
 def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -> None:
-    pty, log = Pty(), tmp_path / "bytes.txt"
+    pty, log = PseudoTerminal(), tmp_path / "bytes.txt"
     with log.open("w") as file:
         wire = SerialWire(pty.path, 1_000_000, file)
         with raises_error(BackendError, code="bus/cannot-open"):
@@ -46,7 +46,7 @@ def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -
 
 
 def test_an_adapter_that_is_pulled_is_said_and_no_exception() -> None:
-    pty = Pty()
+    pty = PseudoTerminal()
     wire = SerialWire(pty.path, 57600)
     pty.close()
     wire.send(b"hello?")
@@ -63,7 +63,7 @@ def test_a_port_that_is_not_there_is_named() -> None:
 
 
 def test_serial_port_survives_a_pause_of_the_computer(monkeypatch: pytest.MonkeyPatch) -> None:
-    pty = Pty()
+    pty = PseudoTerminal()
     wire = SerialWire(pty.path, 1_000_000)
     write = serial.Serial.write
 

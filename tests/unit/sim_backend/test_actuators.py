@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.model.build import build_sim_model
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
@@ -28,10 +28,10 @@ def torque(run):
 
 def test_a_motor_without_response_time_answers_at_once():
     run = fast_run({**TWO_LINKS, "motor": {"response_time_s": 0.0}})
-    run.command(Mode.TORQUE, 0.02)
+    run.command(JointMode.TORQUE, 0.02)
     run.advance()
     assert torque(run) == pytest.approx(0.02)
-    run.command(Mode.PASSIVE)
+    run.command(JointMode.PASSIVE)
     run.advance()
     assert torque(run) == pytest.approx(0.0, abs=NOTHING)
 
@@ -44,7 +44,7 @@ def test_actuator_before_first_command_has_no_torque_at_any_speed():
         assert torque(run) == pytest.approx(0.0, abs=NOTHING)
 
 
-@pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
+@pytest.mark.parametrize("mode", [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE])
 def test_actuator_torque_stays_within_robot_and_command_limits(mode):
     run = fast_run(HEAVY_ROTOR)
     run.command(mode, -100.0, limit=50.0)
@@ -57,9 +57,9 @@ def test_actuator_torque_stays_within_robot_and_command_limits(mode):
 
 def test_actuator_lowered_limit_applies_at_motor_response():
     run = fast_run(HEAVY_ROTOR)
-    run.command(Mode.TORQUE, 6.0)
+    run.command(JointMode.TORQUE, 6.0)
     run.advance(0.2)
-    run.command(Mode.TORQUE, 6.0, limit=1.0)
+    run.command(JointMode.TORQUE, 6.0, limit=1.0)
     before = torque(run)
     for _ in range(100):
         run.advance()
@@ -71,7 +71,7 @@ def test_actuator_lowered_limit_applies_at_motor_response():
 def test_the_motor_does_not_drive_a_joint_beyond_its_speed():
     run = fast_run()
     limit = run.config.robot.limits.speed_rad_s
-    run.command(Mode.TORQUE, 3.0)
+    run.command(JointMode.TORQUE, 3.0)
     speeds, torques = [], []
     for _ in range(200):
         run.advance()
@@ -88,16 +88,16 @@ def test_actuator_below_nine_tenths_speed_has_full_torque():
     run = fast_run(HEAVY_ROTOR)
     limit = run.config.robot.limits.speed_rad_s
     run.sim.data.qvel[6] = 0.85 * limit
-    run.command(Mode.TORQUE, 7.0)
+    run.command(JointMode.TORQUE, 7.0)
     run.advance(0.1)
     assert run.sim.true_state().velocities_rad_s[0] > 0.8 * limit
     assert torque(run) == pytest.approx(7.0, rel=1e-3)
 
 
-@pytest.mark.parametrize("before", list(Mode))
-@pytest.mark.parametrize("after", list(Mode))
+@pytest.mark.parametrize("before", list(JointMode))
+@pytest.mark.parametrize("after", list(JointMode))
 def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
-    targets = {Mode.PASSIVE: 0.0, Mode.POSITION: 0.1, Mode.VELOCITY: 1.5, Mode.TORQUE: -2.0}
+    targets = {JointMode.PASSIVE: 0.0, JointMode.POSITION: 0.1, JointMode.VELOCITY: 1.5, JointMode.TORQUE: -2.0}
     run = fast_run(HEAVY_ROTOR)
     robot = run.config.robot
     run.command(before, targets[before])
@@ -107,11 +107,11 @@ def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
         state, had = run.sim.true_state(), torque(run)
         angle, speed = state.angles_rad[0], state.velocities_rad_s[0]
         demand = {
-            Mode.PASSIVE: 0.0,
-            Mode.POSITION: robot.motor.stiffness_nm_per_rad * (targets[after] - angle)
+            JointMode.PASSIVE: 0.0,
+            JointMode.POSITION: robot.motor.stiffness_nm_per_rad * (targets[after] - angle)
             - robot.motor.damping_nm_s_per_rad * speed,
-            Mode.VELOCITY: robot.motor.velocity_gain_nm_s_per_rad * (targets[after] - speed),
-            Mode.TORQUE: targets[after],
+            JointMode.VELOCITY: robot.motor.velocity_gain_nm_s_per_rad * (targets[after] - speed),
+            JointMode.TORQUE: targets[after],
         }[after]
         run.advance()
         wanted = had + (demand - had) * (1 - np.exp(-1e-3 / RESPONSE_S))
@@ -124,7 +124,7 @@ def test_very_stiff_joints_are_stable(response_s, torque_nm, speed):
     stiff = {"stiffness_nm_per_rad": 1000.0, "damping_nm_s_per_rad": 20.0, "response_time_s": response_s}
     run = SimulatorRig(make_config({"motor": stiff, "limits": {"torque_nm": torque_nm, "speed_rad_s": speed}}))
     zigzag = [0.3 * (-1) ** i for i in range(13)]
-    run.command([Mode.POSITION] * 13, zigzag)
+    run.command([JointMode.POSITION] * 13, zigzag)
     run.advance(1.0)
     assert run.sim.true_state().angles_rad == pytest.approx(zigzag, abs=1e-3)
 
@@ -138,7 +138,7 @@ def test_a_body_that_is_not_as_its_file_says():
     """Twice as heavy, motors twice as stiff; and a description that knows nothing of it."""
     plain, other = (fast_run(HEAVY_ROTOR, mass_scale=scale, motor_gain_scale=scale) for scale in (1.0, 2.0))
     for run in (plain, other):
-        run.command(Mode.POSITION, 0.01)
+        run.command(JointMode.POSITION, 0.01)
         run.advance()
     assert torque(other) == pytest.approx(2 * torque(plain), rel=1e-3)
     assert torque(plain) > 0.01

@@ -8,8 +8,8 @@ import pytest
 
 from snakesim_sim_backend.laws.directional import (
     NO_AXIS,
-    Coefficients,
-    Underside,
+    DirectionalCoefficients,
+    LinkUndersides,
     apply_directional_friction,
     combine_coefficients,
 )
@@ -21,7 +21,7 @@ STIFFNESS, DAMPING, NORMAL_N = 5000.0, 30000.0, 3.0  # of a foot of 0.3 kg, with
 UP = (0.0, 0.0, 1.0)
 
 
-def hu(min_friction: float = 0.0) -> Coefficients:
+def hu(min_friction: float = 0.0) -> DirectionalCoefficients:
     return combine_coefficients(*HU, 0.0, 0.0, min_friction)
 
 
@@ -46,7 +46,7 @@ def test_equal_coefficients_are_not_directional() -> None:
 
 def test_without_an_axis_all_directions_are_sideways() -> None:
     force = apply_directional_friction(
-        (-1.0, 2.0, 0.0), (0.0, 0.0, 0.0), NO_AXIS, Coefficients(1.0, 0.2, 0.3, 0.5, 0, 0), 0.0
+        (-1.0, 2.0, 0.0), (0.0, 0.0, 0.0), NO_AXIS, DirectionalCoefficients(1.0, 0.2, 0.3, 0.5, 0, 0), 0.0
     )
     assert force == (-0.5, 1.0, 0.0)
 
@@ -94,7 +94,7 @@ def test_underside_turns_from_link_to_link() -> None:
     config = make_config({"chain": {"modules": 3}})
     sim, data, _ = make_resting_body(config, SimSettings(), 0.4)
     lengths_m = config.robot.link_lengths_m
-    underside = Underside(data, sim.first_link_body, lengths_m)
+    underside = LinkUndersides(data, sim.first_link_body, lengths_m)
     first = sim.first_link_body
 
     def heading_rad(link: int, along_m: float) -> float:
@@ -113,7 +113,7 @@ def test_underside_turns_from_link_to_link() -> None:
 def test_sides_and_back_of_a_link_are_not_its_underside() -> None:
     config = make_config({"chain": {"modules": 3}})
     sim, data, physics = make_resting_body(config, SimSettings())
-    underside = Underside(data, sim.first_link_body, config.robot.link_lengths_m)
+    underside = LinkUndersides(data, sim.first_link_body, config.robot.link_lengths_m)
     body = sim.first_link_body + 1
     faces = []
     for roll_rad in (0.0, 0.7, 0.9, math.pi):

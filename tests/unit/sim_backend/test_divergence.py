@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 
 def test_divergence_names_tick_joint_and_value_and_keeps_last_state():
     run = SimulatorRig(make_config())
-    run.command(Mode.POSITION, 0.1)
+    run.command(JointMode.POSITION, 0.1)
     run.advance(0.1)
     good = run.sim.true_state()
     run.sim.data.qfrc_applied[6 + 4] = 1e9
@@ -33,7 +33,9 @@ def test_what_is_no_number_is_found_at_once(where, value):
         run.advance()
     samples = run.sample()
     for message in (samples.joints, *samples.by_key.values()):
-        assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message  # refuses NaN
+        assert (
+            MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
+        )  # refuses NaN
 
 
 def test_a_robot_too_quick_for_the_step_is_found_out():
@@ -42,7 +44,7 @@ def test_a_robot_too_quick_for_the_step_is_found_out():
     wild["motor"] |= {"response_time_s": 0.005}
     wild["limits"] = {"torque_nm": 1000.0, "speed_rad_s": 100.0}
     run = SimulatorRig(make_config(wild), timestep_s=0.01, contact_time_s=0.02)
-    run.command([Mode.POSITION] * 13, [0.5 * (-1) ** i for i in range(13)])
+    run.command([JointMode.POSITION] * 13, [0.5 * (-1) ** i for i in range(13)])
     with raises_error(BackendError, code="simulator/diverged"):
         run.advance(5.0)
 

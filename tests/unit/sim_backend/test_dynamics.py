@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.sim.simulator_rig import G, SimulatorRig, make_config
 
 ICE = {"ground": {"friction": 0.0}}
@@ -45,7 +45,7 @@ def test_a_writhing_snake_on_ice_keeps_its_momentum():
     run = SimulatorRig(make_config(scene=ICE), timestep_s=0.0002)
     run.sim.data.qvel[:2] = 0.3, -0.1
     start = momentum(run)
-    run.command([Mode.POSITION] * 13, [0.4 * np.sin(0.9 * i) for i in range(13)])
+    run.command([JointMode.POSITION] * 13, [0.4 * np.sin(0.9 * i) for i in range(13)])
     run.advance(1.0)
     assert np.ptp(run.sim.true_state().angles_rad) > 0.5
     assert momentum(run) == pytest.approx(start, abs=2e-3 * mass_kg(run.config) * 0.3)
@@ -62,7 +62,7 @@ def test_passive_joints_on_ice_keep_their_energy():
 def test_motors_give_the_energy_that_the_snake_has():
     run = SimulatorRig(make_config({"chain": {"modules": 3}}, ICE, rate_hz=1000))
     work = 0.0
-    run.command(Mode.TORQUE, [0.02, -0.03, 0.01])
+    run.command(JointMode.TORQUE, [0.02, -0.03, 0.01])
     for _ in range(300):
         before = run.sim.true_state().velocities_rad_s
         run.advance()
@@ -83,7 +83,7 @@ def test_towing_drags_with_friction_times_weight_in_every_direction(yaw, frictio
     run = SimulatorRig(
         config, tether={"link": 4, "direction_w": [float(np.cos(yaw)), float(np.sin(yaw))], "reel_in_m_s": 0.1}
     )
-    run.command(Mode.POSITION)
+    run.command(JointMode.POSITION)
     run.advance(1.0)
     tensions = []
     for _ in range(500):
@@ -95,7 +95,7 @@ def test_towing_drags_with_friction_times_weight_in_every_direction(yaw, frictio
 def test_a_snake_that_slides_does_not_hop():
     config = make_config(scene={"ground": {"friction": 0.1}})
     run = SimulatorRig(config, tether={"link": 13, "point_m": 0.055, "direction_w": [1.0, 0.0], "reel_in_m_s": 0.2})
-    run.command(Mode.POSITION)
+    run.command(JointMode.POSITION)
     run.advance(1.0)
     heights, tensions = [], []
     for _ in range(50):
@@ -112,7 +112,7 @@ def test_a_snake_that_slides_does_not_hop():
 def test_snake_on_slope_slides_only_beyond_friction_angle(along, tilt, slides):
     friction = 0.3
     run = SimulatorRig(make_config({"chain": {"modules": 8}}, {"ground": {"friction": friction}}))
-    run.command([Mode.POSITION] * 8, CURLED)
+    run.command([JointMode.POSITION] * 8, CURLED)
     run.advance(0.5)
     before = run.sim.true_state().base_position_w
     slope = np.arctan(friction) * tilt
@@ -139,7 +139,7 @@ def test_snake_on_slope_slides_only_beyond_friction_angle(along, tilt, slides):
 def test_sliding_along_an_obstacle_rubs_with_the_obstacle_s_friction(obstacle):
     friction = next(iter(obstacle.values()))[0]["friction"]
     run = SimulatorRig(make_config({"chain": {"modules": 4}}, {**ICE, **obstacle}))
-    run.command(Mode.POSITION)
+    run.command(JointMode.POSITION)
     data, model = run.sim.data, run.sim.sim.model
     body = model.body("link_2").id
     data.xfrc_applied[body, 1] = 8.0
@@ -161,7 +161,7 @@ def test_sliding_along_an_obstacle_rubs_with_the_obstacle_s_friction(obstacle):
 def test_contact_force_of_snake_pushed_at_peg_equals_push():
     peg = {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "name": "post"}]}
     run = SimulatorRig(make_config({"chain": {"modules": 4}}, {**ICE, **peg}))
-    run.command(Mode.POSITION)
+    run.command(JointMode.POSITION)
     body = run.sim.sim.model.body("link_2").id
     run.sim.data.xfrc_applied[body, 1] = 20.0
     run.advance(0.3)

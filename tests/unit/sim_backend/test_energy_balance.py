@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 WAVE_AMPLITUDE_RAD = 0.5
@@ -43,7 +43,7 @@ def run_wave(duration_s: float = 2.0, friction: float = SLIPPERY, rate_hz: int =
         ramp = min(time_s, 1.0)  # the wave grows within a second
         phases_rad = 2.0 * np.pi * time_s / WAVE_PERIOD_S + lags_rad
         targets_rad = ramp * WAVE_AMPLITUDE_RAD * np.sin(phases_rad)
-        rig.command(Mode.POSITION, targets_rad.tolist())
+        rig.command(JointMode.POSITION, targets_rad.tolist())
         for _ in range(round(period_s / STEP_S)):
             _add_physics_step(rig, balance)
         rig.tick += 1

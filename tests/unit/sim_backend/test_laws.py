@@ -17,7 +17,7 @@ from snakesim_native.libraries import LAWS_LIBRARY
 from snakesim_native.load import load_shared_library
 from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, SimModel, build_sim_model
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
 
@@ -92,7 +92,7 @@ class Simulation:
         self.sim: SimModel = build_sim_model(config, SimSettings(), laws=laws, measures_force=True)
         self.model = self.sim.model
         self.data = mujoco.MjData(self.model)
-        self.physics = Physics(self.sim, self.data)
+        self.physics = PhysicsStepper(self.sim, self.data)
         self.measured_force = self.physics.start_force_measurement()
 
     def go(self, state: "State", min_friction: float) -> list[Floats]:

@@ -10,8 +10,8 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Ranges
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
+from snakesim_hal.wire.messages import ColorImage, DepthImage, RangeScan
 from snakesim_sim_backend.laws.flat_ground import SINK_M
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
@@ -34,7 +34,7 @@ def newest(run, key=HEAD) -> Any:
     run.advance()
     message = run.sample().by_key[key]
     run.sim.close()
-    assert Decoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
+    assert MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
     return message
 
 
@@ -105,7 +105,7 @@ def test_depth_outside_the_range_is_not_measured():
 def test_a_lidar_measures_along_each_beam_from_right_to_left():
     scene = {"cylinder": [{"position_m": [NOSE_M + 1.0, 0.4], "radius_m": 0.2, "height_m": 1.0}]}
     scan = newest(simulate(scene, kind="range", beams=181, fov_rad=3.0), keys.ranges_key("front"))
-    assert isinstance(scan, Ranges)
+    assert isinstance(scan, RangeScan)
     angles = scan.angle_min_rad + scan.angle_step_rad * np.arange(181)
     assert (angles[0], angles[-1]) == pytest.approx((-1.5, 1.5))
     along = np.cos(angles) * 1.0 + np.sin(angles) * 0.4

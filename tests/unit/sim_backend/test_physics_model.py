@@ -11,11 +11,11 @@ from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import compute_start_pose, load_scenario
 from snakesim_hal.physics.physics_model import PhysicsModel
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.model.tether import WINCH_N_S_PER_M
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
-from snakesim_sim_backend.settings import PhysicsModelSettings, Tether
+from snakesim_sim_backend.settings import PhysicsModelSettings, TetherSettings
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
 from snakesim_testing.sim.simulator_rig import G, SimulatorRig, make_config
@@ -74,7 +74,7 @@ def through_joints_nm(physics_model, torques):
     model, data = physics_model.sim.model, mujoco.MjData(physics_model.sim.model)
     mujoco.mj_copyData(data, model, physics_model.data)
     data.qfrc_applied[6:] = torques
-    Physics(physics_model.sim, data).forward()
+    PhysicsStepper(physics_model.sim, data).forward()
     mujoco.mj_rnePostConstraint(model, data)
     through = [data.cdof[6 + i] @ data.cfrc_int[model.jnt_bodyid[1 + i]] for i in range(len(physics_model.angle_rad))]
     of_the_ground = data.qfrc_passive - data.qfrc_damper
@@ -199,7 +199,7 @@ def test_position_loop_once_a_step_equals_simulator_motors():
     worst_rad, worst_nm, max_rad, max_nm = 0.0, 0.0, 0.0, 0.0
     for k in range(1000):
         target = np.array([0.1 * np.sin(0.0063 * k - 0.8 * i) - 0.1 * np.sin(-0.8 * i) for i in range(6)])
-        run.command(Mode.POSITION, target.tolist())
+        run.command(JointMode.POSITION, target.tolist())
         run.advance()
         firmware.drive(physics_model, target)
         state = run.sim.true_state()
@@ -280,7 +280,7 @@ def test_imu_samples_equal_those_computed_every_step():
             mujoco.mj_copyData(other, model, physics_model.data)
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
             other.qfrc_applied[6:] = torques
-            Physics(physics_model.sim, other).step(1)
+            PhysicsStepper(physics_model.sim, other).step(1)
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         physics_model.advance(torques)
     imu = physics_model.imu()
@@ -319,7 +319,7 @@ def test_the_pose_is_true_and_of_now():
 
 def test_physics_model_is_towed_by_a_tether():
     physics_model = make_physics_model(
-        make_config(FOUR), tether=Tether(link=4, direction_w=(1.0, 0.0), reel_in_m_s=0.1)
+        make_config(FOUR), tether=TetherSettings(link=4, direction_w=(1.0, 0.0), reel_in_m_s=0.1)
     )
     pass_time(physics_model, seconds=1.0)
     friction = 0.3 * 4 * 0.3 * G

@@ -5,9 +5,9 @@ from math import inf
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Mode, Power, SensorDescription
+from snakesim_hal.wire.messages import JointMode, Power, SensorDescription
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
@@ -16,8 +16,8 @@ from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 WITH = {"sensors!": {"joints": {}, "power": {"rate_hz": 5.0}}}
 
 
-def overheat(end_s: float = inf) -> Injection:
-    return Injection("overheat", "joint_3", 0.0, end_s)
+def overheat(end_s: float = inf) -> FaultInjection:
+    return FaultInjection("overheat", "joint_3", 0.0, end_s)
 
 
 def test_power_sample_keeps_its_rate_and_starts_at_ambient():
@@ -41,7 +41,7 @@ def test_power_sample_keeps_its_rate_and_starts_at_ambient():
 def test_a_motor_that_works_gets_warm_and_takes_current():
     run = SimulatorRig(make_config(WITH))
     run.sample()
-    run.command(Mode.TORQUE, [3.5, *[0.0] * (run.count - 1)])
+    run.command(JointMode.TORQUE, [3.5, *[0.0] * (run.count - 1)])
     run.advance(6.0)
     power = run.sample_only_sensor(Power)
     # The joint turns to its stop and pushes; 3.5 of 7 N·m settle at 80 °C, by a time constant of a minute.

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
+from snakesim_hal.wire.messages import Contacts, Imu, JointMode, Pose
 from snakesim_sim_backend.sensors.timing import SamplingSchedule
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
@@ -20,7 +20,7 @@ def pushed(sensors=None, **top):
     """A bent snake that is pushed at a peg."""
     robot = {"chain": {"modules": 6}, "sensors": sensors or {}}
     run = SimulatorRig(make_config(robot, CORNER, **top))
-    run.command([Mode.POSITION] * 6, [0.1, -0.2, 0.3, 0.1, -0.2, 0.3])
+    run.command([JointMode.POSITION] * 6, [0.1, -0.2, 0.3, 0.1, -0.2, 0.3])
     run.sim.data.xfrc_applied[run.sim.sim.model.body("link_2").id, 1] = 15.0
     return run
 
@@ -40,7 +40,7 @@ def frames_of(run):
 def test_links_are_where_the_published_pose_and_angles_say(robot):
     run = SimulatorRig(make_config(base_robot=robot))
     n = run.count
-    run.command([Mode.POSITION] * n, [0.3 * np.sin(i) for i in range(n)])
+    run.command([JointMode.POSITION] * n, [0.3 * np.sin(i) for i in range(n)])
     run.advance(0.3)
     _, origins, rotations = frames_of(run)
     data, model = run.sim.data, run.sim.sim.model
@@ -85,7 +85,7 @@ def test_imu_on_spinning_snake_measures_centripetal_acceleration():
     spin, middle = 2.0, 13 * 0.11 / 2
     run.sim.data.qvel[5] = spin
     run.sim.data.qvel[1] = -spin * middle  # about its center
-    run.command(Mode.POSITION)
+    run.command(JointMode.POSITION)
     run.advance(0.02)
     imu = run.sample_only_sensor(Imu)
     lengths = np.array(run.config.robot.link_lengths_m)

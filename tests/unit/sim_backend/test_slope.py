@@ -14,7 +14,7 @@ from snakesim_hal.wire.messages import Imu
 from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_sim_backend.model.build import build_sim_model
 from snakesim_sim_backend.model.mjcf import export_mjcf
-from snakesim_sim_backend.physics import Physics
+from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
 from snakesim_testing.hal.small_robots import SCENE
@@ -35,7 +35,7 @@ class Sled:
         self.data = MjData(sim.model)
         self.data.qpos[2] = config.robot.module.radius_m
         self._step_s = sim.model.opt.timestep
-        self._physics = Physics(sim, self.data)
+        self._physics = PhysicsStepper(sim, self.data)
         self._physics.reset()
 
     def advance(self, seconds: float) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.model.scenario import compute_start_pose, load_scenario
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.laws.flat_ground import SINK_M
 from snakesim_sim_backend.model.ground import make_heights
 from snakesim_testing.sim.hilly_start import CURVE, HILLS
@@ -26,7 +26,7 @@ def deepest_m(run):
 def stays(run, seconds=1.0, within_m=2e-3):
     """Holding the angles of its start, the snake does not move any more."""
     start = run.sim.true_state()
-    run.command([Mode.POSITION] * run.count, compute_start_pose(run.config).angles_rad.tolist())
+    run.command([JointMode.POSITION] * run.count, compute_start_pose(run.config).angles_rad.tolist())
     run.advance(seconds)
     end = run.sim.true_state()
     assert np.linalg.norm(end.base_position_w - start.base_position_w) < within_m

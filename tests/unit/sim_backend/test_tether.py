@@ -3,7 +3,7 @@
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config, open_sim
 
@@ -14,7 +14,7 @@ BACKWARD = {"link": 0, "point_m": 0.0, "direction_w": [-1.0, 0.0]}
 def pulled(force, tether=BACKWARD):
     """A stiff snake on ice that hangs on a rope, if on any, and is pulled at link 2."""
     run = SimulatorRig(make_config({"chain": {"modules": 4}}, ICE), tether=tether)
-    run.command(Mode.POSITION)
+    run.command(JointMode.POSITION)
     run.sim.data.xfrc_applied[run.sim.sim.model.body("link_2").id, :3] = force
     return run
 

@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.model.measured_force import MeasuredForce
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.batch.placed import create_settled_robot
 from snakesim_sim_backend.laws.version import LawsVersion, choose_laws
@@ -41,7 +41,9 @@ def test_the_state_has_the_forces_that_python_reads(name: str) -> None:
     touched = 0
     for step in range(STEPS):
         if step % 30 == 0:
-            placed.motors.set_inputs([Mode.POSITION] * joints, random.uniform(-1.2, 1.2, joints).tolist(), limits_nm)
+            placed.motors.set_inputs(
+                [JointMode.POSITION] * joints, random.uniform(-1.2, 1.2, joints).tolist(), limits_nm
+            )
         placed.physics.step(1)
         expected = [[touch.link, *touch.force_w] for touch in placed.contact_reader.read()]
         assert placed.read_obstacle_contacts() == expected
@@ -58,7 +60,7 @@ class MeasuringRobot:
         self.step_s: float = self.backend.sim.model.opt.timestep
         self.touches = ObstacleContactReader(self.backend.sim, self.backend.data, self.backend.physics.contacts)
         self.measured_force = self.backend.physics.start_force_measurement()
-        self._modes = [Mode.POSITION] * config.robot.chain.modules
+        self._modes = [JointMode.POSITION] * config.robot.chain.modules
         self._limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
         self._random = np.random.default_rng(1)
 

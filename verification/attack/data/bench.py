@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_sim_backend.backend import SimBackend
 
 
@@ -16,6 +16,6 @@ class Bench(SimBackend):
         super().__init__(config, settings)
         self._real = msgspec.structs.replace(super().describe(), backend="bench", emulated=False)
 
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         """A robot that really moves."""
         return self._real

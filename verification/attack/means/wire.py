@@ -14,7 +14,7 @@ _ROW = re.compile(r"^\| `(?P<key>[^`]+)` \|(?P<rest>.*)\|$")
 _MESSAGE = re.compile(r"`snakesim\.(\w+)/\d+`")
 
 
-class Row(NamedTuple):
+class DocumentedKey(NamedTuple):
     """One line of schemas/keys.md."""
 
     key: str
@@ -22,15 +22,15 @@ class Row(NamedTuple):
     kind: str
 
 
-def _rows() -> dict[str, Row]:
-    found: dict[str, Row] = {}
+def _rows() -> dict[str, DocumentedKey]:
+    found: dict[str, DocumentedKey] = {}
     for line in (SCHEMAS / "keys.md").read_text(encoding="utf-8").splitlines():
         if (row := _ROW.match(line)) is None:
             continue
         message = _MESSAGE.search(row["rest"])
         cells = {cell.strip() for cell in row["rest"].split("|")}
         kind = next(iter(cells & {"stream", "latched", "query", "liveliness"}))
-        found[row["key"]] = Row(row["key"], message and message[1], kind)
+        found[row["key"]] = DocumentedKey(row["key"], message and message[1], kind)
     return found
 
 

@@ -9,19 +9,19 @@ from contextlib import AbstractContextManager
 from functools import partial
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Mode
+from snakesim_hal.wire.messages import EstopRequest, JointMode, LifecycleRequest
 from verification.attack.means import datagrams
 from verification.attack.means.floods import end, flood, half_open
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import Robot, recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.robot import ProcessRobot, recovered, robot
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 HALF_OPEN, IDLE, READERS, QUERIES, SAMPLES = 300, 1000, 300, 10_000, 10_000
 ANSWER_S = 10.0
 TRIES = 20  # to find the robot armed under a flood before it is stopped
 STANDING = {"controller": "hold", "rate_hz": 50}
 
-Flood = Callable[[Robot], AbstractContextManager[object]]
+Flood = Callable[[ProcessRobot], AbstractContextManager[object]]
 
 
 def _flooding(kind: str, amount: int, processes: int) -> Flood:
@@ -37,7 +37,7 @@ FLOODS: dict[str, Flood] = {
 }
 
 
-def stopped_under(name: str, request: Request) -> Iterator[Trial]:
+def stopped_under(name: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """The value: from the request of the stop to the setpoints of the stop, by the host's private channel."""
     with robot(request, **STANDING) as (started_robot, observer), FLOODS[name](started_robot):
         for number in range(request.trials):
@@ -45,7 +45,7 @@ def stopped_under(name: str, request: Request) -> Iterator[Trial]:
     _explain(request)
 
 
-def stopped_while_readers_leave(request: Request) -> Iterator[Trial]:
+def stopped_while_readers_leave(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """The same, with many readers of everything that leave together just before."""
     with robot(request, **STANDING) as (started_robot, observer):
         for number in range(request.trials):
@@ -56,7 +56,7 @@ def stopped_while_readers_leave(request: Request) -> Iterator[Trial]:
     _explain(request)
 
 
-def _explain(request: Request) -> None:
+def _explain(request: MeasurementRequest) -> None:
     request.note(
         "requested in turn by a query on a session that was there before, and by a datagram; 50 Hz, controller `hold`; "
         "reported over the host's private channel, and a period (20 ms) added, in which the setpoints go out"
@@ -64,13 +64,13 @@ def _explain(request: Request) -> None:
 
 
 def _stopped(
-    request: Request,
-    started_robot: Robot,
+    request: MeasurementRequest,
+    started_robot: ProcessRobot,
     observer: Observer,
     *,
     by_datagram: bool,
     before: Callable[[], object] | None = None,
-) -> Trial:
+) -> InjectionTrial:
     for _ in range(TRIES):
         if observer.state() != "armed":
             observer.arm(60.0)
@@ -104,7 +104,7 @@ def _stopped(
 # --- a second run --------------------------------------------------------------------------------------------------
 
 
-def second_run(request: Request) -> Iterator[Trial]:
+def second_run(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """A person disarmed the robot; a second `snakesim run` starts on its network. The value: setpoints that move."""
     command = [
         sys.executable,
@@ -132,8 +132,8 @@ def second_run(request: Request) -> Iterator[Trial]:
             failures: list[str] = []
             if second.returncode not in (1, 2) or started_robot.config.robot.name not in second.stdout:
                 failures.append(f"the second run ended with {second.returncode}: {second.stdout[-300:]}")
-            moving = sum(any(mode is not Mode.PASSIVE for mode in h.message.mode) for h in observer.applied)
+            moving = sum(any(mode is not JointMode.PASSIVE for mode in h.message.mode) for h in observer.applied)
             if observer.state() != "disarmed":
                 failures.append(f"the robot is {observer.in_words()}")
-            yield Trial(value=float(moving), failure="; ".join(failures))
+            yield InjectionTrial(value=float(moving), failure="; ".join(failures))
         request.note("in turn on the robot's network (`--router`) and at its endpoint (`--endpoint`)")

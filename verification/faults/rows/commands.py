@@ -15,8 +15,8 @@ from snakesim_testing.hal.authority_rig import ROBOT, make_armed_rig
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, make_joint_command
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import robot
-from verification.faults.row import Request, Trial
-from verification.faults.stranger import FORGED, Stranger
+from verification.faults.row import InjectionTrial, MeasurementRequest
+from verification.faults.stranger import FORGED, CommandForger
 
 EACH = 3  # of every kind in a trial
 COUNTED_S = 1.5  # until the status must have counted them
@@ -26,10 +26,10 @@ MOVES = 4  # of two writers in one interleaving
 Kinds = Mapping[str, tuple[Callable[[], None], str]]  # name -> how it is sent, and the reason that it is counted by
 
 
-def out_of_time(request: Request) -> Iterator[Trial]:
+def out_of_time(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """With the lease's own epoch, so that nothing but their time is wrong."""
 
-    def kinds(stranger: Stranger) -> Kinds:
+    def kinds(stranger: CommandForger) -> Kinds:
         return {
             "stale": (partial(stranger.out_of_time, -20), "stale"),
             "replayed": (partial(stranger.again, 20), "replayed"),
@@ -42,10 +42,10 @@ def out_of_time(request: Request) -> Iterator[Trial]:
     yield from _among_good_ones(request, kinds)
 
 
-def wrong_in_itself(request: Request) -> Iterator[Trial]:
+def wrong_in_itself(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """With the lease's own epoch and the right time, so that only what they hold is wrong."""
 
-    def kinds(stranger: Stranger) -> Kinds:
+    def kinds(stranger: CommandForger) -> Kinds:
         return {
             "NaN": (partial(stranger.number, float("nan")), "malformed"),
             "infinity": (partial(stranger.number, float("inf")), "malformed"),
@@ -64,9 +64,9 @@ def wrong_in_itself(request: Request) -> Iterator[Trial]:
     )
 
 
-def _among_good_ones(request: Request, make: Callable[[Stranger], Kinds]) -> Iterator[Trial]:
+def _among_good_ones(request: MeasurementRequest, make: Callable[[CommandForger], Kinds]) -> Iterator[InjectionTrial]:
     with robot(request) as (started_robot, observer):
-        stranger = Stranger(observer)
+        stranger = CommandForger(observer)
         kinds = make(stranger)
         for _ in range(request.trials):
             started_robot.set_in_motion(observer)
@@ -77,7 +77,7 @@ def _among_good_ones(request: Request, make: Callable[[Stranger], Kinds]) -> Ite
         request.note(f"in each trial {EACH} of each kind among the controller's own; counted as {each}")
 
 
-def _bombarded(observer: Observer, stranger: Stranger, kinds: Kinds) -> Trial:
+def _bombarded(observer: Observer, stranger: CommandForger, kinds: Kinds) -> InjectionTrial:
     """Send some of each kind among the controller's commands; how many were not refused and counted."""
     before = _counts(observer)
     for _ in range(EACH):
@@ -94,7 +94,7 @@ def _bombarded(observer: Observer, stranger: Stranger, kinds: Kinds) -> Trial:
     return _judged(observer, uncounted, [])
 
 
-def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], failures: list[str]) -> Trial:
+def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], failures: list[str]) -> InjectionTrial:
     """How many setpoints got through; a failure besides `failures` when not all are counted, or the robot stopped."""
     try:
         observer.until(lambda: not uncounted(), "all counted", COUNTED_S)
@@ -103,7 +103,7 @@ def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], failures:
     observer.watch(0.05)
     if observer.state() != "armed":
         failures.append(f"the robot stopped: {observer.in_words()}")
-    return Trial(value=float(applied_of_others(observer)), failure="; ".join(failures))
+    return InjectionTrial(value=float(applied_of_others(observer)), failure="; ".join(failures))
 
 
 def _counts(observer: Observer) -> Counter[str]:
@@ -119,10 +119,10 @@ def applied_of_others(observer: Observer) -> int:
     return forged + back
 
 
-def second_controller(request: Request) -> Iterator[Trial]:
+def second_controller(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """A second one asks for the lease, is refused, and commands all the same."""
     with robot(request) as (started_robot, observer):
-        stranger, answered_ms = Stranger(observer), list[float]()
+        stranger, answered_ms = CommandForger(observer), list[float]()
         for _ in range(request.trials):
             started_robot.set_in_motion(observer)
             yield _second(observer, stranger, answered_ms)
@@ -133,7 +133,7 @@ def second_controller(request: Request) -> Iterator[Trial]:
         )
 
 
-def _second(observer: Observer, stranger: Stranger, answered_ms: list[float]) -> Trial:
+def _second(observer: Observer, stranger: CommandForger, answered_ms: list[float]) -> InjectionTrial:
     before = _counts(observer)
     request_start_s = time.monotonic()
     answer = observer.ask(keys.LEASE, LeaseRequest(action="acquire", holder="second"))
@@ -150,12 +150,12 @@ def _second(observer: Observer, stranger: Stranger, answered_ms: list[float]) ->
     return _judged(observer, lambda: expected - (_counts(observer) - before), failures)
 
 
-def interleaved(request: Request) -> Iterator[Trial]:
+def interleaved(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Two writers at one authority, in an order by chance; the first has the lease and keeps commanding."""
     each = INTERLEAVINGS // request.trials
     for number in range(request.trials):
         writers = TwoWriters(random.Random(number))
-        yield Trial(value=float(sum(writers.interleave() for _ in range(each))))
+        yield InjectionTrial(value=float(sum(writers.interleave() for _ in range(each))))
     request.note(
         f"{each * request.trials} interleavings of {MOVES} moves each, by seed, at the limiter that stands before both "
         f"backends"

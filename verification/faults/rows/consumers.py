@@ -16,14 +16,14 @@ from verification.attack.means.floods import flood
 from verification.faults.consumer import STUCK
 from verification.faults.observer import Observer
 from verification.faults.robot import robot
-from verification.faults.row import Request, Trial
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 WINDOW_S = 0.5
 FROZEN, FROZEN_WINDOW_S = 4, 1.0  # 20 such windows outlast Zenoh's lease of a link
 FROZEN_HZ = {"sim": 200.0, "can": 100.0}  # what one bus carries
 
 
-def cannot_keep_up(kind: str, request: Request) -> Iterator[Trial]:
+def cannot_keep_up(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """kind: `sleep` in the callback, or `disk` that is full.
 
     A cycle is missed when the setpoints of a tick are those of the tick before: no command had come for it. The value:
@@ -46,7 +46,7 @@ def cannot_keep_up(kind: str, request: Request) -> Iterator[Trial]:
 sleeps, disk_full = (partial(cannot_keep_up, kind) for kind in ("sleep", "disk"))
 
 
-def frozen_readers(request: Request) -> Iterator[Trial]:
+def frozen_readers(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Readers of everything whose processes are stopped, and stay. The value: as above, in windows of a second.
 
     Their buffers are small and full at once, so a process that waits for them stops.
@@ -69,13 +69,13 @@ def frozen_readers(request: Request) -> Iterator[Trial]:
         )
 
 
-def _beside_it(observer: Observer, more_missed: int) -> Trial:
+def _beside_it(observer: Observer, more_missed: int) -> InjectionTrial:
     """Of a window; a robot that has stopped in it is armed again."""
     failure = ""
     if observer.state() != "armed":
         failure = f"the robot stopped: {observer.in_words()}"
         observer.arm()
-    return Trial(value=float(max(more_missed, 0)), failure=failure)
+    return InjectionTrial(value=float(max(more_missed, 0)), failure=failure)
 
 
 def _missed(observer: Observer, window_s: float = WINDOW_S) -> int:

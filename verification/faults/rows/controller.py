@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from signal import SIGCONT, SIGKILL, SIGSTOP
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, Robot, recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.robot import START_LIMIT_S, ProcessRobot, recovered, robot
+from verification.faults.row import InjectionTrial, MeasurementRequest
 from verification.faults.stranger import send_raw
 
 HANG_S = 0.5
@@ -17,11 +17,11 @@ REFUSED_S = 1.5  # until the status must have counted them
 UNDER_WAY_S = 0.1  # until what a dead host has sent has come
 LATCHED_S = 0.15  # how long a fault must be seen to stay, with a controller that commands again
 
-Fail = Callable[[Robot, Observer], int]
-Mend = Callable[[Robot], object]
+Fail = Callable[[ProcessRobot, Observer], int]
+Mend = Callable[[ProcessRobot], object]
 
 
-def _trial(started_robot: Robot, observer: Observer, fail: Fail, mend: Mend) -> Trial:
+def _trial(started_robot: ProcessRobot, observer: Observer, fail: Fail, mend: Mend) -> InjectionTrial:
     started_robot.set_in_motion(observer)
     failed_ns = fail(started_robot, observer)
     value = observer.safe_after_ms(failed_ns)
@@ -40,14 +40,14 @@ def _trial(started_robot: Robot, observer: Observer, fail: Fail, mend: Mend) -> 
     return recovered(observer, value, "; ".join(failures))
 
 
-def _failing(fail: Fail, mend: Mend, request: Request) -> Iterator[Trial]:
+def _failing(fail: Fail, mend: Mend, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """fail: when it began, by the monotonic clock; mend: before the operator resets."""
     with robot(request) as (started_robot, observer):
         for _ in range(request.trials):
             yield _trial(started_robot, observer, fail, mend)
 
 
-def _hang(_made: Robot, observer: Observer) -> int:
+def _hang(_made: ProcessRobot, observer: Observer) -> int:
     """Its interpreter is busy, by the injector."""
     now_ns = time.monotonic_ns()
     observer.inject("control", "hang", "control", for_s=HANG_S)
@@ -67,7 +67,7 @@ frozen = partial(
 suspended = partial(_failing, _hang, lambda _: None)
 
 
-def host_restarts(request: Request) -> Iterator[Trial]:
+def host_restarts(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """The host is killed while moving and started again; what was streamed before is sent to the new one.
 
     The value: setpoints of the new host that were not passive, before an operator armed it.
@@ -87,7 +87,7 @@ def host_restarts(request: Request) -> Iterator[Trial]:
             failures = _objections(observer, streamed)
             if observer.status is None or 0 < observer.status.lease_epoch <= epoch:
                 failures.append(f"the lease's epoch did not grow from {epoch}: {observer.in_words()}")
-            moved = sum(set(h.message.mode) != {Mode.PASSIVE} for h in observer.applied)
+            moved = sum(set(h.message.mode) != {JointMode.PASSIVE} for h in observer.applied)
             yield recovered(observer, float(moved), "; ".join(failures))
         request.note(f"in each trial {REPLAYED} commands of before were sent to the new host")
 

@@ -13,15 +13,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig, write_config
 from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_operator.run import children
 from snakesim_testing.harness.wait import wait_until
 from verification.faults.drives_process import READY
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, Robot, configuration, recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.robot import START_LIMIT_S, ProcessRobot, configuration, recovered, robot
+from verification.faults.row import InjectionTrial, MeasurementRequest
 from verification.faults.rows import modules
 
 RATE_HZ = 50.0
@@ -97,7 +97,7 @@ class DrivesOutside:
         children.stop_children([self._child])
 
 
-def host_frozen(request: Request) -> Iterator[Trial]:
+def host_frozen(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """SIGSTOP for the host, for 1 s. The value: drives that are enabled at any time before the reset."""
     _use_loopback()
     config = robot_of(request.backend, backend__pose_listen=POSE, **BUSES[request.backend])
@@ -123,7 +123,10 @@ def host_frozen(request: Request) -> Iterator[Trial]:
 
 
 def _set_in_motion(
-    request: Request, started_robot: Robot, observer: Observer, is_ready: Callable[[], bool] = lambda: True
+    request: MeasurementRequest,
+    started_robot: ProcessRobot,
+    observer: Observer,
+    is_ready: Callable[[], bool] = lambda: True,
 ) -> None:
     """Repeat a trial if the robot stops by itself: a bus of emulated drives is late on a busy computer."""
     for _ in range(MAX_RETRIES):
@@ -135,7 +138,7 @@ def _set_in_motion(
     raise TrialError(f"this machine is too busy: the robot stopped by itself {MAX_RETRIES} times")
 
 
-def _frozen(started_robot: Robot, observer: Observer, drives: DrivesOutside) -> tuple[Trial, float]:
+def _frozen(started_robot: ProcessRobot, observer: Observer, drives: DrivesOutside) -> tuple[InjectionTrial, float]:
     """Return a trial, and how long after the signal the last drive was off."""
     stopped_ns = started_robot.signal("host", signal.SIGSTOP)
     try:
@@ -167,7 +170,7 @@ def _unnamed(observer: Observer) -> list[str]:
     return [f"not reported: {', '.join(missing)}"] if missing else []
 
 
-def _buses_in_words(request: Request) -> str:
+def _buses_in_words(request: MeasurementRequest) -> str:
     buses = [name for values in BUSES[request.backend].values() for name in values]
     return " and ".join("a pseudo terminal" if name == SERVOS else "UDP multicast" for name in buses)
 
@@ -181,7 +184,7 @@ def _use_loopback() -> None:
 # --- a drive, or its bus ---------------------------------------------------------------------------------------
 
 
-def at_host(kind: str, expected: dict[str, Sequence[str]], request: Request) -> Iterator[Trial]:
+def at_host(kind: str, expected: dict[str, Sequence[str]], request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Inject a fault of joint_N or bus_1 into the host whose process emulates the drives.
 
     expected: names that the driver of each type gives it. The value: from its beginning to the stop mode.
@@ -194,5 +197,5 @@ def at_host(kind: str, expected: dict[str, Sequence[str]], request: Request) -> 
         for _ in range(request.trials):
             _set_in_motion(request, started_robot, observer)
             target = "bus_1" if kind in modules.BUS_KINDS else f"joint_{rng.randrange(joints) + 1}"
-            yield modules.injected(observer, Injection(kind, target), what, PERIOD_MS)
+            yield modules.injected(observer, FaultInjection(kind, target), what, PERIOD_MS)
     request.note(f"the real host process at {RATE_HZ:g} Hz, drives emulated in it; counted in its periods")

@@ -16,16 +16,16 @@ from functools import partial
 from pathlib import Path
 
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, parse_node
-from snakesim_hal.model.scenario import Override, load_scenario
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.model.scenario import KeyOverride, load_scenario
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.programs import host_program as host_process
 from snakesim_testing.can.listened_bus import (
     JOINTS,
     NODES,
     RATE_HZ,
     SCENARIO,
-    Bench,
     ReceivedFrame,
+    RobotOnBus,
     bench,
     first_in,
     passed_for_module_ms,
@@ -34,8 +34,8 @@ from snakesim_testing.can.listened_bus import (
 from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
 from snakesim_testing.hal.small_robots import write_scenario_files
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, Robot, robot
-from verification.faults.row import Request, Trial
+from verification.faults.robot import START_LIMIT_S, ProcessRobot, robot
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 CHANNEL = "vcan0"
 ARM_LIMIT_S = 120.0
@@ -49,14 +49,14 @@ AFTER_STEP_S = 1.0
 ATTEMPTS = 3
 
 
-def host_gone(number: signal.Signals, request: Request) -> Iterator[Trial]:
+def host_gone(number: signal.Signals, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """SIGKILL or SIGSTOP for the host. The value: from the last setpoint to the fault, in the module's own time."""
     rng, by_kernel_ms, done = random.Random(7), list[float](), 0
     with bench(request.folder, CHANNEL) as robot:
         robot.modules()
         robot.control()
         while done < request.trials:
-            trial: Trial | None = None
+            trial: InjectionTrial | None = None
             try:
                 with _armed_host(request, robot) as pid:
                     robot.listener.forget()
@@ -81,7 +81,9 @@ def host_gone(number: signal.Signals, request: Request) -> Iterator[Trial]:
 host_killed, host_frozen = (partial(host_gone, number) for number in (signal.SIGKILL, signal.SIGSTOP))
 
 
-def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: list[float]) -> Trial | None:
+def _left_alone(
+    robot: RobotOnBus, pid: int, number: signal.Signals, by_kernel_ms: list[float]
+) -> InjectionTrial | None:
     """None: the robot had stopped already when the signal came."""
     listener, fault = robot.listener, {ModuleState.FAULT}
     now_ns = time.time_ns()
@@ -92,7 +94,9 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
         return None
     stopped = first_in(received, fault, now_ns)
     if len(stopped) < JOINTS:
-        return Trial(value=None, failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}")
+        return InjectionTrial(
+            value=None, failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}"
+        )
     by_kernel_ms.append(max(h.at_ns for h in stopped.values()) / 1e6 - now_ns / 1e6)
     failures: list[str] = []
     causes = {h.decode()["last_stop"] for h in stopped.values() if h.opcode == Opcode.HEARTBEAT}
@@ -102,7 +106,7 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
     for node in NODES:
         points = [h.at_ns for h in received if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node]
         own_ms.append(passed_for_module_ms(received, node, max(points), stopped[node].at_ns))
-    return Trial(value=max(own_ms), failure="; ".join(failures), recovered=True)
+    return InjectionTrial(value=max(own_ms), failure="; ".join(failures), recovered=True)
 
 
 def _went_well_until(received: Sequence[ReceivedFrame], now_ns: int) -> bool:
@@ -113,14 +117,14 @@ def _went_well_until(received: Sequence[ReceivedFrame], now_ns: int) -> bool:
 
 
 @contextlib.contextmanager
-def _armed_host(request: Request, robot: Bench) -> Iterator[int]:
+def _armed_host(request: MeasurementRequest, robot: RobotOnBus) -> Iterator[int]:
     """A host in a process of its own, once it has armed every module."""
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload([__name__])
     process = processes.Process(target=_become_host, args=(robot.host_arguments, robot.folder))
     process.start()
     try:
-        link = Link(robot.endpoint, robot.config.robot.name)
+        link = ConnectionSettings(robot.endpoint, robot.config.robot.name)
         with open_session(link, connect_timeout_s=ARM_LIMIT_S) as session:
             _arm(request, robot, Observer(session))
             assert process.pid is not None
@@ -130,7 +134,7 @@ def _armed_host(request: Request, robot: Bench) -> Iterator[int]:
         process.join()
 
 
-def _arm(request: Request, robot: Bench, observer: Observer) -> None:
+def _arm(request: MeasurementRequest, robot: RobotOnBus, observer: Observer) -> None:
     """Until every module says that it is armed. Looks rarely: this machine is slow, and modules and host need it."""
     deadline = time.monotonic() + ARM_LIMIT_S
     while robot.listener.states() != [ModuleState.ARMED] * JOINTS:
@@ -153,7 +157,7 @@ def _become_host(arguments: Sequence[str], folder: Path) -> None:
     sys.exit(host_process.main([*arguments, "--parent", str(os.getppid())]))
 
 
-def watchdog(request: Request) -> Iterator[Trial]:
+def watchdog(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """A module whose host is silent from some instant on. The value: until it is passive, in its own exact time."""
     rng = random.Random(8)
     for _ in range(request.trials):
@@ -170,19 +174,19 @@ def watchdog(request: Request) -> Iterator[Trial]:
             now_us += MS / 10
             module.poll(now_us)
         failure = "" if module.state == ModuleState.FAULT else f"it is {module.state.name}"
-        yield Trial(value=(now_us - last_us) / MS, failure=failure)
+        yield InjectionTrial(value=(now_us - last_us) / MS, failure=failure)
 
 
-def clock_step(request: Request) -> Iterator[Trial]:
+def clock_step(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """An hour ahead, then an hour back, while a robot moves at 25 Hz. The value: faults and stops."""
     scenario = write_scenario_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
     settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
     config = load_scenario(
-        scenario, [Override(key, value, "the fault table") for key, value in settings.items()]
+        scenario, [KeyOverride(key, value, "the fault table") for key, value in settings.items()]
     ).config
     with robot(request, config) as (started_robot, observer):
         for number in range(request.trials):
-            trial = Trial(value=None)
+            trial = InjectionTrial(value=None)
             for _ in range(ATTEMPTS):
                 trial = _stepped(started_robot, observer, STEP_S if number % 2 == 0 else -STEP_S)
                 if trial.value == 0:
@@ -199,7 +203,7 @@ def clock_step(request: Request) -> Iterator[Trial]:
     )
 
 
-def _stepped(started_robot: Robot, observer: Observer, by_s: float) -> Trial:
+def _stepped(started_robot: ProcessRobot, observer: Observer, by_s: float) -> InjectionTrial:
     while observer.state() != "armed":
         observer.arm(START_LIMIT_S)
     observer.watch(LIVE_S + started_robot.random.random() / RATE_HZ)
@@ -211,7 +215,7 @@ def _stepped(started_robot: Robot, observer: Observer, by_s: float) -> Trial:
     failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
     if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
         failure = failure or f"only {len(observer.applied)} setpoints received of in {AFTER_STEP_S:g} s"
-    return Trial(value=float(faults + stops), failure=failure)
+    return InjectionTrial(value=float(faults + stops), failure=failure)
 
 
 def _step_clock(by_s: float) -> None:

@@ -6,17 +6,17 @@ from collections.abc import Iterator
 from typing import Any
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, LifecycleRequest, Mode
-from verification.faults.observer import Observer, Received, TrialError
+from snakesim_hal.wire.messages import AppliedCommand, JointMode, LifecycleRequest
+from verification.faults.observer import Observer, ReceivedMessage, TrialError
 from verification.faults.robot import recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 FAULT_DURATION_S = 0.3
 MORE_S = 0.1  # that the others are watched for, when the joint is sound again
 MAY_LOSE_ONE: dict[str, Any] = {"robot__safety__max_isolated_joints": 1}
 
 
-def set_aside(kind: str, request: Request) -> Iterator[Trial]:
+def set_aside(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """The value: from the request to the injector to the first setpoints that leave the joint passive."""
     rng = random.Random(7)
     with robot(request, **MAY_LOSE_ONE) as (started_robot, observer):
@@ -33,11 +33,11 @@ def set_aside(kind: str, request: Request) -> Iterator[Trial]:
             yield recovered(observer, value, "; ".join(failures))
 
 
-def _let_go(observer: Observer, joint: int, since_ns: int) -> Received[AppliedCommand]:
+def _let_go(observer: Observer, joint: int, since_ns: int) -> ReceivedMessage[AppliedCommand]:
     """The first setpoints without the joint; by the controller, not by the host alone."""
 
-    def found() -> list[Received[AppliedCommand]]:
-        passive = (h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint] is Mode.PASSIVE)
+    def found() -> list[ReceivedMessage[AppliedCommand]]:
+        passive = (h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint] is JointMode.PASSIVE)
         return [received for received in passive if received.message.sequence is not None]
 
     return observer.until(found, "the joint is let go", 3.0)[0]

@@ -10,12 +10,12 @@ import time
 from collections.abc import Iterator, Sequence
 
 from snakesim_can_backend.protocol.definitions import CommandAction
-from snakesim_hal.model.fault_kinds import Injection, validate_and_complete_injection
-from snakesim_hal.wire.messages import Answer, Status
+from snakesim_hal.model.fault_kinds import FaultInjection, validate_and_complete_injection
+from snakesim_hal.wire.messages import Answer, RobotStatus
 from verification.faults import bus_log
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, Robot, configuration, recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.robot import START_LIMIT_S, ProcessRobot, configuration, recovered, robot
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 PERIOD_MS = 10.0
 FAULT_DURATION_S = 0.3
@@ -27,7 +27,7 @@ BUS_LOG = "bus.log"
 ROBOT_TIME_PATTERN = re.compile(r"at ([0-9.]+) s of robot time")
 
 
-def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
+def at_host(kind: str, what: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Inject a fault of joint_N or bus_1 on CAN into the host. what: the name that the driver gives it.
 
     The value: from its beginning, which is just before a Sync, to the stop mode, which goes out where the setpoints
@@ -38,7 +38,7 @@ def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
         for _ in range(request.trials):
             started_robot.set_in_motion(observer)
             number = rng.randrange(len(observer.description().joints)) + 1
-            injection = Injection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}")
+            injection = FaultInjection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}")
             yield injected(observer, injection, [what], PERIOD_MS)
     stops = bus_log.commands(bus_log.read(log), CommandAction.STOP)
     if kind not in CUT_OFF and stops < request.trials:
@@ -46,7 +46,7 @@ def at_host(kind: str, what: str, request: Request) -> Iterator[Trial]:
     request.note("the real host process, in real time; counted in its periods")
 
 
-def injected(observer: Observer, injection: Injection, what: Sequence[str], period_ms: float) -> Trial:
+def injected(observer: Observer, injection: FaultInjection, what: Sequence[str], period_ms: float) -> InjectionTrial:
     """Inject a fault once, and return the trial. what: names that the driver may give it; period_ms: of the host."""
     injection, requested_ns = validate_and_complete_injection(injection), time.monotonic_ns()
     answer = observer.inject("hal", injection.kind, injection.target, for_s=FAULT_DURATION_S)
@@ -54,7 +54,7 @@ def injected(observer: Observer, injection: Injection, what: Sequence[str], peri
     status = observer.first_fault(requested_ns)
     found = min((fault for fault in status.faults if fault.tick >= begun), key=lambda fault: fault.tick, default=None)
     if found is None:
-        return Trial(value=None, failure=f"nothing found after tick {begun}: {status.faults}")
+        return InjectionTrial(value=None, failure=f"nothing found after tick {begun}: {status.faults}")
     observer.watch(REST_S)
     failures = _objections(observer, injection, what, requested_ns)
     if injection.target_type == "joint" and found.joint != injection.target:
@@ -72,10 +72,10 @@ def _begun_tick(answer: Answer, period_ms: float) -> int:
     return round(float(match[1]) * 1000 / period_ms)
 
 
-def _objections(observer: Observer, injection: Injection, what: Sequence[str], requested_ns: int) -> list[str]:
+def _objections(observer: Observer, injection: FaultInjection, what: Sequence[str], requested_ns: int) -> list[str]:
     """Return every condition that is not met after the stop mode."""
     failures: list[str] = []
-    reported: list[Status] = [received.message for received in observer.statuses if received.at_ns >= requested_ns]
+    reported: list[RobotStatus] = [received.message for received in observer.statuses if received.at_ns >= requested_ns]
     words = {fault.what for status in reported for fault in status.faults}
     if words.isdisjoint(what):
         failures.append(f"found as {sorted(words)}, not {' or '.join(what)}")
@@ -93,7 +93,7 @@ def _objections(observer: Observer, injection: Injection, what: Sequence[str], r
     return failures
 
 
-def twice_at_start(request: Request) -> Iterator[Trial]:
+def twice_at_start(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Open a bus on which two modules have one node id. The value: modules that the host enabled all the same."""
     joints = configuration("can").robot.chain.modules
     for number in range(request.trials):
@@ -101,19 +101,19 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
         folder.mkdir()
         log = folder / BUS_LOG
         config = configuration("can", backend__log=str(log), backend__faults=[f"duplicate:{joint}@0"])
-        with Robot(folder, config) as started_robot:
+        with ProcessRobot(folder, config) as started_robot:
             host = started_robot.start("host")
             host.process.wait(START_LIMIT_S)
             words = "\n".join(host.output.last_lines())
         failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
         frames = bus_log.read(log)
-        yield Trial(
+        yield InjectionTrial(
             value=float(bus_log.commands(frames, CommandAction.ARM) + bus_log.setpoints(frames)), failure=failure
         )
     request.note("the real host process, which reports why it refuses; enabled is what its bus log shows")
 
 
-def through_robot(kind: str, request: Request) -> Iterator[Trial]:
+def through_robot(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Let a joint's sensor fail while the robot moves.
 
     The value: from the request to the injector to the first safe setpoints that were received.

@@ -11,10 +11,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from snakesim_testing.lab.machines import Machine
+from snakesim_testing.lab.machines import NamespaceMachine
 from verification.faults.observer import Observer
-from verification.faults.robot import START_LIMIT_S, Robot, configuration, recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.robot import START_LIMIT_S, ProcessRobot, configuration, recovered, robot
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 DOWN_S = 0.4  # how long there is no router
 RECONNECT_S = 5.0
@@ -27,7 +27,7 @@ SIOCGIFFLAGS, SIOCSIFFLAGS, IFF_UP = 0x8913, 0x8914, 1
 CUTS_S = (0.3, 0.5, 1.0, 3.0)  # the longest outlives Zenoh's own lease of a link
 
 
-def router_restarts(request: Request) -> Iterator[Trial]:
+def router_restarts(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """The router is killed and started again. The value: from the kill to the stop."""
     with robot(request, router=True) as (started_robot, observer):
         slowest_s = 0.0
@@ -57,7 +57,7 @@ def _all_back(observer: Observer) -> bool:
     return status is not None and not status.waiting_for and status.lease_holder == "control"
 
 
-def _after(observer: Observer, value: float, failures: list[str]) -> Trial:
+def _after(observer: Observer, value: float, failures: list[str]) -> InjectionTrial:
     """Still stopped, because of the lease; and back by an operator's commands."""
     observer.forget()
     observer.watch(STEADY_S)
@@ -74,10 +74,13 @@ def _after(observer: Observer, value: float, failures: list[str]) -> Trial:
 # --- a cable ---------------------------------------------------------------------------------------------------
 
 
-def network_cut(request: Request) -> Iterator[Trial]:
+def network_cut(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Host and observer on one side of a veth pair, the services on the other; the link goes down, and up again."""
     endpoint = f"tcp/{OURS}:{PORT}"
-    with _far_side() as far, Robot(request.folder, configuration(request.backend), endpoint=endpoint) as started_robot:
+    with (
+        _far_side() as far,
+        ProcessRobot(request.folder, configuration(request.backend), endpoint=endpoint) as started_robot,
+    ):
         started_robot.start("host")
         observer = started_robot.observe()
         with _inside(far):
@@ -112,7 +115,7 @@ def network_cut(request: Request) -> Iterator[Trial]:
 def _far_side() -> Iterator[Path]:
     """A network namespace behind a veth pair; this process must be in one of its own."""
     with contextlib.ExitStack() as stack:
-        far = Machine(stack, "the far side")
+        far = NamespaceMachine(stack, "the far side")
         _ip("link", "set", "lo", "up")
         _ip("link", "add", "ours", "type", "veth", "peer", "name", "theirs", "netns", far.pid)
         _ip("address", "add", f"{OURS}/24", "dev", "ours")

@@ -10,14 +10,14 @@ from snakesim_hal.run_log.black_box import read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from verification.faults.observer import TrialError
 from verification.faults.robot import START_LIMIT_S, recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 SHARE = 0.1  # of real time
 WINDOW_TICKS = 15
 MAX_STEP_RAD = 0.2  # of a joint within one period; a diverged one is further off
 
 
-def slow(request: Request) -> Iterator[Trial]:
+def slow(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Lockstep at a tenth of real time. The value: stops and faults in a window of it."""
     with robot(request, clock_mode="lockstep") as (_, observer):
         observer.inject("hal", "slow", "simulator", amount=SHARE)
@@ -34,12 +34,12 @@ def slow(request: Request) -> Iterator[Trial]:
             failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
             if shares and shares[-1] > 2 * SHARE:
                 failure = failure or f"the simulator was not slow: {shares[-1]:.2f} of real time"
-            yield Trial(value=float(faults + stops), failure=failure)
+            yield InjectionTrial(value=float(faults + stops), failure=failure)
         observer.inject("hal", "slow", "simulator", end=True)
         request.note(f"{WINDOW_TICKS} ticks each, at {min(shares):.3f} to {max(shares):.3f} of real time")
 
 
-def diverges(request: Request) -> Iterator[Trial]:
+def diverges(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """Its state becomes impossible. The value: steps from the injection to the fault. Then a new host is started."""
     with robot(request) as (started_robot, observer):
         for _ in range(request.trials):

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 from snakesim_hal.model.fault_kinds import find_writer
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Mode
+from snakesim_hal.wire.messages import ControlState, JointMode
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import Robot, recovered, robot
-from verification.faults.row import Request, Trial
+from verification.faults.robot import ProcessRobot, recovered, robot
+from verification.faults.row import InjectionTrial, MeasurementRequest
 
 ALONG_PEGS = {"scene": "peg_row", "mission__speed_m_s": 0.2}  # where the snake pushes for as long as it takes
 PUSHES = 5  # ticks in a row with a joint in torque mode, before a stream is cut
@@ -17,7 +17,7 @@ BACK_S = 5.0  # at most, until it pushes again
 DEPTH = 4096
 
 
-def no_joints(request: Request) -> Iterator[Trial]:
+def no_joints(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """The value: until the stop mode. Somebody resets and arms when the stream is back."""
     with robot(request) as (started_robot, observer):
         for _ in range(request.trials):
@@ -34,7 +34,7 @@ def no_joints(request: Request) -> Iterator[Trial]:
             yield recovered(observer, value, "; ".join(failures))
 
 
-def withheld(key: str, request: Request) -> Iterator[Trial]:
+def withheld(key: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """The value: from the request to the injector to the last setpoints with which a joint pushed."""
     with robot(request, **ALONG_PEGS) as (started_robot, observer):
         states = observer.session.declare_reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
@@ -68,13 +68,13 @@ def _mend(observer: Observer, key: str) -> None:
     observer.inject(find_writer(key), "drop", key, end=True)
 
 
-def _pushing(started_robot: Robot, observer: Observer) -> None:
+def _pushing(started_robot: ProcessRobot, observer: Observer) -> None:
     """Armed, and some joint has pushed for a moment."""
     started_robot.set_in_motion(observer)
 
     def pushes() -> bool:
         newest = observer.applied[-PUSHES:]
-        return len(newest) == PUSHES and all(Mode.TORQUE in h.message.mode for h in newest)
+        return len(newest) == PUSHES and all(JointMode.TORQUE in h.message.mode for h in newest)
 
     observer.until(pushes, "a joint that pushes", BACK_S)
     observer.forget()
@@ -90,27 +90,29 @@ def _held(observer: Observer, requested_ns: int) -> tuple[float | None, list[str
     if observer.state() != "armed" or observer.first_safe(requested_ns) is not None:
         failures.append(f"the robot stopped: {observer.in_words()}")
     since = [h for h in observer.applied if h.at_ns >= requested_ns]
-    pushing = [i for i, h in enumerate(since) if Mode.TORQUE in h.message.mode]
+    pushing = [i for i, h in enumerate(since) if JointMode.TORQUE in h.message.mode]
     last = pushing[-1] if pushing else -1
     if last + 1 >= len(since):
         return None, [*failures, "a joint pushes on"]
-    if any(set(h.message.mode) != {Mode.POSITION} for h in since[last + 1 :]):
+    if any(set(h.message.mode) != {JointMode.POSITION} for h in since[last + 1 :]):
         failures.append("not all joints hold their position")
     return (since[last + 1].at_ns - requested_ns) / 1e6, failures
 
 
-def _back(observer: Observer, key: str, value: float | None, failures: list[str], back_ms: list[float]) -> Trial:
+def _back(
+    observer: Observer, key: str, value: float | None, failures: list[str], back_ms: list[float]
+) -> InjectionTrial:
     """Let the stream come again: the controller pushes by itself, and no target jumps."""
     observer.forget()
     began_ns = time.monotonic_ns()
     _mend(observer, key)
 
     def pushing() -> list[int]:
-        return [h.at_ns for h in observer.applied if Mode.TORQUE in h.message.mode]
+        return [h.at_ns for h in observer.applied if JointMode.TORQUE in h.message.mode]
 
     try:
         back_ns = observer.until(pushing, "a joint pushes again", BACK_S)[0]
     except TrialError as error:
-        return Trial(value=value, failure="; ".join([*failures, str(error)]), recovered=False)
+        return InjectionTrial(value=value, failure="; ".join([*failures, str(error)]), recovered=False)
     back_ms.append((back_ns - began_ns) / 1e6)
-    return Trial(value=value, failure="; ".join(failures), recovered=True, **observer.steps())
+    return InjectionTrial(value=value, failure="; ".join(failures), recovered=True, **observer.steps())

@@ -1,9 +1,9 @@
 """The fault table: every row, in the order of the page. The rows of one kind of fault are in one module."""
 
-from verification.faults.row import Heading, Row
+from verification.faults.row import FaultHeading, FaultRow
 from verification.faults.table import commands, drives, inputs_and_time, network, processes
 
-HEADINGS: tuple[Heading, ...] = (
+HEADINGS: tuple[FaultHeading, ...] = (
     processes.CONTROLLER_STOPS,
     processes.HOST_STOPS,
     drives.DRIVE_FAILS,
@@ -25,4 +25,4 @@ HEADINGS: tuple[Heading, ...] = (
     processes.HOST_RESTARTS,
 )
 
-ROWS: dict[str, Row] = {row.name: row for heading in HEADINGS for row in heading.rows}
+ROWS: dict[str, FaultRow] = {row.name: row for heading in HEADINGS for row in heading.rows}

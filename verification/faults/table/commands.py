@@ -1,15 +1,15 @@
 """Commands of a second controller, and commands that are late, replayed or malformed."""
 
-from verification.faults.row import Heading, Row
+from verification.faults.row import FaultHeading, FaultRow
 from verification.faults.rows import commands
 from verification.faults.table.row_kinds import FRAMES_THROUGH, both
 
-TWO_CONTROLLERS = Heading(
+TWO_CONTROLLERS = FaultHeading(
     fault="two controllers",
     expected="first wins, typed refusal, zero frames from the second in 100,000 interleavings",
     deadline="at once",
     rows=(
-        Row(
+        FaultRow(
             name="two_controllers",
             fault="two writers at one limiter, interleaved by chance",
             expected="no setpoint and no right for the second",
@@ -18,7 +18,7 @@ TWO_CONTROLLERS = Heading(
             unit="frames from the second",
             measures={"both": commands.interleaved},
         ),
-        Row(
+        FaultRow(
             name="second_controller",
             fault="a second controller on the network requests the lease, and commands with other epochs",
             expected="typed refusal (lease_held), commands refused as wrong_epoch, the first continues",
@@ -30,12 +30,12 @@ TWO_CONTROLLERS = Heading(
     ),
 )
 
-COMMANDS_OUT_OF_TIME = Heading(
+COMMANDS_OUT_OF_TIME = FaultHeading(
     fault="stale, replayed, reordered, duplicated, future command",
     expected="refused",
     deadline="one message",
     rows=(
-        Row(
+        FaultRow(
             name="out_of_time",
             fault="commands out of their time, with the right lease epoch",
             expected="each refused and counted by its reason, the controller's own continue",
@@ -47,12 +47,12 @@ COMMANDS_OUT_OF_TIME = Heading(
     ),
 )
 
-INVALID_COMMANDS = Heading(
+INVALID_COMMANDS = FaultHeading(
     fault="NaN, infinity, out of range, wrong length, wrong joint order, malformed or huge bytes, unknown version",
     expected="refused, counted; never an exception out of a callback",
     deadline="one message",
     rows=(
-        Row(
+        FaultRow(
             name="wrong_in_itself",
             fault="commands that are wrong in themselves, with the right epoch, sequence and tick",
             expected="each refused and counted by its reason, the controller's own continue, no process ends",

@@ -1,6 +1,6 @@
 """Faults of joint modules, of drives, and of buses."""
 
-from verification.faults.row import DRIVE_TYPES, Heading, Row
+from verification.faults.row import DRIVE_TYPES, FaultHeading, FaultRow
 from verification.faults.rows import drives, modules
 from verification.faults.table.row_kinds import (
     NO_BUS,
@@ -12,13 +12,13 @@ from verification.faults.table.row_kinds import (
     sensor_row,
 )
 
-DRIVE_FAILS = Heading(
+DRIVE_FAILS = FaultHeading(
     fault="drives of every type: host frozen for 1 s; a drive silent, restarted, too hot; the bus lost",
     expected="drives stop by themselves; fault names the joint; no drive is enabled again before reset and arming",
     deadline="a watchdog, 100 ms; at 50 Hz (T = 20 ms) for the driver 3 T, and 100 ms for what drives report by "
     "themselves",
     rows=(
-        Row(
+        FaultRow(
             name="drive_host_frozen",
             fault="host: SIGSTOP for 1 s, then SIGCONT",
             expected="every drive off by its own watchdog; each stop a fault that names its joint; none enabled again",
@@ -63,7 +63,7 @@ DRIVE_FAILS = Heading(
     ),
 )
 
-JOINT_MODULE_FAILS = Heading(
+JOINT_MODULE_FAILS = FaultHeading(
     fault="joint module silent, restarted, frozen value, wrong counter",
     expected="fault names the joint; group to safe stop",
     deadline="50 ms; restart: one frame",
@@ -80,7 +80,7 @@ JOINT_MODULE_FAILS = Heading(
     ),
 )
 
-JOINT_IS_ISOLATED = Heading(
+JOINT_IS_ISOLATED = FaultHeading(
     fault="one joint fails, and the robot file allows for it (`max_isolated_joints = 1`)",
     expected="that joint is disabled, the others continue",
     deadline="50 ms",
@@ -92,7 +92,7 @@ JOINT_IS_ISOLATED = Heading(
     ),
 )
 
-BUS_FAILS = Heading(
+BUS_FAILS = FaultHeading(
     fault="bus-off, error-passive, transmit queue full, interface down, receive overflow, babbling node, duplicate id",
     expected="fault; recovers only to disarmed; duplicate refused at arming",
     deadline="2-3 T; flood 100 ms",
@@ -104,7 +104,7 @@ BUS_FAILS = Heading(
         bus_row("bus_receive_overflow", "received frames get lost", "overflow", "receive_overflow"),
         bus_row("bus_babbling", "a node floods the bus", "babble", "module_babbling", 100.0),
         bus_row("bus_duplicate", "a second node with the same id appears", "duplicate", "duplicate_node", 100.0),
-        Row(
+        FaultRow(
             name="bus_duplicate_at_start",
             fault="two nodes with the same id are there when the host opens the bus",
             expected="refused, with the joint and both serials; nothing is enabled",

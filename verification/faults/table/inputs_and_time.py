@@ -1,16 +1,16 @@
 """Streams that stop, clocks that step, and a simulator that is slow or diverges."""
 
 from snakesim_hal.wire import keys
-from verification.faults.row import Heading, Row
+from verification.faults.row import FaultHeading, FaultRow
 from verification.faults.rows import guest, simulator, streams
 from verification.faults.table.row_kinds import LEASE_MS, PERIOD_MS, both, stream_row
 
-STREAM_STOPS = Heading(
+STREAM_STOPS = FaultHeading(
     fault="a stream that control acts on stops: of a sensor, of guidance, of navigation",
     expected="without joint states: safe stop; without another: the controller holds, and continues when it is back",
     deadline="joints: 30 ms and the lease; others: their `max_age`",
     rows=(
-        Row(
+        FaultRow(
             name="stream_joints",
             fault="sensor/joints: all of it is lost",
             expected="no command on a state that is too old: safe stop by the lease, lease freed, fault latched",
@@ -27,12 +27,12 @@ STREAM_STOPS = Heading(
     ),
 )
 
-WALL_CLOCK_STEPS = Heading(
+WALL_CLOCK_STEPS = FaultHeading(
     fault="wall clock steps by an hour either way",
     expected="nothing",
     deadline="-",
     rows=(
-        Row(
+        FaultRow(
             name="clock_step",
             fault="the wall clock goes an hour ahead, and back",
             expected="nothing: no fault, no lease missed",
@@ -45,12 +45,12 @@ WALL_CLOCK_STEPS = Heading(
     ),
 )
 
-SLOW_SIMULATOR = Heading(
+SLOW_SIMULATOR = FaultHeading(
     fault="simulator slower than real time in lockstep (0.1x)",
     expected="no false stop",
     deadline="-",
     rows=(
-        Row(
+        FaultRow(
             name="slow_simulator",
             fault="the simulator runs at a tenth of real time, in lockstep",
             expected="no stop, no fault: leases count in simulated time",
@@ -62,12 +62,12 @@ SLOW_SIMULATOR = Heading(
     ),
 )
 
-SIMULATION_DIVERGES = Heading(
+SIMULATION_DIVERGES = FaultHeading(
     fault="simulation diverges",
     expected="stop, fault, last good state stays",
     deadline="one step",
     rows=(
-        Row(
+        FaultRow(
             name="simulation_diverges",
             fault="the simulator's state becomes impossible",
             expected="stop and fault in the same step; nothing that is no number is published or recorded",

@@ -1,10 +1,10 @@
 """Faults of the network: a cut, slow consumers, and emergency stops under an attack."""
 
-from verification.faults.row import Heading
+from verification.faults.row import FaultHeading
 from verification.faults.rows import attacks, consumers, network
 from verification.faults.table.row_kinds import STOP_MS, consumer_row, flood_row, lease_row, stop_row
 
-NETWORK_CUT = Heading(
+NETWORK_CUT = FaultHeading(
     fault="network cut between controller and robot (namespaces with a veth pair, link down)",
     expected="safe stop on the robot side",
     deadline="lease",
@@ -13,7 +13,7 @@ NETWORK_CUT = Heading(
     ),
 )
 
-SLOW_CONSUMER = Heading(
+SLOW_CONSUMER = FaultHeading(
     fault="slow subscriber (sleeping callback, full disk at a consumer, frozen process)",
     expected="only that consumer suffers; zero missed control cycles",
     deadline="-",
@@ -24,7 +24,7 @@ SLOW_CONSUMER = Heading(
     ),
 )
 
-STOP_UNDER_ATTACK = Heading(
+STOP_UNDER_ATTACK = FaultHeading(
     fault="an emergency stop while the network is flooded, occupied or held up",
     expected="stopped at once, regardless of traffic",
     deadline=f"{STOP_MS:.0f} ms",

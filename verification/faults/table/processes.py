@@ -1,6 +1,6 @@
 """Faults of processes: the controller, the HAL host, the router, and a second run."""
 
-from verification.faults.row import Heading, Row
+from verification.faults.row import FaultHeading, FaultRow
 from verification.faults.rows import attacks, controller, guest, network
 from verification.faults.table.row_kinds import (
     GUEST_WATCHDOG_MS,
@@ -11,7 +11,7 @@ from verification.faults.table.row_kinds import (
     watchdog_row,
 )
 
-CONTROLLER_STOPS = Heading(
+CONTROLLER_STOPS = FaultHeading(
     fault="controller killed; controller frozen (SIGSTOP; busy interpreter)",
     expected="safe stop, lease freed, latched",
     deadline="lease",
@@ -27,7 +27,7 @@ CONTROLLER_STOPS = Heading(
     ),
 )
 
-HOST_STOPS = Heading(
+HOST_STOPS = FaultHeading(
     fault="HAL host killed or frozen",
     expected="modules' own watchdog",
     deadline="100 ms",
@@ -38,7 +38,7 @@ HOST_STOPS = Heading(
     ),
 )
 
-ROUTER_RESTARTS = Heading(
+ROUTER_RESTARTS = FaultHeading(
     fault="router dies, restarts, 50 times",
     expected="safe stop if the stream stops; reconnects; no re-arm",
     deadline="lease; 5 s to reconnect",
@@ -52,12 +52,12 @@ ROUTER_RESTARTS = Heading(
     ),
 )
 
-SECOND_RUN = Heading(
+SECOND_RUN = FaultHeading(
     fault="a second run on a robot's network, or at its endpoint",
     expected="refuses to start; the robot stays as it is",
     deadline="-",
     rows=(
-        Row(
+        FaultRow(
             name="second_run",
             fault="a person disarmed the robot; a second `snakesim run` of its name starts there",
             expected="the second ends with an error that names the robot; nothing is armed",
@@ -69,12 +69,12 @@ SECOND_RUN = Heading(
     ),
 )
 
-HOST_RESTARTS = Heading(
+HOST_RESTARTS = FaultHeading(
     fault="HAL restarts while moving",
     expected="boots disarmed; old commands void; no jump",
     deadline="before first frame",
     rows=(
-        Row(
+        FaultRow(
             name="host_restarts",
             fault="host: SIGKILL while moving, started again",
             expected="boots disarmed, refuses what was streamed before, moves nothing until armed",

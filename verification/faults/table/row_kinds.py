@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from snakesim_hal.model.fault_kinds import FAULT_KINDS
-from verification.faults.row import DRIVE_TYPES, Backend, Environment, Measure, Row
+from verification.faults.row import DRIVE_TYPES, Backend, Environment, FaultRow, Measure
 from verification.faults.rows import attacks, drives, guest, isolation, modules, streams
 
 PERIOD_MS = 10.0  # of the control cycle
@@ -43,9 +43,9 @@ def lease_row(
     min_trials: int = 0,
     environment: Environment = "here",
     more_ms: float = 0.0,
-) -> Row:
+) -> FaultRow:
     """Return a row about a stream of commands that stops. more_ms: until the fault begins, after its request."""
-    return Row(
+    return FaultRow(
         name=name,
         fault=fault,
         expected="safe stop by the lease, lease freed, fault latched",
@@ -58,7 +58,9 @@ def lease_row(
     )
 
 
-def watchdog_row(name: str, fault: str, measure: Measure, limit_ms: float, environment: Environment = "here") -> Row:
+def watchdog_row(
+    name: str, fault: str, measure: Measure, limit_ms: float, environment: Environment = "here"
+) -> FaultRow:
     """Return a row about joint modules that get no setpoints any more.
 
     Args:
@@ -71,7 +73,7 @@ def watchdog_row(name: str, fault: str, measure: Measure, limit_ms: float, envir
     uncertainty = ""
     if limit_ms > WATCHDOG_MS:
         uncertainty = f", which a listener can tell to {limit_ms - WATCHDOG_MS:.0f} ms"
-    return Row(
+    return FaultRow(
         name=name,
         fault=fault,
         expected="every module stops by itself, motor off, latched",
@@ -83,9 +85,9 @@ def watchdog_row(name: str, fault: str, measure: Measure, limit_ms: float, envir
     )
 
 
-def joint_row(name: str, kind: str, fault_name: str) -> Row:
+def joint_row(name: str, kind: str, fault_name: str) -> FaultRow:
     """Return a row about a joint module on CAN. fault_name: what the driver reports."""
-    return Row(
+    return FaultRow(
         name=name,
         fault=f"a joint module: {FAULT_KINDS['joint'][kind].description}",
         expected=NAMES_JOINT,
@@ -96,9 +98,9 @@ def joint_row(name: str, kind: str, fault_name: str) -> Row:
     )
 
 
-def injected_row(name: str, fault: str, expected: str, measure: Measure) -> Row:
+def injected_row(name: str, fault: str, expected: str, measure: Measure) -> FaultRow:
     """Return a row about a fault that the injector of a whole robot causes on request, with any backend."""
-    return Row(
+    return FaultRow(
         name=name,
         fault=fault,
         expected=expected,
@@ -109,20 +111,20 @@ def injected_row(name: str, fault: str, expected: str, measure: Measure) -> Row:
     )
 
 
-def sensor_row(name: str, fault: str, kind: str) -> Row:
+def sensor_row(name: str, fault: str, kind: str) -> FaultRow:
     """Return a row about a joint's sensor of any backend."""
     return injected_row(name, fault, NAMES_JOINT, partial(modules.through_robot, kind))
 
 
-def isolated_row(name: str, fault: str, kind: str) -> Row:
+def isolated_row(name: str, fault: str, kind: str) -> FaultRow:
     """Return a row about one failing joint of a robot that continues without it."""
     expected = "fault names the joint, it alone is disabled, the others continue, and a reset enables it again"
     return injected_row(name, fault, expected, partial(isolation.set_aside, kind))
 
 
-def bus_row(name: str, fault: str, kind: str, fault_name: str, limit_ms: float = 3 * PERIOD_MS) -> Row:
+def bus_row(name: str, fault: str, kind: str, fault_name: str, limit_ms: float = 3 * PERIOD_MS) -> FaultRow:
     """Return a row about a CAN bus. fault_name: what the driver reports."""
-    return Row(
+    return FaultRow(
         name=name,
         fault=fault,
         expected="fault, group to safe stop, recovers only to disarmed",
@@ -135,7 +137,7 @@ def bus_row(name: str, fault: str, kind: str, fault_name: str, limit_ms: float =
 
 def drive_row(
     name: str, fault: str, kind: str, limit_periods: int, reason: str, fault_names: dict[str, Sequence[str]]
-) -> Row:
+) -> FaultRow:
     """Return a row about a drive of every type, or about its bus.
 
     Args:
@@ -147,7 +149,7 @@ def drive_row(
         fault_names: what the driver of joint modules ("can") and those of drives ("others") may report.
     """
     limit_ms = limit_periods * drives.PERIOD_MS
-    return Row(
+    return FaultRow(
         name=name,
         fault=fault,
         expected="fault, which names the joint if it is one; every motor off after the braking; none on again before "
@@ -159,9 +161,9 @@ def drive_row(
     )
 
 
-def consumer_row(name: str, fault: str, measure: Measure) -> Row:
+def consumer_row(name: str, fault: str, measure: Measure) -> FaultRow:
     """Return a row about a process that reads from the robot's network, and is slow."""
-    return Row(
+    return FaultRow(
         name=name,
         fault=fault,
         expected="no control cycle is missed because of it, the robot continues",
@@ -172,9 +174,9 @@ def consumer_row(name: str, fault: str, measure: Measure) -> Row:
     )
 
 
-def stream_row(name: str, key: str, max_age_ms: float) -> Row:
+def stream_row(name: str, key: str, max_age_ms: float) -> FaultRow:
     """Return a row about a stream without which the controller holds. max_age_ms: of the scenario's `max_age`."""
-    return Row(
+    return FaultRow(
         name=name,
         fault=f"{key}: all of it is lost",
         expected="the push ends, every joint holds its position, control/state names the stream; continues when it is "
@@ -186,9 +188,9 @@ def stream_row(name: str, key: str, max_age_ms: float) -> Row:
     )
 
 
-def stop_row(name: str, fault: str, measure: Measure) -> Row:
+def stop_row(name: str, fault: str, measure: Measure) -> FaultRow:
     """Return a row about an emergency stop during an attack on the network."""
-    return Row(
+    return FaultRow(
         name=name,
         fault=fault,
         expected="every joint is made safe at once, the stop is latched and confirmed to the client that requested it",
@@ -199,6 +201,6 @@ def stop_row(name: str, fault: str, measure: Measure) -> Row:
     )
 
 
-def flood_row(name: str, fault: str, flood: str) -> Row:
+def flood_row(name: str, fault: str, flood: str) -> FaultRow:
     """Return a row about an emergency stop under one flood of `attacks.FLOODS`."""
     return stop_row(name, fault, partial(attacks.stopped_under, flood))

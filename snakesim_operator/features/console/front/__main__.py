@@ -14,7 +14,7 @@ from snakesim_hal.base.process import call_on_stop_signals, raise_open_file_limi
 from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, read_session_option
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_operator.base.console_port import TOKEN_VARIABLE
@@ -65,16 +65,16 @@ def _prepare_stop(arguments: argparse.Namespace) -> PreparedStop:
     """Open what a stop needs. The network session follows in a thread of its own, once the robot's network answers."""
     session = read_session_option(arguments)
     if session is not None:
-        link = Link.from_session_file(session, arguments.namespace)
+        link = ConnectionSettings.from_session_file(session, arguments.namespace)
     else:
-        link = Link(arguments.router or arguments.endpoint or DEFAULT_ENDPOINT, arguments.namespace)
+        link = ConnectionSettings(arguments.router or arguments.endpoint or DEFAULT_ENDPOINT, arguments.namespace)
     selection = RobotSelection(link.endpoint, link.namespace, link.session)
     stop = PreparedStop(selection, link, lambda requester, result: print_line(f"{requester}: {result}"))
     start_restarting_thread("stop session", partial(_keep_session, stop, link))
     return stop
 
 
-def _keep_session(stop: PreparedStop, link: Link) -> None:
+def _keep_session(stop: PreparedStop, link: ConnectionSettings) -> None:
     """Give the stop a network session, for as long as this process lives."""
     with open_session(link, SERVICE_START_LIMIT_S) as session:
         stop.use_session(session)

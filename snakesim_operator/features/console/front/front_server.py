@@ -48,7 +48,7 @@ REASONS = {
 }
 
 
-class Readiness(Protocol):
+class SelfTestResult(Protocol):
     """The result of a self-test: whether a stop would reach the robot."""
 
     @property
@@ -69,7 +69,7 @@ class StopPath(Protocol):
         """Stop the robot; the future gets the result in words, or an error."""
         ...
 
-    def check_readiness(self) -> Readiness:
+    def check_readiness(self) -> SelfTestResult:
         """Return the result of the newest self-test."""
         ...
 

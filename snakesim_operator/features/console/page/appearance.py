@@ -2,9 +2,9 @@
 
 import viser
 
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import Vector
-from snakesim_operator.features.console.web.admission import Admission
+from snakesim_operator.features.console.web.admission import ControlAdmission
 
 BRAND_COLOR = (0, 103, 176)
 CAMERA_FOV_RAD = 0.75  # vertical field of view
@@ -21,7 +21,7 @@ def set_appearance(gui: viser.GuiApi, *, dark: bool) -> None:
     )
 
 
-def add_appearance(client: viser.ClientHandle, admission: Admission, *, dark: bool) -> None:
+def add_appearance(client: viser.ClientHandle, admission: ControlAdmission, *, dark: bool) -> None:
     """Add a checkbox with which a viewer chooses a dark page; `dark` is the browser's preference, set at first."""
     checkbox = client.gui.add_checkbox("Dark page", initial_value=dark, order=2.5)
     admission.admit_control(checkbox, client.client_id)
@@ -29,7 +29,7 @@ def add_appearance(client: viser.ClientHandle, admission: Admission, *, dark: bo
     set_appearance(client.gui, dark=dark)
 
 
-def choose_camera_pose(robot: Description, *, narrow: bool) -> tuple[Vector, Vector]:
+def choose_camera_pose(robot: RobotDescription, *, narrow: bool) -> tuple[Vector, Vector]:
     """Return a camera position, and the point that it looks at, from which the whole body is in view.
 
     Args:
@@ -51,14 +51,14 @@ def choose_camera_pose(robot: Description, *, narrow: bool) -> tuple[Vector, Vec
     return position, target
 
 
-def aim_initial_camera(server: viser.ViserServer, robot: Description) -> None:
+def aim_initial_camera(server: viser.ViserServer, robot: RobotDescription) -> None:
     """Set the camera with which pages begin, so that the whole robot is in view."""
     camera = server.initial_camera
     camera.position, camera.look_at = choose_camera_pose(robot, narrow=False)
     camera.fov = CAMERA_FOV_RAD
 
 
-def aim_phone_camera(client: viser.ClientHandle, robot: Description) -> None:
+def aim_phone_camera(client: viser.ClientHandle, robot: RobotDescription) -> None:
     """Aim the camera of a phone; other screens use the initial camera."""
     camera = client.camera
     if camera.image_width < camera.image_height:

@@ -9,7 +9,7 @@ from snakesim_hal.wire.quantities import MAX_JOINTS
 from snakesim_operator.features.console.joint_step import BACKWARDS, ENTER, FORWARDS
 from snakesim_operator.features.console.page.commissioning_tab import DESCRIPTION_BY_STEP, CommissioningTab
 from snakesim_operator.features.console.page.page_html import escape_text
-from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, Admission
+from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, ControlAdmission
 from snakesim_operator.features.console.web.message_age import PageAction
 
 HOLD_REPEAT_HZ = 20.0  # `snakesim robot jog` counts a key as held for 0.15 s
@@ -23,7 +23,7 @@ class CommissioningControls:
         client: viser.ClientHandle,
         tab: viser.GuiFolderHandle,
         commissioning: CommissioningTab,
-        admission: Admission,
+        admission: ControlAdmission,
         is_in_control: Callable[[], bool],
         run_operation: Callable[[str, Callable[[], str]], object],
         on_late_press: Callable[[float], None],
@@ -69,7 +69,7 @@ class CommissioningControls:
         self._backwards_button = gui.add_button("Hold: backwards (-)", color="green")
         self._end_button = gui.add_button("End step", color="gray")
 
-    def _admit_controls(self, admission: Admission, on_late_press: Callable[[float], None]) -> None:
+    def _admit_controls(self, admission: ControlAdmission, on_late_press: Callable[[float], None]) -> None:
         """Let this viewer's page use the controls. A step ends at any age of the press; other presses may not be old.
 
         Args:

@@ -14,8 +14,8 @@ import viser
 
 from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.session import Link
-from snakesim_hal.wire.messages import Configuration
+from snakesim_hal.network.session import ConnectionSettings
+from snakesim_hal.wire.messages import RunConfiguration
 from snakesim_operator.base.targets import make_robot_flags
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.joint_step import ENTER, JointStep, format_command_name
@@ -45,7 +45,7 @@ class CommissioningTab:
         self,
         gui: viser.GuiApi,
         tab: viser.GuiFolderHandle,
-        connection: Link,
+        connection: ConnectionSettings,
         robot_file: Path | None,
         control_token: ControlToken,
         log: PageLog,
@@ -72,7 +72,7 @@ class CommissioningTab:
         self._last_keypress_time_s = 0.0  # when the step was started, or got its newest key
         self._measured_ranges: list[AngleRange] = []
         # The configuration of the run, decoded once.
-        self._configuration: Configuration | None = None
+        self._configuration: RunConfiguration | None = None
         self._config: RunConfig | None = None
         with tab:
             self._table = gui.add_html("", order=0)

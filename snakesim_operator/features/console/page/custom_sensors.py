@@ -23,16 +23,16 @@ MAX_LINES = 16  # of one chart
 
 
 @dataclass(frozen=True)
-class Quantity:
+class SensorQuantity:
     """A field of custom sensor messages; sensors that publish the same quantity share a chart."""
 
     field: str
     unit: str
 
 
-def collect_numbers(snapshot: RobotSnapshot) -> dict[Quantity, dict[str, float]]:
+def collect_numbers(snapshot: RobotSnapshot) -> dict[SensorQuantity, dict[str, float]]:
     """Return the numbers of all custom sensors by quantity, then by sensor: `left`, or `left.0` of a list."""
-    numbers: dict[Quantity, dict[str, float]] = {}
+    numbers: dict[SensorQuantity, dict[str, float]] = {}
     for key, kind in find_custom_messages(snapshot.robot).items():
         sample = snapshot.custom.get(key)
         if sample is None:
@@ -40,7 +40,7 @@ def collect_numbers(snapshot: RobotSnapshot) -> dict[Quantity, dict[str, float]]
         sensor = key.rpartition("/")[2]
         for name, value in kind.extract_numeric_values(sample).items():
             field, dot, part = name.partition(".")
-            quantity = Quantity(field, kind.units[field])
+            quantity = SensorQuantity(field, kind.units[field])
             numbers.setdefault(quantity, {})[f"{sensor}{dot}{part}"] = value
     return numbers
 
@@ -76,7 +76,7 @@ def _format_value(kind: CustomMessage, name: str, value: float) -> str:
 
 
 @dataclass
-class _Chart:
+class _QuantityChart:
     line_names: Sequence[str]
     handle: viser.GuiUplotHandle
 
@@ -87,8 +87,8 @@ class CustomSensorCharts:
     def __init__(self, gui: viser.GuiApi) -> None:
         self._gui = gui
         self._table = gui.add_html("")
-        self._charts: dict[Quantity, _Chart] = {}
-        self._history: dict[Quantity, deque[tuple[float, dict[str, float]]]] = {}
+        self._charts: dict[SensorQuantity, _QuantityChart] = {}
+        self._history: dict[SensorQuantity, deque[tuple[float, dict[str, float]]]] = {}
 
     def add_snapshot(self, snapshot: RobotSnapshot) -> None:
         """Keep a sample for the charts; called for each frame."""
@@ -105,7 +105,7 @@ class CustomSensorCharts:
         for quantity in list(self._history)[:MAX_CHARTS]:
             self._show_chart(quantity)
 
-    def _show_chart(self, quantity: Quantity) -> None:
+    def _show_chart(self, quantity: SensorQuantity) -> None:
         history = self._history[quantity]
         newest_s, newest = history[-1]
         line_names = list(newest)[:MAX_LINES]
@@ -117,13 +117,13 @@ class CustomSensorCharts:
         columns = [np.array([numbers.get(name, math.nan) for _, numbers in samples]) for name in line_names]
         chart.handle.data = (times_s, *columns)
 
-    def _replace_chart(self, quantity: Quantity, line_names: Sequence[str]) -> _Chart:
+    def _replace_chart(self, quantity: SensorQuantity, line_names: Sequence[str]) -> _QuantityChart:
         """Add a chart with these lines in the place of the one that has other lines."""
         former = self._charts.pop(quantity, None)
         if former is not None:
             former.handle.remove()
         title = f"{quantity.field}, last {HISTORY_S:g} s, {quantity.unit}"
-        chart = _Chart(line_names, add_history_chart(self._gui, line_names, title))
+        chart = _QuantityChart(line_names, add_history_chart(self._gui, line_names, title))
         self._charts[quantity] = chart
         return chart
 

@@ -10,7 +10,7 @@ import viser
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_operator.features.console.operations import BUTTON_VALIDITY_NS, KEY_VALIDITY_NS
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, Admission
+from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, ControlAdmission
 from snakesim_operator.features.console.web.message_age import PageAction
 from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, compute_limited_heading
 
@@ -39,7 +39,7 @@ class DriveControls:
     def __init__(
         self,
         client: viser.ClientHandle,
-        admission: Admission,
+        admission: ControlAdmission,
         is_in_control: Callable[[], bool],
         get_snapshot: Callable[[], RobotSnapshot | None],
         send_intent: SendIntent,

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.messages import JointMode, RobotDescription
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import find_propulsion_joint
 from snakesim_operator.features.console.scene.scene_colors import PROPULSION_JOINT
@@ -39,7 +39,7 @@ def append_sample(history: deque[SampleT], sample: SampleT) -> None:
 class JointCharts:
     """Angles against references and torques against limits, joint by joint, and both over time."""
 
-    def __init__(self, gui: viser.GuiApi, robot: Description) -> None:
+    def __init__(self, gui: viser.GuiApi, robot: RobotDescription) -> None:
         """Add the charts of all joints to the page, without values.
 
         Args:
@@ -151,7 +151,7 @@ def find_references_rad(snapshot: RobotSnapshot) -> Floats:
         return np.array(control.reference_rad)
     applied = snapshot.applied
     if applied is not None and len(applied.target) == len(applied.mode) == joint_count:
-        return np.where(np.array(applied.mode) == Mode.POSITION, applied.target, np.nan)
+        return np.where(np.array(applied.mode) == JointMode.POSITION, applied.target, np.nan)
     return np.full(joint_count, np.nan)
 
 

@@ -26,7 +26,7 @@ from snakesim_operator.features.console.page.robot_display import RobotDisplay, 
 from snakesim_operator.features.console.page.viewer_controls import ControlContext, format_viewer
 from snakesim_operator.features.console.page.viewers import Viewers, ignore_closed_page
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.scene.drawing import Surroundings
+from snakesim_operator.features.console.scene.drawing import TrueSurroundings
 from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.viser_server import PageServer
 
@@ -39,13 +39,13 @@ AGE_REQUEST_DECIMATION = 3  # ten questions a second to the page in control, by 
 PANEL_WIDTH_PX = 490  # wide enough for all tabs in one line
 
 
-class Page:
+class ConsolePage:
     """The page that all viewers see, and the controls of each viewer."""
 
     def __init__(
         self,
         server: PageServer,
-        surroundings: Surroundings | None,
+        surroundings: TrueSurroundings | None,
         operations: RobotOperations | None,
         log: PageLog,
         recorded: str = "",

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from html import escape
 
 from snakesim_hal.base.terminal import escape_invisible
-from snakesim_hal.wire.messages import Description, Status
+from snakesim_hal.wire.messages import RobotDescription, RobotStatus
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 MAX_SILENCE_S = 1.0  # a host publishes its status more often, so a longer silence is an alarm
@@ -36,7 +36,7 @@ def escape_text(text: object) -> str:
     return escape(escape_invisible(str(text)))
 
 
-def choose_backend_label(robot: Description) -> tuple[str, str]:
+def choose_backend_label(robot: RobotDescription) -> tuple[str, str]:
     """Return the label for what moves, a real, emulated or simulated robot, and the label's color."""
     backend_name = robot.backend.upper()[:MAX_BACKEND_CHARACTERS]
     if not robot.emulated:  # whatever the backend is called
@@ -74,7 +74,7 @@ def format_header(snapshot: RobotSnapshot | None, *, recorded: str = "", control
     return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(html_lines)}</div>"
 
 
-def _format_backend_bar(robot: Description, recorded: str) -> str:
+def _format_backend_bar(robot: RobotDescription, recorded: str) -> str:
     """Return the bar that distinguishes a real robot from an emulated one, and a recording from a live robot."""
     label, color = choose_backend_label(robot)
     robot_text = escape_text(robot.robot)
@@ -137,7 +137,7 @@ def format_state_table(snapshot: RobotSnapshot) -> str:
     return format_table(rows) + format_faults(snapshot.status)
 
 
-def _list_status_rows(status: Status, time_s: float | None) -> list[tuple[str, str]]:
+def _list_status_rows(status: RobotStatus, time_s: float | None) -> list[tuple[str, str]]:
     """Return the rows that every status has."""
     robot_time = "" if time_s is None else f"{time_s:.2f} s · "
     return [
@@ -151,7 +151,7 @@ def _list_status_rows(status: Status, time_s: float | None) -> list[tuple[str, s
     ]
 
 
-def _list_warning_rows(status: Status) -> list[tuple[str, str]]:
+def _list_warning_rows(status: RobotStatus) -> list[tuple[str, str]]:
     """Return the rows that are shown only when they have something to report."""
     rows: list[tuple[str, str]] = []
     if status.real_time_factor is not None:
@@ -169,12 +169,12 @@ def _list_warning_rows(status: Status) -> list[tuple[str, str]]:
     return rows
 
 
-def _format_speed(status: Status) -> str:
+def _format_speed(status: RobotStatus) -> str:
     wanted = f", {status.speed:g} wanted" if status.speed != 1.0 else ""
     return f"{status.real_time_factor:.2f} of the wall clock{wanted}"
 
 
-def format_faults(status: Status | None) -> str:
+def format_faults(status: RobotStatus | None) -> str:
     """Return the faults since the last reset as a list; empty when there are none."""
     if status is None or not status.faults:
         return ""

@@ -12,7 +12,7 @@ import msgspec
 import viser
 
 from snakesim_hal.wire.messages import ControlParameters
-from snakesim_operator.robot_commands.parameters import Parameter, parse_parameters
+from snakesim_operator.robot_commands.parameters import RobotParameter, parse_parameters
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def list_input_fields(in_force: ControlParameters) -> list[InputField]:
     return fields
 
 
-def _make_field(parameter: Parameter) -> InputField | None:
+def _make_field(parameter: RobotParameter) -> InputField | None:
     """Make the input field for a parameter; return None if its type has no input."""
     value = parameter.value
     if isinstance(value, bool):
@@ -51,7 +51,7 @@ def _make_field(parameter: Parameter) -> InputField | None:
     return None
 
 
-def _make_number_field(parameter: Parameter, value: float) -> InputField:
+def _make_number_field(parameter: RobotParameter, value: float) -> InputField:
     """Make the input field for a number, with the range and the step of its slider.
 
     It allows numbers up to four times the current value in both directions, as far as the parameter's bounds allow.
@@ -84,7 +84,7 @@ def _make_number_field(parameter: Parameter, value: float) -> InputField:
     )
 
 
-def _describe_number(parameter: Parameter) -> str:
+def _describe_number(parameter: RobotParameter) -> str:
     """Return description, bounds and unit of a parameter, as far as it has them."""
     parts: list[str] = []
     if parameter.description:

@@ -10,7 +10,7 @@ SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
 SLIDER_PERIOD_S = 0.1  # between two updates of the slider while the recording plays
 
 
-class Player:
+class RecordingPlayer:
     """The time in the recording that the page shows.
 
     The display loop calls `advance`; the threads of viser and of the web server move the time.

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import viser
 
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.features.console.page.appearance import aim_initial_camera, aim_phone_camera
 from snakesim_operator.features.console.page.camera_tab import draw_picture
 from snakesim_operator.features.console.page.custom_sensors import CustomSensorCharts
 from snakesim_operator.features.console.page.force_polygon import draw_force_polygon, format_push_point_table
 from snakesim_operator.features.console.page.joint_charts import JointCharts
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.scene.drawing import Surroundings, draw
+from snakesim_operator.features.console.scene.drawing import TrueSurroundings, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
 from snakesim_operator.features.console.web.viser_server import PageServer
 
@@ -31,7 +31,7 @@ class RobotTabs:
 class RobotDisplay:
     """The scene, charts and images of a robot. They start over when another robot appears."""
 
-    def __init__(self, server: PageServer, surroundings: Surroundings | None, tabs: RobotTabs) -> None:
+    def __init__(self, server: PageServer, surroundings: TrueSurroundings | None, tabs: RobotTabs) -> None:
         """Show nothing yet.
 
         Args:
@@ -42,7 +42,7 @@ class RobotDisplay:
         self._server = server
         self._surroundings = surroundings
         self._tabs = tabs
-        self._robot: Description | None = None  # the robot that scene and charts are for
+        self._robot: RobotDescription | None = None  # the robot that scene and charts are for
         self._scene: RobotScene | None = None
         self._joint_charts: JointCharts | None = None
         self._sensor_charts: CustomSensorCharts | None = None
@@ -90,7 +90,7 @@ class RobotDisplay:
         if self._scene is not None:
             self._scene.clear_trail()
 
-    def _prepare_for_robot(self, robot: Description) -> None:
+    def _prepare_for_robot(self, robot: RobotDescription) -> None:
         """Replace scene and charts if they are for a robot of another layout, and aim the cameras at the new robot."""
         if self._robot is not None and self._robot.layout == robot.layout:
             return

@@ -24,7 +24,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.console.robot_data.signals import Signals
+from snakesim_operator.features.console.robot_data.signals import SignalSource
 from snakesim_operator.results.page.charts import LIBRARY, round_values, select_rows_to_draw
 from snakesim_operator.results.page.palette import DARK, LIGHT, format_css_variables, make_joint_colors
 
@@ -46,7 +46,7 @@ Series = tuple[Floats, Floats]  # times in s and values, (n,) each
 class SignalsPage:
     """Answers the requests for paths below PATH. The web server calls `answer` in its thread."""
 
-    def __init__(self, signals: Signals, second_stop: bytes = b"") -> None:
+    def __init__(self, signals: SignalSource, second_stop: bytes = b"") -> None:
         """Answer from a source of signals.
 
         Args:

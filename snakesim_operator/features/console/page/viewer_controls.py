@@ -21,7 +21,7 @@ from snakesim_operator.features.console.page.drive_controls import DriveControls
 from snakesim_operator.features.console.page.page_html import BAD, escape_text
 from snakesim_operator.features.console.page.parameter_form import ParameterForm
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.web.admission import MAX_PRESS_AGE_S, Admission, format_age
+from snakesim_operator.features.console.web.admission import MAX_PRESS_AGE_S, ControlAdmission, format_age
 from snakesim_operator.robot_commands.fault import FaultOrder
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
@@ -46,7 +46,7 @@ class ControlContext:
 
     token: ControlToken  # decides which viewer has control
     operations: RobotOperations  # sends commands to the robot
-    admission: Admission  # decides which messages of a page count
+    admission: ControlAdmission  # decides which messages of a page count
     commissioning: CommissioningTab  # runs steps; all viewers share one
     get_snapshot: Callable[[], RobotSnapshot | None]  # returns the newest snapshot; None while there is no robot
     on_control_changed: Callable[[], None]  # called when a viewer took or released control

@@ -12,23 +12,23 @@ from typing import Any
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Session
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_hal.wire.messages import (
     Clock,
     ColorImage,
-    Configuration,
     CustomSample,
     DepthImage,
-    Description,
     JointState,
     Pose,
-    World,
+    RobotDescription,
+    RunConfiguration,
+    WorldModel,
 )
 from snakesim_hal.wire.quantities import Quaternion, Vector
-from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, Stream
+from snakesim_operator.features.console.robot_data.snapshot import MessageStream, RobotSnapshot
 
 # Arrivals of a key that are kept between two snapshots.
 MAX_ARRIVALS = 64
@@ -60,10 +60,10 @@ class KeyBuffer:
 
     def __init__(self, message_type: type[Any], max_arrivals: int) -> None:
         self.count = 0  # of all arrivals
-        self._arrivals: deque[Arrival] = deque(maxlen=max_arrivals)
-        self._decoder: Decoder[Any] = Decoder(message_type)
+        self._arrivals: deque[ReceivedSample] = deque(maxlen=max_arrivals)
+        self._decoder: MessageDecoder[Any] = MessageDecoder(message_type)
 
-    def store(self, arrival: Arrival) -> None:
+    def store(self, arrival: ReceivedSample) -> None:
         """Store an arrival; called by Zenoh's threads."""
         self.count += 1
         self._arrivals.append(arrival)
@@ -125,7 +125,7 @@ class LiveRobot:
         self._buffer_by_key[key] = buffer
         return buffer
 
-    def _store_sensor_arrival(self, arrival: Arrival) -> None:
+    def _store_sensor_arrival(self, arrival: ReceivedSample) -> None:
         """Store an arrival of a camera or a custom sensor; called by Zenoh's threads.
 
         Each camera has a key of its own, and gets a buffer with its first image. A custom sensor has a buffer only if
@@ -139,7 +139,7 @@ class LiveRobot:
             buffer.store(arrival)
 
     @property
-    def robot(self) -> Description | None:
+    def robot(self) -> RobotDescription | None:
         """The newest description."""
         return self._newest_by_key.get(keys.DESCRIPTION)
 
@@ -158,7 +158,7 @@ class LiveRobot:
         now_s = time.monotonic()
         get_newest = self._newest_by_key.get  # returns None for a key without messages
         clock: Clock | None = get_newest(keys.CLOCK)
-        world: World | None = get_newest(keys.WORLD)
+        world: WorldModel | None = get_newest(keys.WORLD)
         body, base = self._find_body_and_base(world)
         return RobotSnapshot(
             robot=robot,
@@ -214,7 +214,7 @@ class LiveRobot:
         elif key == keys.JOINTS:
             self._joint_states.append(message)
 
-    def _update_description(self, robot: Description) -> None:
+    def _update_description(self, robot: RobotDescription) -> None:
         """Keep a description. One of another host makes the messages of the former host void."""
         former = self.robot
         if former is not None and former.host != robot.host:
@@ -226,7 +226,7 @@ class LiveRobot:
             self._replace_sensor_buffers(robot)
         self._newest_by_key[keys.DESCRIPTION] = robot
 
-    def _replace_sensor_buffers(self, robot: Description) -> None:
+    def _replace_sensor_buffers(self, robot: RobotDescription) -> None:
         """Add a buffer for each custom sensor that the robot describes, in the place of the former ones."""
         former_keys = [key for key in self._buffer_by_key if keys.find_row_key(key) == keys.CUSTOM_ALL]
         for key in former_keys:
@@ -237,9 +237,9 @@ class LiveRobot:
 
     # --- parts of a snapshot ---------------------------------------------------------------------------------
 
-    def _find_configuration(self, robot: Description) -> Configuration | None:
+    def _find_configuration(self, robot: RobotDescription) -> RunConfiguration | None:
         """Return the configuration of the host that describes itself, whichever of the two messages came first."""
-        configuration: Configuration | None = self._newest_by_key.get(keys.CONFIG)
+        configuration: RunConfiguration | None = self._newest_by_key.get(keys.CONFIG)
         if configuration is None or configuration.config_hash != robot.config_hash:
             return None
         return configuration
@@ -250,7 +250,9 @@ class LiveRobot:
             host for host, time_s in self._last_status_time_by_host_s.items() if now_s - time_s < MAX_STATUS_AGE_S
         )
 
-    def _find_body_and_base(self, world: World | None) -> tuple[JointState | None, tuple[Vector, Quaternion] | None]:
+    def _find_body_and_base(
+        self, world: WorldModel | None
+    ) -> tuple[JointState | None, tuple[Vector, Quaternion] | None]:
         """Return the pose of the base, and the joint state that was measured nearest to the pose's time.
 
         The pose is that of guidance, else that of motion capture. Without a pose, the joint state is the newest one.
@@ -281,17 +283,17 @@ class LiveRobot:
         self._last_count_time_s = now_s
         self._count_by_key = counts
 
-    def _list_streams(self, clock: Clock | None) -> dict[str, Stream]:
+    def _list_streams(self, clock: Clock | None) -> dict[str, MessageStream]:
         """Return rate and age of each key that has published a message and is not latched."""
-        streams: dict[str, Stream] = {}
+        streams: dict[str, MessageStream] = {}
         for key in list(self._buffer_by_key):
             message = self._newest_by_key.get(key)
             if message is not None and key not in LATCHED_MESSAGE_KEYS:
-                streams[key] = Stream(self._rate_by_key_hz.get(key, 0.0), _find_age_s(message, clock))
+                streams[key] = MessageStream(self._rate_by_key_hz.get(key, 0.0), _find_age_s(message, clock))
         return streams
 
 
-def _find_base_time_ns(world: World) -> int:
+def _find_base_time_ns(world: WorldModel) -> int:
     """Return the robot time of the base's pose in a world.
 
     If guidance gives a standard deviation, it has moved the pose on to the world's own timestamp by dead reckoning.

@@ -8,10 +8,10 @@ from typing import Any
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.custom_sample import find_message_type
-from snakesim_hal.wire.messages import Description
-from snakesim_operator.features.console.robot_data.snapshot import Stream
+from snakesim_hal.wire.messages import RobotDescription
+from snakesim_operator.features.console.robot_data.snapshot import MessageStream
 from snakesim_operator.recording.message import RecordedMessage
 
 IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOR_ALL)
@@ -53,7 +53,7 @@ class MessageHistory:
         self._messages: dict[str, _KeyMessages] = {}  # by key
         self._image_bytes = 0
         self.image_decimation = 1  # one of so many images is kept
-        self.robot: Description | None = None  # describes custom sensors
+        self.robot: RobotDescription | None = None  # describes custom sensors
         self._decode_cached = lru_cache(MAX_DECODED)(self._decode)
 
     def add(self, message: RecordedMessage) -> None:
@@ -110,16 +110,16 @@ class MessageHistory:
             if message is not None:
                 yield time_s, message
 
-    def measure_streams(self, time_s: float) -> dict[str, Stream]:
+    def measure_streams(self, time_s: float) -> dict[str, MessageStream]:
         """Return the rate over the last second and the age of each key at a time, by key."""
-        streams: dict[str, Stream] = {}
+        streams: dict[str, MessageStream] = {}
         for key, messages in sorted(self._messages.items()):
             count = bisect_right(messages.times_s, time_s)
             if count == 0 or keys.find_row_key(key) in LATCHED_KEYS:
                 continue
             recent_count = count - bisect_right(messages.times_s, time_s - RATE_PERIOD_S)
             age_s = time_s - messages.times_s[count - 1]
-            streams[key] = Stream(recent_count / RATE_PERIOD_S, age_s)
+            streams[key] = MessageStream(recent_count / RATE_PERIOD_S, age_s)
         return streams
 
     def _decode(self, key: str, index: int) -> Any:
@@ -129,6 +129,6 @@ class MessageHistory:
         if message_type is None:
             return None
         try:
-            return Decoder(message_type).decode(kept.payload, kept.encoding)
+            return MessageDecoder(message_type).decode(kept.payload, kept.encoding)
         except WireError:
             return None

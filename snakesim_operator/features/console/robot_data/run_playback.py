@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointState, Mode, Trajectory, World
+from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointMode, JointState, Trajectory, WorldModel
 from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_operator.features.console.operations import MAX_LOG_LINES
 from snakesim_operator.features.console.page_log import StateChangeLog
@@ -21,7 +21,7 @@ MAX_CONTROL_AGE_S = 0.3  # controllers publish more often, so an older message i
 CHART_HISTORY_S = 10.0  # shown before an instant that a viewer jumps to
 CHART_SAMPLES = 200  # in CHART_HISTORY_S
 
-MessageT = TypeVar("MessageT", ControlState, World, Trajectory)
+MessageT = TypeVar("MessageT", ControlState, WorldModel, Trajectory)
 
 
 class RunPlayback:
@@ -164,7 +164,7 @@ class RunPlayback:
             tick=0,
             timestamp_ns=round(record.time_s[row] * 1e9),
             sequence=None,
-            mode=[Mode(mode) for mode in record.mode[row].tolist()],
+            mode=[JointMode(mode) for mode in record.mode[row].tolist()],
             target=_replace_nan(record.target[row]),
             torque_limit_nm=_replace_nan(record.torque_limit_nm[row]),
         )
@@ -180,7 +180,7 @@ class RunPlayback:
         return (x, y, z), (qw, qx, qy, qz)
 
 
-def get_timestamp_s(message: ControlState | World | Trajectory) -> float:
+def get_timestamp_s(message: ControlState | WorldModel | Trajectory) -> float:
     """Return the robot time of a controller's message in s; 0 if it has none."""
     return (message.timestamp_ns or 0) * 1e-9
 

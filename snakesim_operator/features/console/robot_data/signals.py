@@ -20,7 +20,7 @@ from snakesim_hal.model.field_words import find_unit_in_name
 from snakesim_hal.run_log.black_box import summarize_contacts
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.custom_sample import find_custom_messages
-from snakesim_hal.wire.messages import AppliedCommand, ControlState, Description, Imu, JointState, Message, Power
+from snakesim_hal.wire.messages import AppliedCommand, ControlState, Imu, JointState, Message, Power, RobotDescription
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 LIVE_HISTORY_S = 60.0
@@ -41,7 +41,7 @@ PREFIXED_MESSAGES: dict[str, type[Message]] = {
 }
 
 
-class Signals(Protocol):
+class SignalSource(Protocol):
     """A source of signals. Every method may be called from any thread."""
 
     recorded: bool
@@ -63,7 +63,7 @@ class Signals(Protocol):
 
 
 @dataclass(frozen=True)
-class _Sample:
+class _LiveValues:
     """The numbers of a live robot at one time."""
 
     time_s: float
@@ -78,7 +78,7 @@ class LiveSignals:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._samples: deque[_Sample] = deque(maxlen=round(LIVE_HISTORY_S / LIVE_PERIOD_S))
+        self._samples: deque[_LiveValues] = deque(maxlen=round(LIVE_HISTORY_S / LIVE_PERIOD_S))
         self._units: dict[str, str] = {}
 
     def add_snapshot(self, snapshot: RobotSnapshot) -> None:
@@ -95,7 +95,7 @@ class LiveSignals:
                 self._samples.clear()
                 self._units.clear()
             self._units |= numbers.units
-            self._samples.append(_Sample(time_s, tuple(numbers.values), values))
+            self._samples.append(_LiveValues(time_s, tuple(numbers.values), values))
 
     def now_s(self) -> float | None:
         """Return the robot time of the newest sample, if there is one."""
@@ -118,7 +118,7 @@ class LiveSignals:
         return np.array([sample.time_s for sample in samples]), np.array(values)
 
 
-def list_message_numbers(message: Message, robot: Description) -> dict[str, float]:
+def list_message_numbers(message: Message, robot: RobotDescription) -> dict[str, float]:
     """Return the numbers of a message that have a unit, by signal."""
     numbers: dict[str, float] = {}
     prefix = type(message).__name__.removesuffix("State").lower()
@@ -158,7 +158,7 @@ def _find_first_unit(schemas: Iterable[Any]) -> str | None:
     return None
 
 
-def _flatten_fields(name: str, value: Any, robot: Description, numbers: dict[str, float]) -> None:
+def _flatten_fields(name: str, value: Any, robot: RobotDescription, numbers: dict[str, float]) -> None:
     """Add each number of a field to `numbers`, under the field's name and the name of each part."""
     if isinstance(value, dict):
         parts = list(value.items())
@@ -171,7 +171,7 @@ def _flatten_fields(name: str, value: Any, robot: Description, numbers: dict[str
         _flatten_fields(f"{name}.{part}", element, robot, numbers)
 
 
-def _name_parts(values: list[Any] | tuple[Any, ...], robot: Description) -> Iterable[object]:
+def _name_parts(values: list[Any] | tuple[Any, ...], robot: RobotDescription) -> Iterable[object]:
     """Return the names of a field's parts: axes of a vector, joints of a list with one value for each, else indices."""
     if isinstance(values, tuple) and len(values) == 3:
         return "xyz"

@@ -9,25 +9,25 @@ from snakesim_hal.model.scenario import RunConfig, compute_config_hash, compute_
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     ColorImage,
-    Configuration,
     Contacts,
     ControlParameters,
     ControlState,
     CustomSample,
     DepthImage,
-    Description,
     Imu,
     JointState,
     Power,
-    Status,
+    RobotDescription,
+    RobotStatus,
+    RunConfiguration,
     Trajectory,
-    World,
+    WorldModel,
 )
 from snakesim_hal.wire.quantities import Quaternion, Vector
 
 
 @dataclass(frozen=True)
-class Stream:
+class MessageStream:
     """Rate and age of the messages of one key."""
 
     rate_hz: float
@@ -38,14 +38,14 @@ class Stream:
 class RobotSnapshot:
     """One instant of a robot. None means that a value is not known."""
 
-    robot: Description
+    robot: RobotDescription
 
     # Host.
     expected: bool = False  # True: the run is starting, and no host has described the robot yet
     time_s: float | None = None  # robot time
     time_since_status_s: float = 0.0  # since the newest status of the host arrived
-    status: Status | None = None
-    configuration: Configuration | None = None
+    status: RobotStatus | None = None
+    configuration: RunConfiguration | None = None
     hosts: frozenset[str] = frozenset()  # ids of all hosts that publish a status; more than one: an impostor
 
     # Robot.
@@ -60,13 +60,13 @@ class RobotSnapshot:
     custom: dict[str, CustomSample] = field(default_factory=dict[str, CustomSample])  # of custom sensors, by key
 
     # Controller.
-    world: World | None = None
+    world: WorldModel | None = None
     trajectory: Trajectory | None = None
     control: ControlState | None = None
     parameters: ControlParameters | None = None
 
     # Network and log.
-    streams: dict[str, Stream] = field(default_factory=dict)  # by key
+    streams: dict[str, MessageStream] = field(default_factory=dict)  # by key
     log: Sequence[str] = ()  # of a recording: changes of the robot's state until then, newest first
 
 

@@ -14,7 +14,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
 from snakesim_hal.physics.hills import make_heights
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Obstacle, World, WorldContact
+from snakesim_hal.wire.messages import ColorImage, DepthImage, KnownObstacle, WorldContact, WorldModel
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.results.metrics.force_tracking import is_contact_measured
 
@@ -40,13 +40,13 @@ def _make_no_arrows() -> Floats:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class TrueSurroundings:
     """The true surroundings of a robot, from the configuration of its run."""
 
     config: RunConfig
 
     @cached_property
-    def obstacles(self) -> list[Obstacle]:
+    def obstacles(self) -> list[KnownObstacle]:
         """All obstacles, with steps among them."""
         return [placed.obstacle for placed in place_obstacles(self.config)]
 
@@ -96,7 +96,7 @@ class ForceArrows:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Drawing(ForceArrows):
+class SnapshotDrawing(ForceArrows):
     """Everything that is drawn of one snapshot."""
 
     # The snake.
@@ -110,13 +110,13 @@ class Drawing(ForceArrows):
 
     # What it moves among.
     path_w: Floats = field(default_factory=_make_no_points)
-    perceived: tuple[Obstacle, ...] = ()  # by guidance
+    perceived: tuple[KnownObstacle, ...] = ()  # by guidance
     pushed_obstacles: frozenset[str] = frozenset()  # names; the body pushes off these
     obstacles_ahead: frozenset[str] = frozenset()  # names; navigation expects push-points there along the path
     cameras: tuple[CameraFrustum, ...] = ()
 
 
-def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing | None:
+def draw(snapshot: RobotSnapshot, surroundings: TrueSurroundings | None) -> SnapshotDrawing | None:
     """Compute the positions of everything that is drawn of a snapshot.
 
     If the pose of the robot is unknown, its tail is drawn at the origin.
@@ -146,7 +146,7 @@ def draw(snapshot: RobotSnapshot, surroundings: Surroundings | None) -> Drawing 
         path_w = _lay_on_ground(np.array(snapshot.trajectory.path_w), surroundings)
         obstacles_ahead = frozenset(snapshot.trajectory.push_points)
     cameras = [_make_camera_frustum(key, image, origins_w, rotations) for key, image in snapshot.images.items()]
-    return Drawing(
+    return SnapshotDrawing(
         # The snake.
         center_w=center_w,
         links_w=middles_w,
@@ -195,7 +195,7 @@ def find_propulsion_joint(snapshot: RobotSnapshot) -> int | None:
     return None
 
 
-def _list_perceived(world: World | None) -> tuple[Obstacle, ...]:
+def _list_perceived(world: WorldModel | None) -> tuple[KnownObstacle, ...]:
     """Return the obstacles that guidance knows from its sensors.
 
     Those that it knows from a map are the truth, which is drawn anyway.
@@ -279,7 +279,7 @@ def _arrows(start_w: Floats, span: Floats) -> Floats:
     return np.stack([start_w, start_w + span], axis=1)
 
 
-def _lay_on_ground(points_w: Floats, surroundings: Surroundings | None) -> Floats:
+def _lay_on_ground(points_w: Floats, surroundings: TrueSurroundings | None) -> Floats:
     """Return points (n, 2) lifted to just above the ground, (n, 3)."""
     heights_m = np.zeros(len(points_w))
     if surroundings is not None:

@@ -7,9 +7,9 @@ import numpy as np
 import viser
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.features.console.scene.batches import add_batch, to_float32
-from snakesim_operator.features.console.scene.drawing import Drawing
+from snakesim_operator.features.console.scene.drawing import SnapshotDrawing
 from snakesim_operator.features.console.scene.meshes import (
     Mesh,
     make_box,
@@ -60,12 +60,12 @@ class ObstacleMeshes:
         self._options = options
         self.batches: dict[str, viser.BatchedMeshHandle] = {}  # by shape
 
-    def show(self, obstacles: Sequence[Obstacle], scale: float = 1.0) -> None:
+    def show(self, obstacles: Sequence[KnownObstacle], scale: float = 1.0) -> None:
         """Draw these obstacles, and hide shapes of which there is none."""
         for shape in self._shapes:
             self._show_shape(shape, [obstacle for obstacle in obstacles if obstacle.shape == shape], scale)
 
-    def _show_shape(self, shape: str, obstacles: Sequence[Obstacle], scale: float) -> None:
+    def _show_shape(self, shape: str, obstacles: Sequence[KnownObstacle], scale: float) -> None:
         batch = self.batches.get(shape)
         if batch is not None:
             batch.visible = bool(obstacles)
@@ -99,12 +99,12 @@ class ObstacleMeshes:
 class TrueObstacles:
     """Draws the obstacles that are really there, colored by what the body does with them."""
 
-    def __init__(self, scene: viser.SceneApi, obstacles: Sequence[Obstacle]) -> None:
+    def __init__(self, scene: viser.SceneApi, obstacles: Sequence[KnownObstacle]) -> None:
         self._obstacles = obstacles
         self._meshes = ObstacleMeshes(scene, "true", TRUE_SHAPES, OBSTACLE, opacity=TRUE_OPACITY)
         self._meshes.show(obstacles)
 
-    def show(self, drawing: Drawing) -> None:
+    def show(self, drawing: SnapshotDrawing) -> None:
         """Mark the obstacles that the body pushes off, and those that navigation expects it to push off."""
         for shape in TRUE_SHAPES:
             names = [obstacle.name for obstacle in self._obstacles if obstacle.shape == shape]
@@ -120,7 +120,7 @@ class PerceivedObstacles:
             scene, "perceived", PERCEIVED_SHAPES, PERCEIVED, opacity=1.0, side="double", cast_shadow=False
         )
 
-    def show(self, obstacles: Sequence[Obstacle]) -> None:
+    def show(self, obstacles: Sequence[KnownObstacle]) -> None:
         """Draw these obstacles, and hide those of the frame before."""
         self.meshes.show(obstacles, PERCEIVED_SCALE)
         for shape in PERCEIVED_SHAPES:
@@ -129,7 +129,7 @@ class PerceivedObstacles:
                 self.meshes.set_opacities(shape, opacities)
 
 
-def _choose_obstacle_color(name: str, drawing: Drawing) -> Color:
+def _choose_obstacle_color(name: str, drawing: SnapshotDrawing) -> Color:
     if name in drawing.pushed_obstacles:
         return PUSHED_OBSTACLE
     if name in drawing.obstacles_ahead:
@@ -137,7 +137,7 @@ def _choose_obstacle_color(name: str, drawing: Drawing) -> Color:
     return OBSTACLE
 
 
-def _compute_mesh_scale(obstacle: Obstacle) -> tuple[float, float, float]:
+def _compute_mesh_scale(obstacle: KnownObstacle) -> tuple[float, float, float]:
     """Return the factors by which the unit mesh of the obstacle's shape is stretched along x, y and z."""
     match obstacle.shape:
         case "box":

@@ -12,10 +12,10 @@ import numpy as np
 import viser
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.features.console.scene import scene_colors
 from snakesim_operator.features.console.scene.batches import add_batch, to_float32
-from snakesim_operator.features.console.scene.drawing import CameraFrustum, Drawing, Surroundings
+from snakesim_operator.features.console.scene.drawing import CameraFrustum, SnapshotDrawing, TrueSurroundings
 from snakesim_operator.features.console.scene.meshes import make_capsule, make_cylinder
 from snakesim_operator.features.console.scene.obstacle_meshes import PerceivedObstacles, TrueObstacles
 from snakesim_operator.features.console.scene.scene_colors import Color, convert_to_linear_colors
@@ -33,7 +33,7 @@ NO_SEGMENTS = np.zeros((1, 2, 3))  # placeholder: viser accepts no empty line
 class RobotScene:
     """The 3-D scene of one robot."""
 
-    def __init__(self, scene: viser.SceneApi, robot: Description, surroundings: Surroundings | None) -> None:
+    def __init__(self, scene: viser.SceneApi, robot: RobotDescription, surroundings: TrueSurroundings | None) -> None:
         """Add everything to the 3-D scene that does not depend on a snapshot: links, hinges, ground and obstacles.
 
         Args:
@@ -117,7 +117,7 @@ class RobotScene:
             visible=False,
         )
 
-    def _add_ground(self, surroundings: Surroundings | None) -> None:
+    def _add_ground(self, surroundings: TrueSurroundings | None) -> None:
         """Add the ground to the scene: its heightfield, if it has one, and a grid below its lowest point.
 
         Args:
@@ -171,7 +171,7 @@ class RobotScene:
 
     # --- each frame ------------------------------------------------------------------------------------------
 
-    def show(self, drawing: Drawing) -> None:
+    def show(self, drawing: SnapshotDrawing) -> None:
         """Update all nodes from the drawing of one snapshot."""
         self._show_snake(drawing)
         self._show_contacts(drawing)
@@ -189,7 +189,7 @@ class RobotScene:
         self._trail.clear()
         self._view_center_w = None
 
-    def _show_snake(self, drawing: Drawing) -> None:
+    def _show_snake(self, drawing: SnapshotDrawing) -> None:
         for batch, indices in self._links:
             batch.batched_positions = to_float32(drawing.links_w[indices])
             batch.batched_wxyzs = to_float32(drawing.links_wxyz[indices])
@@ -197,7 +197,7 @@ class RobotScene:
         self._hinges.batched_wxyzs = to_float32(drawing.hinges_wxyz)
         self._mark_joints(drawing)
 
-    def _mark_joints(self, drawing: Drawing) -> None:
+    def _mark_joints(self, drawing: SnapshotDrawing) -> None:
         """Color and enlarge failed joints and the propulsion joint."""
         count = len(drawing.hinges_w)
         colors: list[Color] = [scene_colors.HINGE] * count
@@ -212,14 +212,14 @@ class RobotScene:
         self._hinges.batched_colors = convert_to_linear_colors(colors)
         self._hinges.batched_scales = scales
 
-    def _show_contacts(self, drawing: Drawing) -> None:
+    def _show_contacts(self, drawing: SnapshotDrawing) -> None:
         self._contacts.visible = len(drawing.contacts_w) > 0
         if len(drawing.contacts_w):
             self._contacts.points = to_float32(drawing.contacts_w)
         self._show_arrows("contacts/normals", drawing.normals, scene_colors.CONTACT_NORMAL, 0.10)
         self._show_arrows("contacts/tangents", drawing.tangents, scene_colors.CONTACT_TANGENT, 0.08)
 
-    def _show_forces(self, drawing: Drawing) -> None:
+    def _show_forces(self, drawing: SnapshotDrawing) -> None:
         self._show_arrows("forces/measured", drawing.measured_forces, scene_colors.MEASURED_FORCE, 0.22)
         self._show_arrows("forces/desired", drawing.desired_forces, scene_colors.DESIRED_FORCE, 0.16)
         self._show_dashed_forces(drawing.forces_without_contact)

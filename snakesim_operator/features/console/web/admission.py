@@ -36,11 +36,11 @@ MAX_PRESS_AGE_S = 5.0  # of a press that may move the robot: an older one was me
 MAX_HOLD_AGE_S = 0.5  # of a message that a button or key is held: the finger may be up by now
 
 
-class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
+class _ViewerMessage(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
     pass
 
 
-class ViewerCamera(_Message, frozen=True, tag="ViewerCameraMessage"):
+class ViewerCamera(_ViewerMessage, frozen=True, tag="ViewerCameraMessage"):
     """The position and direction from which a viewer looks at the scene."""
 
     wxyz: tuple[Number, Number, Number, Number]
@@ -54,33 +54,33 @@ class ViewerCamera(_Message, frozen=True, tag="ViewerCameraMessage"):
     up_direction: Vector
 
 
-class Value(Struct, frozen=True, forbid_unknown_fields=True):
+class ControlValue(Struct, frozen=True, forbid_unknown_fields=True):
     """The one attribute of a control that a browser may set."""
 
     value: bool | int | Number | Text
 
 
-class Update(_Message, frozen=True, tag="GuiUpdateMessage"):
+class UpdateMessage(_ViewerMessage, frozen=True, tag="GuiUpdateMessage"):
     """A control has another value, or a button was pressed."""
 
     uuid: Identifier
-    updates: Value
+    updates: ControlValue
 
 
-class Hold(_Message, frozen=True, tag="GuiButtonHoldMessage"):
+class HoldMessage(_ViewerMessage, frozen=True, tag="GuiButtonHoldMessage"):
     """A button is held; repeated at that frequency."""
 
     uuid: Identifier
     frequency: Number
 
 
-class Trigger(_Message, frozen=True, tag="CommandTriggerMessage"):
+class TriggerMessage(_ViewerMessage, frozen=True, tag="CommandTriggerMessage"):
     """The key of a command was pressed."""
 
     uuid: Identifier
 
 
-class QuestionAnswer(_Message, frozen=True, tag="LocalStorageGetItemResponseMessage"):
+class QuestionAnswer(_ViewerMessage, frozen=True, tag="LocalStorageGetItemResponseMessage"):
     """A page's answer to a question of `pacing`."""
 
     request_uuid: Identifier
@@ -88,7 +88,7 @@ class QuestionAnswer(_Message, frozen=True, tag="LocalStorageGetItemResponseMess
     error: Text | None
 
 
-ControlMessage = Update | Hold | Trigger
+ControlMessage = UpdateMessage | HoldMessage | TriggerMessage
 Handler = Callable[[int, PageAction], None]  # called with the viewer and the time of the action
 
 
@@ -107,12 +107,12 @@ class _AdmittedControl:
 
     def is_late(self, message: ControlMessage, action: PageAction) -> bool:
         """Return whether a message is too old to be handled."""
-        if isinstance(message, Update) and message.updates.value in self.at_any_age:
+        if isinstance(message, UpdateMessage) and message.updates.value in self.at_any_age:
             return False
         return action.age_s > self.max_age_s
 
 
-class Admission:
+class ControlAdmission:
     """Holds the controls that viewers may use, and checks each message of a browser. Thread-safe."""
 
     def __init__(self, report: Callable[[str], None] = lambda _: None) -> None:
@@ -208,7 +208,7 @@ class Admission:
             return None
         if isinstance(message, QuestionAnswer):
             age.note_answer(message.request_uuid)
-        elif isinstance(message, Update | Hold | Trigger):
+        elif isinstance(message, UpdateMessage | HoldMessage | TriggerMessage):
             control = self._find_control(viewer, message)
             if control is None:
                 return None
@@ -267,7 +267,7 @@ def _make_message_validator(control: Any, hold_hz: float) -> Callable[[ControlMe
     """
     match control:
         case viser.CommandHandle():
-            return lambda message: isinstance(message, Trigger)
+            return lambda message: isinstance(message, TriggerMessage)
         case viser.GuiButtonHandle():
             return lambda message: _is_press_or_hold(message, hold_hz)
         case viser.GuiCheckboxHandle():
@@ -287,14 +287,14 @@ def _make_message_validator(control: Any, hold_hz: float) -> Callable[[ControlMe
 
 def _make_value_validator(is_valid: Callable[[Any], bool]) -> Callable[[ControlMessage], bool]:
     """Return a function that accepts updates whose value is valid, and no other messages."""
-    return lambda message: isinstance(message, Update) and is_valid(message.updates.value)
+    return lambda message: isinstance(message, UpdateMessage) and is_valid(message.updates.value)
 
 
 def _is_press_or_hold(message: ControlMessage, hold_hz: float) -> bool:
     """Return whether a button was pressed, or is held and repeats that at `hold_hz` (0: it cannot be held)."""
-    if isinstance(message, Update):
+    if isinstance(message, UpdateMessage):
         return message.updates.value is True
-    return isinstance(message, Hold) and hold_hz > 0 and message.frequency == hold_hz
+    return isinstance(message, HoldMessage) and hold_hz > 0 and message.frequency == hold_hz
 
 
 def _is_number_within(

@@ -7,17 +7,17 @@ from websockets.http11 import Request
 
 from snakesim_hal.base.workers import ErrorReporter
 from snakesim_operator.features.console.web.added_html import DARK_COOKIE
-from snakesim_operator.features.console.web.admission import Admission
+from snakesim_operator.features.console.web.admission import ControlAdmission
 from snakesim_operator.features.console.web.message_age import MessageAge
 
 MAX_MESSAGES_PER_S = 300.0  # a page sends at most 50 a second of a camera and 20 of a slider
 MAX_BURST = 300.0  # messages that may arrive at once after a pause
 
 
-class Browser:
+class BrowserConnection:
     """A browser whose page is open. The event loop of the page server calls its methods."""
 
-    def __init__(self, request: Request, admission: Admission) -> None:
+    def __init__(self, request: Request, admission: ControlAdmission) -> None:
         """Start without a viewer number. `request` is the one with which the browser opened its websocket."""
         cookies = "; ".join(request.headers.get_all("Cookie"))
         self.prefers_dark = DARK_COOKIE in cookies.split("; ")

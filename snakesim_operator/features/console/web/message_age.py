@@ -26,12 +26,12 @@ class PageAction:
 
 
 @dataclass(frozen=True)
-class _Question:
+class _AgeQuestion:
     asked_s: float
     robot_ns: int | None
 
 
-NO_QUESTION = _Question(-math.inf, None)  # before the page has answered any
+NO_QUESTION = _AgeQuestion(-math.inf, None)  # before the page has answered any
 
 
 class MessageAge:
@@ -42,7 +42,7 @@ class MessageAge:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._unanswered: dict[str, _Question] = {}
+        self._unanswered: dict[str, _AgeQuestion] = {}
         self._answered = NO_QUESTION
 
     def may_ask(self) -> bool:
@@ -58,7 +58,7 @@ class MessageAge:
             robot_ns: The robot's time, if it is known.
         """
         with self._lock:
-            self._unanswered[question] = _Question(now_s, robot_ns)
+            self._unanswered[question] = _AgeQuestion(now_s, robot_ns)
 
     def note_answer(self, question: str) -> None:
         """Note an answer. An answer to a question that was not asked is ignored."""

@@ -16,7 +16,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from snakesim_operator.base.byte_relay import run_until_one_ends
-from snakesim_operator.features.console.web.browser import Browser
+from snakesim_operator.features.console.web.browser import BrowserConnection
 from snakesim_operator.features.console.web.viser_server import PageServer
 
 MAX_VIEWERS = 64
@@ -50,7 +50,7 @@ class BrowserRelay:
         self._page_server = page_server
         self._page = page_html
         self._handle_first = answer_first
-        self._open_browsers: set[Browser] = set()
+        self._open_browsers: set[BrowserConnection] = set()
         # Bytes that are no websocket are no errors of the console.
         self._quiet_logger = logging.getLogger(f"{__name__}.websockets")
         self._quiet_logger.addHandler(logging.NullHandler())
@@ -117,7 +117,7 @@ class BrowserRelay:
     async def _serve_browser(self, connection: ServerConnection) -> None:
         """Relay the messages of one browser until it leaves."""
         assert connection.request is not None
-        browser = Browser(connection.request, self._page_server.admission)
+        browser = BrowserConnection(connection.request, self._page_server.admission)
         if len(self._open_browsers) >= MAX_VIEWERS:
             reason = f"more than {MAX_VIEWERS} pages are open"
             browser.drop("too many viewers", reason)
@@ -132,7 +132,7 @@ class BrowserRelay:
         finally:
             self._open_browsers.discard(browser)
 
-    async def _connect_to_viser(self, connection: ServerConnection, browser: Browser) -> None:
+    async def _connect_to_viser(self, connection: ServerConnection, browser: BrowserConnection) -> None:
         """Open a connection to viser for a browser, and relay messages in both directions until either side ends."""
         protocols = None if connection.subprotocol is None else [connection.subprotocol]
         with self._page_server.expect_browser(browser) as address:
@@ -145,14 +145,14 @@ class BrowserRelay:
             await connection.close(to_viser.close_code, to_viser.close_reason or "")
 
 
-async def _relay_messages(browser: Browser, connection: ServerConnection, to_viser: ClientConnection) -> None:
+async def _relay_messages(browser: BrowserConnection, connection: ServerConnection, to_viser: ClientConnection) -> None:
     """Relay messages in both directions until either side ends."""
     to_viser_direction = _relay_to_viser(browser, connection, to_viser)
     to_browser_direction = _relay_to_browser(to_viser, connection)
     await run_until_one_ends(to_viser_direction, to_browser_direction)
 
 
-async def _relay_to_viser(browser: Browser, connection: ServerConnection, to_viser: ClientConnection) -> None:
+async def _relay_to_viser(browser: BrowserConnection, connection: ServerConnection, to_viser: ClientConnection) -> None:
     """Pass each message of a browser that is admitted on to viser, until a connection is closed."""
     await browser.wait_for_number()
     try:

@@ -9,7 +9,7 @@ from typing import Any
 
 from snakesim_operator.base.console_port import LOOPBACK
 from snakesim_operator.features.console.web.added_html import add_html
-from snakesim_operator.features.console.web.admission import Admission
+from snakesim_operator.features.console.web.admission import ControlAdmission
 from snakesim_operator.features.console.web.page_server import AnswerRequest, BrowserRelay
 from snakesim_operator.features.console.web.viser_server import PageServer
 
@@ -33,7 +33,7 @@ def serve_pages(
         has_stop: Whether there is a robot that can be stopped.
     """
     with _ignore_output():
-        server = PageServer(Admission(report))
+        server = PageServer(ControlAdmission(report))
     page = add_html(_read_page(server.get_port()), has_stop=has_stop)
     with BrowserRelay(listening_socket, server, page, answer_first):
         try:

@@ -12,8 +12,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from snakesim_operator.base.console_port import LOOPBACK
-from snakesim_operator.features.console.web.admission import Admission
-from snakesim_operator.features.console.web.browser import Browser
+from snakesim_operator.features.console.web.admission import ControlAdmission
+from snakesim_operator.features.console.web.browser import BrowserConnection
 from snakesim_operator.features.console.web.pacing import ask_page, pace_pages
 
 ANY_FREE_PORT = 0
@@ -29,19 +29,21 @@ class PageServer(viser.ViserServer):
     viser counts only pages that can draw the scene; this server knows all of them by their connections.
     """
 
-    def __init__(self, admission: Admission) -> None:
+    def __init__(self, admission: ControlAdmission) -> None:
         """Start to listen."""
         super().__init__(LOOPBACK, ANY_FREE_PORT, label="SnakeSIM", verbose=False)
         self.admission = admission
-        self._expected: dict[str, Browser] = {}  # by the path of the connection that the page server opens for it
-        self._browsers: dict[int, Browser] = {}  # by viewer
+        self._expected: dict[
+            str, BrowserConnection
+        ] = {}  # by the path of the connection that the page server opens for it
+        self._browsers: dict[int, BrowserConnection] = {}  # by viewer
         self._websock_server.on_client_connect(self._check_connection)
         self._websock_server.on_client_disconnect(self._on_viewer_gone)
         self._websock_server.disconnect_all_clients()  # which connected before they were checked
         pace_pages(self)
 
     @contextlib.contextmanager
-    def expect_browser(self, browser: Browser) -> Iterator[str]:
+    def expect_browser(self, browser: BrowserConnection) -> Iterator[str]:
         """Accept one connection for a browser while the context lasts, and yield the address to connect to."""
         path = f"/{secrets.token_urlsafe(PASSWORD_BYTES)}"
         self._expected[path] = browser

@@ -9,18 +9,18 @@ from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_operator.features.reproduce.endless_curve import find_endless_motion
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
     Experiment,
-    Findings,
-    Picture,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
     explain_by_steps,
     fit_exponent,
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion, GroundFriction
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import GaitRun, Trials, make_serpenoid_run, set_skin
+from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run, set_skin
 
 RATIOS = (20.0, 40.0, 80.0, 160.0)  # of transverse to forward friction
 FACTORS = (0.64, 0.8, 1.0, 1.25, 1.5)  # of the amplitudes that are tried, around the expected optimum
@@ -34,7 +34,7 @@ class AlbenAmplitude(Experiment):
     """Exponent of the optimal amplitude in the transverse friction."""
 
     name = "alben-amplitude"
-    source = Source(
+    source = PublishedSource(
         authors="S. Alben",
         title="Optimizing snake locomotion in the plane",
         published_in="Proceedings of the Royal Society A 469",
@@ -59,7 +59,7 @@ class AlbenAmplitude(Experiment):
         "deflections at the minima, by least squares."
     )
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the work per distance at several amplitudes and ratios."""
         ratios = RATIOS[1:3] if trials.is_quick else RATIOS
         cases = [(ratio, angle_rad) for ratio in ratios for angle_rad in _tried_angles_rad(ratio)]
@@ -82,7 +82,7 @@ class AlbenAmplitude(Experiment):
                 )
             )
         steps.append(("", exponent))
-        comparison = Comparison(
+        comparison = PublishedComparison(
             quantity="exponent of the optimal deflection",
             unit="1",
             published=PUBLISHED_EXPONENT,
@@ -90,22 +90,22 @@ class AlbenAmplitude(Experiment):
             ours=exponent,
             runs=len(cases),
         )
-        picture = Picture(
+        picture = ExperimentPicture(
             x_label="transverse over forward friction",
             y_label="optimal deflection [body lengths]",
             curves=(
-                Curve(
+                PictureCurve(
                     label="power -1/4, from our derivation",
                     x=ratios,
                     y=[WAVELENGTH / (2.0 * math.pi) * _expect_optimum_rad(ratio) for ratio in ratios],
                 ),
-                Curve(label="endless body", x=ratios, y=endless),
-                Curve(label="simulator", x=ratios, y=ours, is_ours=True),
+                PictureCurve(label="endless body", x=ratios, y=endless),
+                PictureCurve(label="simulator", x=ratios, y=ours, is_ours=True),
             ),
             is_logarithmic=True,
         )
         reasons = explain_by_steps(steps, unit="1", rest="servos, contacts, and the fit of the minima")
-        return Findings(comparisons=(comparison,), reasons=reasons, picture=picture)
+        return ExperimentFindings(comparisons=(comparison,), reasons=reasons, picture=picture)
 
 
 def find_deflection(winding_angle_rad: float) -> float:

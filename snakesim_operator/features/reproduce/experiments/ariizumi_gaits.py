@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
+    DifferenceReason,
     Experiment,
-    Findings,
-    Picture,
-    Reason,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
 )
-from snakesim_operator.features.reproduce.trials import Trials, make_config
+from snakesim_operator.features.reproduce.trials import ExperimentTrials, make_config
 from snakesim_operator.run.in_process import simulate
 
 DURATION_S = 8
@@ -26,7 +26,7 @@ CONTROLLERS = {  # and the settings of each
 
 
 @dataclass(frozen=True)
-class Case:
+class GaitOnGround:
     """A gait on ground with some friction."""
 
     gait: str  # one of CONTROLLERS
@@ -46,7 +46,7 @@ class AriizumiGaits(Experiment):
     """Order of three gaits by energy."""
 
     name = "ariizumi-gaits"
-    source = Source(
+    source = PublishedSource(
         authors="R. Ariizumi and F. Matsuno",
         title="Dynamic Analysis of Three Snake Robot Gaits",
         published_in="IEEE Transactions on Robotics 33",
@@ -71,25 +71,25 @@ class AriizumiGaits(Experiment):
     )
     depends_on_seed = True
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Run the gaits at several ratios of friction, and sinus-lifting with strong motors too."""
         ratios = (RATIOS[0], RATIOS[-1]) if trials.is_quick else RATIOS
         seeds = range(1, (1 if trials.is_quick else trials.seeds) + 1)
-        cases = [Case(gait, ratio) for gait in CONTROLLERS for ratio in ratios]
-        cases.append(Case("sinus-lifting", ratios[-1], NO_TORQUE_LIMIT_NM))
+        cases = [GaitOnGround(gait, ratio) for gait in CONTROLLERS for ratio in ratios]
+        cases.append(GaitOnGround("sinus-lifting", ratios[-1], NO_TORQUE_LIMIT_NM))
         energies: list[GaitEnergy] = trials.call(run_trial, [(case, seed) for case in cases for seed in seeds])
-        found: dict[Case, list[GaitEnergy]] = {}
+        found: dict[GaitOnGround, list[GaitEnergy]] = {}
         for i, case in enumerate(cases):
             found[case] = energies[i * len(seeds) : (i + 1) * len(seeds)]
         means = {case: _find_mean(runs) for case, runs in found.items()}
 
         comparisons = tuple(
-            Comparison(
+            PublishedComparison(
                 quantity=f"gait with the least energy per meter, {text}",
                 unit="",
                 published=published,
                 basis="printed",
-                ours=_find_cheapest({gait: means[Case(gait, ratio)] for gait in CONTROLLERS}),
+                ours=_find_cheapest({gait: means[GaitOnGround(gait, ratio)] for gait in CONTROLLERS}),
                 runs=len(CONTROLLERS) * len(seeds),
             )
             for text, published, ratio in (
@@ -97,18 +97,20 @@ class AriizumiGaits(Experiment):
                 ("ten times the friction sideways", "sinus-lifting", ratios[-1]),
             )
         )
-        curves: list[Curve] = []
+        curves: list[PictureCurve] = []
         for gait in CONTROLLERS:
-            known = [(ratio, means[Case(gait, ratio)]) for ratio in ratios]
+            known = [(ratio, means[GaitOnGround(gait, ratio)]) for ratio in ratios]
             pairs = [(ratio, value) for ratio, value in known if value is not None]
             curves.append(
-                Curve(label=gait, x=[ratio for ratio, _ in pairs], y=[value for _, value in pairs], is_ours=True)
+                PictureCurve(label=gait, x=[ratio for ratio, _ in pairs], y=[value for _, value in pairs], is_ours=True)
             )
-        picture = Picture(
+        picture = ExperimentPicture(
             x_label="sideways over forward friction", y_label="energy [J/m]", curves=curves, is_logarithmic=True
         )
-        notes = tuple(_describe(gait, {ratio: means[Case(gait, ratio)] for ratio in ratios}) for gait in CONTROLLERS)
-        return Findings(
+        notes = tuple(
+            _describe(gait, {ratio: means[GaitOnGround(gait, ratio)] for ratio in ratios}) for gait in CONTROLLERS
+        )
+        return ExperimentFindings(
             comparisons=comparisons,
             reasons=_find_reasons(found, means, ratios[-1]),
             picture=picture,
@@ -116,7 +118,7 @@ class AriizumiGaits(Experiment):
         )
 
 
-def run_trial(case: Case, seed: int) -> GaitEnergy:
+def run_trial(case: GaitOnGround, seed: int) -> GaitEnergy:
     """Run a gait with a seed of the sensors' noise, and return its energy. Runs in a worker."""
     settings = [
         *CONTROLLERS[case.gait],
@@ -156,26 +158,26 @@ def _describe(gait: str, energies: dict[float, float | None]) -> str:
 
 
 def _find_reasons(
-    found: dict[Case, list[GaitEnergy]], means: dict[Case, float | None], ratio: float
-) -> tuple[Reason, ...]:
+    found: dict[GaitOnGround, list[GaitEnergy]], means: dict[GaitOnGround, float | None], ratio: float
+) -> tuple[DifferenceReason, ...]:
     """Return why the order differs at a large anisotropy."""
-    shipped_case = Case("sinus-lifting", ratio)
+    shipped_case = GaitOnGround("sinus-lifting", ratio)
     shipped = means[shipped_case]
-    strong = means[Case("sinus-lifting", ratio, NO_TORQUE_LIMIT_NM)]
+    strong = means[GaitOnGround("sinus-lifting", ratio, NO_TORQUE_LIMIT_NM)]
     effect = None if shipped is None or strong is None else shipped - strong
     runs = found[shipped_case]
     saturated = sum(run.saturated_fraction for run in runs) / len(runs)
     return (
-        Reason(
+        DifferenceReason(
             cause=f"A joint of Mamba is at its torque limit in {100 * saturated:.0f} % of the time in sinus-lifting. "
             "Motors without that limit need this much less energy.",
             effect=effect,
             unit="J/m",
         ),
-        Reason(
+        DifferenceReason(
             cause="The paper studies the trade-off between speed and energy. Our gaits have one set of parameters "
             "each, and different speeds."
         ),
-        Reason(cause="The abstract does not print how large the anisotropy has to be. Ten is our choice."),
-        Reason(cause="We have not read the masses, lengths and motors of the paper's robot."),
+        DifferenceReason(cause="The abstract does not print how large the anisotropy has to be. Ten is our choice."),
+        DifferenceReason(cause="We have not read the masses, lengths and motors of the paper's robot."),
     )

@@ -4,17 +4,17 @@ import math
 
 from snakesim_operator.features.reproduce.endless_curve import find_axis_ratio, find_endless_motion
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
     Experiment,
-    Findings,
-    Picture,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
     explain_by_steps,
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import GaitRun, Trials, make_serpenoid_run, set_viscous
+from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run, set_viscous
 
 WINDING_ANGLES_RAD = (0.15, 0.3, 0.45, 0.6)
 COMPARED_RAD = 0.3
@@ -39,7 +39,7 @@ class GrayHancock(Experiment):
     """Speed of an undulating body on viscous ground."""
 
     name = "gray-hancock"
-    source = Source(
+    source = PublishedSource(
         authors="J. Gray and G. J. Hancock",
         title="The propulsion of sea-urchin spermatozoa",
         published_in="Journal of Experimental Biology 32",
@@ -58,7 +58,7 @@ class GrayHancock(Experiment):
     our_conditions = "31 links of planar13, three waves on the body, and viscous ground with a ratio of 2."
     method = "Speed of the center of mass along the body over two periods, after two that do not count."
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed at several amplitudes."""
         angles_rad = (COMPARED_RAD,) if trials.is_quick else WINDING_ANGLES_RAD
         friction = set_viscous(ACROSS_S_PER_M / DRAG_RATIO, ACROSS_S_PER_M)
@@ -68,7 +68,7 @@ class GrayHancock(Experiment):
         compared = angles_rad.index(COMPARED_RAD)
         published = find_published_ratio(COMPARED_RAD, DRAG_RATIO)
         steps = _find_steps(runs[compared], motions[compared])
-        comparison = Comparison(
+        comparison = PublishedComparison(
             quantity=f"speed over the speed of the wave, at a winding angle of {COMPARED_RAD:g} rad",
             unit="1",
             published=published,
@@ -77,16 +77,16 @@ class GrayHancock(Experiment):
             runs=1,
         )
         dense_rad = [0.02 * i for i in range(1, 33)]
-        picture = Picture(
+        picture = ExperimentPicture(
             x_label="winding angle [rad]",
             y_label="speed over the speed of the wave",
             curves=(
-                Curve(
+                PictureCurve(
                     label="formula",
                     x=dense_rad,
                     y=[find_published_ratio(angle_rad, DRAG_RATIO) for angle_rad in dense_rad],
                 ),
-                Curve(label="simulator", x=angles_rad, y=ours, is_ours=True),
+                PictureCurve(label="simulator", x=angles_rad, y=ours, is_ours=True),
             ),
         )
         reasons = explain_by_steps(
@@ -94,7 +94,7 @@ class GrayHancock(Experiment):
             unit="1",
             rest="contacts, and loads that are not constant",
         )
-        return Findings(comparisons=(comparison,), reasons=reasons, picture=picture)
+        return ExperimentFindings(comparisons=(comparison,), reasons=reasons, picture=picture)
 
 
 def _find_wave_m_s(body_length_m: float, winding_angle_rad: float) -> float:

@@ -2,17 +2,17 @@
 
 from snakesim_operator.features.reproduce.endless_curve import find_axis_ratio, find_endless_motion
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
     Experiment,
-    Findings,
-    Picture,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
     explain_by_steps,
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import GaitRun, Trials, make_serpenoid_run
+from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run
 
 WINDING_ANGLES_RAD = (0.3, 0.6, 0.9, 1.2)
 COMPARED_RAD = 0.6
@@ -30,7 +30,7 @@ class HiroseSerpenoid(Experiment):
     """Speed of a serpenoid curve on wheels."""
 
     name = "hirose-serpenoid"
-    source = Source(
+    source = PublishedSource(
         authors="S. Hirose",
         title="Biologically Inspired Robots: Snake-Like Locomotors and Manipulators",
         published_in="Oxford University Press",
@@ -52,7 +52,7 @@ class HiroseSerpenoid(Experiment):
     )
     method = "Speed of the center of mass along the body over two periods, after two that do not count."
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed at several winding angles."""
         angles_rad = (COMPARED_RAD,) if trials.is_quick else WINDING_ANGLES_RAD
         runs = [make_serpenoid_run(angle_rad, WAVELENGTH, PERIOD_S, WHEELS) for angle_rad in angles_rad]
@@ -61,7 +61,7 @@ class HiroseSerpenoid(Experiment):
         compared = angles_rad.index(COMPARED_RAD)
         wave_m_s = _find_wave_m_s(runs[0])
         published = wave_m_s * find_axis_ratio(COMPARED_RAD)
-        comparison = Comparison(
+        comparison = PublishedComparison(
             quantity=f"speed at a winding angle of {COMPARED_RAD:g} rad",
             unit="m/s",
             published=published,
@@ -70,21 +70,21 @@ class HiroseSerpenoid(Experiment):
             runs=1,
         )
         dense_rad = [0.05 * i for i in range(1, 27)]
-        picture = Picture(
+        picture = ExperimentPicture(
             x_label="winding angle [rad]",
             y_label="speed [m/s]",
             curves=(
-                Curve(
+                PictureCurve(
                     label="without slip: J0",
                     x=dense_rad,
                     y=[wave_m_s * find_axis_ratio(angle_rad) for angle_rad in dense_rad],
                 ),
-                Curve(
+                PictureCurve(
                     label="endless body that slips",
                     x=dense_rad,
                     y=[wave_m_s * find_endless_motion(angle_rad, runs[0].friction).speed for angle_rad in dense_rad],
                 ),
-                Curve(label="simulator", x=angles_rad, y=ours, is_ours=True),
+                PictureCurve(label="simulator", x=angles_rad, y=ours, is_ours=True),
             ),
         )
         steps = _find_steps(runs[compared], motions[compared], wave_m_s)
@@ -93,7 +93,7 @@ class HiroseSerpenoid(Experiment):
             unit="m/s",
             rest="contacts, and loads that are not constant",
         )
-        return Findings(comparisons=(comparison,), reasons=reasons, picture=picture)
+        return ExperimentFindings(comparisons=(comparison,), reasons=reasons, picture=picture)
 
 
 def _find_wave_m_s(run: GaitRun) -> float:

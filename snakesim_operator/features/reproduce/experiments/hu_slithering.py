@@ -1,16 +1,16 @@
 """Hu, Nirody, Scott and Shelley 2009: a snake on flat ground, with the friction measured on its scales."""
 
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
     Experiment,
-    Findings,
-    Picture,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
     explain_by_steps,
 )
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import GaitRun, Trials, make_serpenoid_run, set_skin
+from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run, set_skin
 
 FORWARD = 0.11
 BACKWARD = 0.14
@@ -25,7 +25,7 @@ class HuSlithering(Experiment):
     """Speed against the ratio of sideways to forward friction."""
 
     name = "hu-slithering"
-    source = Source(
+    source = PublishedSource(
         authors="D. L. Hu, J. Nirody, T. Scott and M. J. Shelley",
         title="The mechanics of slithering locomotion",
         published_in="PNAS 106",
@@ -50,7 +50,7 @@ class HuSlithering(Experiment):
         "solved in the plane, without MuJoCo."
     )
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed with several coefficients sideways; forward and backward ones stay."""
         coefficients = (SIDEWAYS,) if trials.is_quick else SIDEWAYS_SWEEP
         runs = [_make_run(sideways) for sideways in coefficients]
@@ -62,7 +62,7 @@ class HuSlithering(Experiment):
         robot = runs[compared].robot
         with_measured = find_chain_motion(robot, measured_waves, runs[compared].friction).speed_m_s / robot.length_m
         unit = "body lengths/s"
-        comparison = Comparison(
+        comparison = PublishedComparison(
             quantity="speed with 0.11 forward, 0.14 backward and 0.19 sideways",
             unit=unit,
             published=solved[compared],
@@ -71,12 +71,12 @@ class HuSlithering(Experiment):
             runs=1,
         )
         ratios = [sideways / FORWARD for sideways in coefficients]
-        picture = Picture(
+        picture = ExperimentPicture(
             x_label="sideways over forward friction",
             y_label="speed [body lengths/s]",
             curves=(
-                Curve(label="equations of the paper", x=ratios, y=solved),
-                Curve(label="simulator", x=ratios, y=ours, is_ours=True),
+                PictureCurve(label="equations of the paper", x=ratios, y=solved),
+                PictureCurve(label="simulator", x=ratios, y=ours, is_ours=True),
             ),
         )
         reasons = explain_by_steps(
@@ -88,7 +88,7 @@ class HuSlithering(Experiment):
             unit=unit,
             rest="contacts that stick before they slide, and loads that are not constant",
         )
-        return Findings(comparisons=(comparison,), reasons=reasons, picture=picture)
+        return ExperimentFindings(comparisons=(comparison,), reasons=reasons, picture=picture)
 
 
 def _make_run(sideways: float) -> GaitRun:

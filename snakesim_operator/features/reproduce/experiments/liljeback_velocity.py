@@ -4,18 +4,18 @@ import math
 from collections.abc import Sequence
 
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
+    DifferenceReason,
     Experiment,
-    Findings,
-    Picture,
-    Reason,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
     fit_exponent,
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import GaitRun, Trials, set_viscous
+from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, set_viscous
 
 MODULES = 9  # joints
 LAG_RAD = math.radians(40)  # of a joint behind the one ahead of it
@@ -31,7 +31,7 @@ class LiljebackVelocity(Experiment):
     """Exponents of the speed in amplitude and frequency."""
 
     name = "liljeback-velocity"
-    source = Source(
+    source = PublishedSource(
         authors="P. Liljebäck, K. Y. Pettersen, Ø. Stavdahl and J. T. Gravdahl",
         title="Experimental Investigation of Fundamental Properties of Snake Robot Locomotion",
         published_in="IEEE/RSJ International Conference on Intelligent Robots and Systems",
@@ -57,7 +57,7 @@ class LiljebackVelocity(Experiment):
         "periods, after two that do not count."
     )
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed at several amplitudes, and at several periods."""
         amplitudes_rad = AMPLITUDES_RAD[::4] if trials.is_quick else AMPLITUDES_RAD
         periods_s = PERIODS_S[::2] if trials.is_quick else PERIODS_S
@@ -76,7 +76,7 @@ class LiljebackVelocity(Experiment):
         chain_frequency = fit_exponent(frequencies_hz, chain[len(amplitudes_rad) :])
         endless = fit_exponent(amplitudes_rad, [_find_saturating_speed(amplitude) for amplitude in amplitudes_rad])
         comparisons = (
-            Comparison(
+            PublishedComparison(
                 quantity="exponent of the amplitude, 5 to 20 degrees",
                 unit="1",
                 published=2.0,
@@ -84,7 +84,7 @@ class LiljebackVelocity(Experiment):
                 ours=amplitude_exponent,
                 runs=len(amplitudes_rad),
             ),
-            Comparison(
+            PublishedComparison(
                 quantity="exponent of the frequency, 1/6 to 1/2 Hz",
                 unit="1",
                 published=1.0,
@@ -94,34 +94,36 @@ class LiljebackVelocity(Experiment):
             ),
         )
         reasons = (
-            Reason(
+            DifferenceReason(
                 cause="Amplitude: the property is for small angles. A body with greater ones slips less, and its speed "
                 "approaches that of the wave.",
                 effect=endless - 2.0,
                 unit="1",
             ),
-            Reason(
+            DifferenceReason(
                 cause="Amplitude: the body ends, and has 10 straight links, mass and servos.",
                 effect=chain_amplitude - endless,
                 unit="1",
             ),
-            Reason(
+            DifferenceReason(
                 cause="Amplitude: unknown, possibly contacts, and loads that are not constant.",
                 effect=amplitude_exponent - chain_amplitude,
                 unit="1",
             ),
-            Reason(
+            DifferenceReason(
                 cause="Frequency: the body has mass, and servos.",
                 effect=chain_frequency - 1.0,
                 unit="1",
             ),
-            Reason(
+            DifferenceReason(
                 cause="Frequency: unknown, possibly contacts, and loads that are not constant.",
                 effect=frequency_exponent - chain_frequency,
                 unit="1",
             ),
         )
-        return Findings(comparisons=comparisons, reasons=reasons, picture=_make_picture(amplitudes_rad, by_amplitude))
+        return ExperimentFindings(
+            comparisons=comparisons, reasons=reasons, picture=_make_picture(amplitudes_rad, by_amplitude)
+        )
 
 
 def _make_run(amplitude_rad: float, period_s: float) -> GaitRun:
@@ -154,16 +156,16 @@ def _find_saturating_speed(amplitude_rad: float) -> float:
     return half_square / (1.0 + half_square)
 
 
-def _make_picture(amplitudes_rad: Sequence[float], speeds_m_s: Sequence[float]) -> Picture:
+def _make_picture(amplitudes_rad: Sequence[float], speeds_m_s: Sequence[float]) -> ExperimentPicture:
     """Return the picture of the speed by amplitude, with a line of slope 2 through the first point."""
     degrees = [math.degrees(amplitude_rad) for amplitude_rad in amplitudes_rad]
     square = [speeds_m_s[0] * (amplitude / degrees[0]) ** 2 for amplitude in degrees]
-    return Picture(
+    return ExperimentPicture(
         x_label="amplitude of the joints [degrees]",
         y_label="speed [m/s]",
         curves=(
-            Curve(label="proportional to the squared amplitude", x=degrees, y=square),
-            Curve(label="simulator", x=degrees, y=speeds_m_s, is_ours=True),
+            PictureCurve(label="proportional to the squared amplitude", x=degrees, y=square),
+            PictureCurve(label="simulator", x=degrees, y=speeds_m_s, is_ours=True),
         ),
         is_logarithmic=True,
     )

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
+    DifferenceReason,
     Experiment,
-    Findings,
-    Picture,
-    Reason,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
 )
-from snakesim_operator.features.reproduce.trials import Trials, make_config
+from snakesim_operator.features.reproduce.trials import ExperimentTrials, make_config
 from snakesim_operator.results.metrics.propulsion import find_propulsion_periods
 from snakesim_operator.results.time_axis import get_time_origin_s
 from snakesim_operator.run.in_process import simulate
@@ -38,7 +38,7 @@ class SanfilippoHandOver(Experiment):
     """Order in which joints propel."""
 
     name = "sanfilippo-hand-over"
-    source = Source(
+    source = PublishedSource(
         authors="F. Sanfilippo, Ø. Stavdahl and P. Liljebäck",
         title="SnakeSIM: a ROS-based Control and Simulation Framework for Perception-Driven Obstacle-Aided Locomotion "
         "of Snake Robots",
@@ -62,13 +62,13 @@ class SanfilippoHandOver(Experiment):
     )
     depends_on_seed = True
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Run the case study with several seeds."""
         seeds = range(1, (1 if trials.is_quick else trials.seeds) + 1)
         found: list[HandOverTrial] = trials.call(run_trial, [(seed,) for seed in seeds])
         tail_m = sum(trial.tail_m for trial in found) / len(found)
         comparisons = (
-            Comparison(
+            PublishedComparison(
                 quantity="order of the propelling joints, from joint 7 on",
                 unit="",
                 published=_describe_joints(PUBLISHED_ORDER),
@@ -76,7 +76,7 @@ class SanfilippoHandOver(Experiment):
                 ours=_describe_orders([_take_from_published(trial.joints) for trial in found]),
                 runs=len(found),
             ),
-            Comparison(
+            PublishedComparison(
                 quantity="how propulsion ends",
                 unit="",
                 published=TAIL_LOST,
@@ -86,7 +86,7 @@ class SanfilippoHandOver(Experiment):
             ),
         )
         reasons = (
-            Reason(
+            DifferenceReason(
                 cause="Our order begins earlier, with "
                 + _describe_orders([_take_before_published(trial.joints) for trial in found])
                 + ", because our snake starts with its push-points further ahead. The paper does not print the start"
@@ -98,7 +98,7 @@ class SanfilippoHandOver(Experiment):
             f"When propulsion ends, the obstacle is {1000 * tail_m:.0f} mm ahead of the tail end on average: there the "
             "tail can no longer press on it.",
         )
-        return Findings(comparisons=comparisons, reasons=reasons, picture=_make_picture(found), notes=notes)
+        return ExperimentFindings(comparisons=comparisons, reasons=reasons, picture=_make_picture(found), notes=notes)
 
 
 def run_trial(seed: int) -> HandOverTrial:
@@ -152,9 +152,9 @@ def _describe_endings(found: Sequence[HandOverTrial]) -> str:
     return TAIL_LOST if count == len(found) else f"{TAIL_LOST} in {count} of {len(found)} runs"
 
 
-def _make_picture(found: Sequence[HandOverTrial]) -> Picture:
+def _make_picture(found: Sequence[HandOverTrial]) -> ExperimentPicture:
     """Return the picture of the propelling joint over time, one curve for each seed."""
-    curves: list[Curve] = []
+    curves: list[PictureCurve] = []
     for seed, trial in enumerate(found, start=1):
         times_s: list[float] = []
         numbers: list[float] = []
@@ -163,5 +163,5 @@ def _make_picture(found: Sequence[HandOverTrial]) -> Picture:
             number = float(name.removeprefix("joint_"))
             times_s += [start_s, end_s]
             numbers += [number, number]
-        curves.append(Curve(label=f"simulator, seed {seed}", x=times_s, y=numbers))
-    return Picture(x_label="time [s]", y_label="propelling joint", curves=curves)
+        curves.append(PictureCurve(label=f"simulator, seed {seed}", x=times_s, y=numbers))
+    return ExperimentPicture(x_label="time [s]", y_label="propelling joint", curves=curves)

@@ -7,7 +7,7 @@ import can
 import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.protocol.definitions import FROM_HOST, CommandAction, Frame, LastStop, Opcode
+from snakesim_can_backend.protocol.definitions import FROM_HOST, CanFrame, CommandAction, LastStop, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire import keys
@@ -45,7 +45,7 @@ def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -
         assert mocap is not None
         host, _, port = mocap.address.rpartition(":")
 
-        def broken(_frame: Frame) -> bool:
+        def broken(_frame: CanFrame) -> bool:
             raise BackendError("the bus is broken")
 
         def gone() -> None:
@@ -89,7 +89,7 @@ def test_closing_reports_errors_even_when_stop_cannot_be_sent() -> None:
         module_of(run, 2).health.leak = True
         wire = WIRES[0]
 
-        def breaks(frame: Frame) -> bool:
+        def breaks(frame: CanFrame) -> bool:
             if is_action(frame, CommandAction.STOP):
                 raise BackendError("the bus is broken")
             return False

@@ -29,7 +29,7 @@ from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_hal.model.scenario import parse_set_option
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.driver_loop import JOINTS, config, loop
 from snakesim_testing.can.frames import read
 from snakesim_testing.can.recorded_wire import (
@@ -168,11 +168,13 @@ def test_opened_command_acts_one_period_after_its_state() -> None:
     speeds = []
     for torque_nm in (0.0, 1.0):
         with loop() as run:
-            run.wanted = SafeSetpoints([Mode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
+            run.wanted = SafeSetpoints([JointMode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
             run.arm()
 
             def wish(tick: int, torque_nm: float = torque_nm) -> SafeSetpoints:
-                return SafeSetpoints([Mode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS)
+                return SafeSetpoints(
+                    [JointMode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS
+                )
 
             run.run(change_at + 5 - run.tick, wish)
             speeds.append(np.array([samples.joints.velocity_rad_s for samples in run.samples]))

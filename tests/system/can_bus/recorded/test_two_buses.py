@@ -12,12 +12,12 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer, InProcessEmulators
 from snakesim_can_backend.protocol.commands import make_query
-from snakesim_can_backend.protocol.definitions import CommandAction, Frame, Opcode, parse_node, parse_opcode
+from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, Opcode, parse_node, parse_opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_testing.can.driver_loop import Loop, config
+from snakesim_testing.can.driver_loop import DriverLoop, config
 from snakesim_testing.can.recorded_wire import WIRES, RecordedWire, go, is_action, is_setpoint, words
 from snakesim_testing.messages import raises_error
 
@@ -42,7 +42,7 @@ class NoProcess:
 
 
 @pytest.fixture
-def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], Loop]]:
+def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], DriverLoop]]:
     """Opens a driver for two buses with so many joints each, on emulators with three and one."""
     run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
     real = CanSettings(channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia")
@@ -53,10 +53,10 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     monkeypatch.setattr(modules, "EmulatorProcess", NoProcess)
     opened: list[CanBackend] = []
 
-    def open_with(joints: list[int], **settings: Any) -> Loop:
+    def open_with(joints: list[int], **settings: Any) -> DriverLoop:
         asked = CanSettings(channels=channels, joints_per_channel=joints, emulators="process", **settings)
         opened.append(CanBackend(run, asked))
-        return Loop(opened[-1], run)
+        return DriverLoop(opened[-1], run)
 
     yield open_with
     for driver in opened:
@@ -64,7 +64,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     end.close()
 
 
-def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]) -> None:
+def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., DriverLoop]) -> None:
     NoProcess.started.clear()
     run = two_buses([3, 1])
     ((channels, pose, stepped),) = NoProcess.started
@@ -91,7 +91,7 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]
 
 
 def test_two_buses_in_lockstep_have_no_frames_left_in_flight(
-    two_buses: Callable[..., Loop],
+    two_buses: Callable[..., DriverLoop],
 ) -> None:
     run = two_buses([3, 1])
     run.run(2)
@@ -105,7 +105,7 @@ def test_two_buses_in_lockstep_have_no_frames_left_in_flight(
     run.backend.close()
 
 
-def test_two_buses_module_on_wrong_bus_is_detected_before_enabling(two_buses: Callable[..., Loop]) -> None:
+def test_two_buses_module_on_wrong_bus_is_detected_before_enabling(two_buses: Callable[..., DriverLoop]) -> None:
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         two_buses([2, 2], bring_up_limit_s=0.3)
     assert [wire.closed for wire in WIRES] == [1, 1]
@@ -114,7 +114,9 @@ def test_two_buses_module_on_wrong_bus_is_detected_before_enabling(two_buses: Ca
     )
 
 
-def test_a_driver_whose_twins_have_died_ends(two_buses: Callable[..., Loop], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_whose_twins_have_died_ends(
+    two_buses: Callable[..., DriverLoop], monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = two_buses([3, 1])
     run.run(1)
     monkeypatch.setattr(NoProcess, "ended", "they died")
@@ -122,11 +124,11 @@ def test_a_driver_whose_twins_have_died_ends(two_buses: Callable[..., Loop], mon
         run.run(1)
 
 
-def test_two_buses_failure_of_one_does_not_block_the_other(two_buses: Callable[..., Loop]) -> None:
+def test_two_buses_failure_of_one_does_not_block_the_other(two_buses: Callable[..., DriverLoop]) -> None:
     run = two_buses([3, 1])
     run.arm()
 
-    def broken(frame: Frame) -> bool:
+    def broken(frame: CanFrame) -> bool:
         if frame.id == 0:
             raise BackendError("the bus is broken")
         return False

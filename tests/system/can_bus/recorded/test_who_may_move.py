@@ -7,8 +7,8 @@ import pytest
 from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleParameter,
     ModuleState,
     Opcode,
@@ -16,7 +16,7 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_hal.backend import SafeSetpoints
-from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import JointMode, LifecycleState
 from snakesim_testing.can.driver_loop import JOINTS, cleared_and_armed_again, loop
 from snakesim_testing.can.frames import read
 from snakesim_testing.can.recorded_wire import (
@@ -99,9 +99,9 @@ def test_module_that_disarmed_itself_is_not_armed_again_automatically() -> None:
 
 
 def test_lost_emergency_frame_is_repeated_until_all_modules_confirm() -> None:
-    lost: list[Frame] = []
+    lost: list[CanFrame] = []
 
-    def lose_some(frame: Frame) -> bool:
+    def lose_some(frame: CanFrame) -> bool:
         lost.extend([frame] * (frame.id == 0))
         return frame.id == 0 and len(lost) < 10
 
@@ -126,7 +126,7 @@ def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
         for _ in range(30):
             tick = run.tick
             before = len(WIRES[0].sent)
-            run.run(1, lambda tick: SafeSetpoints([Mode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
+            run.run(1, lambda tick: SafeSetpoints([JointMode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
             mine = [f for f in WIRES[0].sent[before:] if is_setpoint(f) and parse_node(f.id) == 2]
             by_tick[tick] = [read(frame) for frame in mine]
         assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)

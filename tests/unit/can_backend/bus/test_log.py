@@ -6,7 +6,7 @@ from pathlib import Path
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire, open_log
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_testing.messages import raises_error
 
@@ -27,20 +27,20 @@ def test_log_of_sent_and_received_frames_keeps_their_order(tmp_path: Path) -> No
         assert wire.channel == "can3"
         assert wire.fileno() == 42
         assert wire.idle() == math.inf
-        assert wire.send(Frame(0x105, bytes.fromhex("00112233")))
+        assert wire.send(CanFrame(0x105, bytes.fromhex("00112233")))
         wire.inject("full", begins=True)
-        assert not wire.send(Frame(0x106, b"\x01"))
+        assert not wire.send(CanFrame(0x106, b"\x01"))
         wire.inject("full", begins=False)
         assert [error.kind for error in wire.errors()] == ["queue_full"]
-        for frame in (Frame(0x7, b""), Frame(0x7FF, bytes(8))):
+        for frame in (CanFrame(0x7, b""), CanFrame(0x7FF, bytes(8))):
             other.send(frame)
-        assert wire.receive() == [Frame(0x7, b""), Frame(0x7FF, bytes(8))]
+        assert wire.receive() == [CanFrame(0x7, b""), CanFrame(0x7FF, bytes(8))]
         assert wire.receive() == []
-        assert neighbor.send(Frame(0, b"\x02"))
+        assert neighbor.send(CanFrame(0, b"\x02"))
         for one in (other, wire, neighbor):
             one.close()
         with raises_error(BackendError, code="bus/io-failed"):
-            wire.send(Frame(0, b""))
+            wire.send(CanFrame(0, b""))
         lines = [LINE.fullmatch(line) for line in path.read_text().splitlines(keepends=True)]
     assert [line and line.groups()[1:] for line in lines] == [
         ("can3", "105", "00112233", "T"),

@@ -10,15 +10,15 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire, make_virtual_channel
 from snakesim_can_backend.cia402.backend import Cia402Backend
 from snakesim_can_backend.cia402.eds import BUNDLED
-from snakesim_can_backend.cia402.frames import Emergency, Function, NmtCommand, NmtState, encode_emergency
+from snakesim_can_backend.cia402.frames import EmergencyMessage, FunctionCode, NmtCommand, NmtState, encode_emergency
 from snakesim_can_backend.cia402.objects import MODE_PDO, POSITION_PDO, TORQUE_PDO
 from snakesim_can_backend.cia402.scan import make_scan_row, read_nodes
 from snakesim_can_backend.cia402.settings import MountedCia402
-from snakesim_can_backend.cia402.state_machine import Control, PowerState
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.cia402.state_machine import ControlwordCommand, PowerState
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.messages import raises_error
@@ -34,7 +34,7 @@ class Robot(DriveRig):
     def __init__(self, **settings: Any) -> None:
         fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 2.0}
         super().__init__(CONFIG, Cia402Backend(CONFIG, Cia402Backend.Settings(**fixed | settings)))
-        self.sent: list[Frame] = []
+        self.sent: list[CanFrame] = []
         send = self.driver.wire.send
         self.driver.wire.send = lambda frame: self.sent.append(frame) or send(frame)
 
@@ -61,18 +61,23 @@ def robot() -> Iterator[Robot]:
 
 def test_drive_is_enabled_step_by_step_and_only_in_its_mode(robot: Robot) -> None:
     assert robot.run(5, "disarmed") == []
-    assert robot.sent and Function.HEARTBEAT | 127 not in {frame.id for frame in robot.sent}
+    assert robot.sent and FunctionCode.HEARTBEAT | 127 not in {frame.id for frame in robot.sent}
     robot.sent.clear()
     assert robot.run(10, "armed") == []
     controls = robot.controls(0)
-    assert controls[:4] == [Control.DISABLE_VOLTAGE, Control.SHUTDOWN, Control.SWITCH_ON, Control.ENABLE_OPERATION]
-    assert set(controls[4:]) == {Control.ENABLE_OPERATION}
-    heartbeats = [frame for frame in robot.sent if frame.id == Function.HEARTBEAT | 127]
+    assert controls[:4] == [
+        ControlwordCommand.DISABLE_VOLTAGE,
+        ControlwordCommand.SHUTDOWN,
+        ControlwordCommand.SWITCH_ON,
+        ControlwordCommand.ENABLE_OPERATION,
+    ]
+    assert set(controls[4:]) == {ControlwordCommand.ENABLE_OPERATION}
+    heartbeats = [frame for frame in robot.sent if frame.id == FunctionCode.HEARTBEAT | 127]
     assert len(heartbeats) == 10
     assert heartbeats[0].data == bytes([NmtState.OPERATIONAL])
     assert sum(frame.id == 0x080 for frame in robot.sent) == 10, "one SYNC a tick"
     robot.sent.clear()
-    robot.mode, robot.target = Mode.TORQUE, 0.0
+    robot.mode, robot.target = JointMode.TORQUE, 0.0
     assert robot.run(10, "armed") == []
     assert [frame.data for frame in robot.sent if frame.id == MODE_PDO.base | 1][:1] == [bytes([10])]
     assert [drive.state for drive in robot.drives] == [PowerState.ENABLED] * JOINTS
@@ -85,7 +90,7 @@ def test_drive_that_leaves_operation_enabled_by_itself_stays_off(robot: Robot) -
     [fault] = robot.run(30, "armed")
     assert (fault.what, fault.joint) == ("drive_not_armed", "joint_1")
     assert "switch on disabled" in fault.cause
-    assert set(robot.controls(0)) == {Control.DISABLE_VOLTAGE}
+    assert set(robot.controls(0)) == {ControlwordCommand.DISABLE_VOLTAGE}
     assert robot.drives[0].state == PowerState.SWITCH_ON_DISABLED
 
 
@@ -96,12 +101,12 @@ def test_drive_that_leaves_operation_enabled_at_once_gets_no_second_chance(robot
     robot.sent.clear()
     faults = robot.run(70, "armed")
     assert [(fault.what, fault.joint) for fault in faults] == [("drive_not_armed", "joint_1")]
-    assert Control.SHUTDOWN not in robot.controls(0)
+    assert ControlwordCommand.SHUTDOWN not in robot.controls(0)
 
 
 def test_fault_is_reset_by_the_operator_alone(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
     robot.run(20, "armed")
-    robot.driver._emulator._fail(0, Emergency(0x3210, 0x05))
+    robot.driver._emulator._fail(0, EmergencyMessage(0x3210, 0x05))
     with caplog.at_level(logging.WARNING):
         faults = robot.run(20, "armed")
     assert [fault.what for fault in faults] == ["drive_fault"]
@@ -109,7 +114,7 @@ def test_fault_is_reset_by_the_operator_alone(robot: Robot, caplog: pytest.LogCa
     assert "0x3210" in caplog.text
     robot.run(20, "fault")
     assert robot.drives[0].state == PowerState.FAULT
-    assert not any(control & Control.FAULT_RESET for control in robot.controls(0))
+    assert not any(control & ControlwordCommand.FAULT_RESET for control in robot.controls(0))
     assert robot.run(10, "disarmed") == []
     assert robot.drives[0].state == PowerState.SWITCH_ON_DISABLED
     assert robot.run(20, "armed") == []
@@ -122,7 +127,7 @@ def test_emergency_stop_is_a_quick_stop_that_ends_in_time() -> None:
     robot.drives[0].objects.values[0x605A, 0] = 6  # stay in quick stop, whatever the driver has written
     robot.sent.clear()
     robot.run(3, "estop")
-    assert robot.controls(0)[0] == Control.QUICK_STOP
+    assert robot.controls(0)[0] == ControlwordCommand.QUICK_STOP
     assert robot.drives[0].state == PowerState.QUICK_STOP
     robot.run(20, "estop")
     assert [drive.state for drive in robot.drives] == [PowerState.SWITCH_ON_DISABLED] * JOINTS
@@ -219,17 +224,17 @@ def test_id_of_the_host_is_refused_for_a_joint() -> None:
 
 def test_own_master_on_the_bus_is_recognized_by_what_it_sends(robot: Robot) -> None:
     sender = robot.driver.find_sender
-    assert sender(Frame(0x000, bytes([NmtCommand.START, 0]))) == -1
-    assert sender(Frame(0x080, b"")) == -1
-    assert sender(Frame(0x201, bytes(8))) == -1
-    assert sender(Frame(0x601, bytes([0x2B, 0x40, 0x60, 0, 6, 0, 0, 0]))) == -1
-    assert sender(Frame(0x77F, b"\x05")) == -1
-    assert sender(Frame(0x601, bytes([0x40, 0x41, 0x60, 0, 0, 0, 0, 0]))) is None, "it only reads"
-    assert sender(Frame(0x100, bytes(6))) is None
-    assert sender(Frame(0x7E5, bytes(8))) is None
-    assert sender(encode_emergency(9, Emergency(0x1000, 1))) == 9
-    assert sender(Frame(0x789 & 0x7FF, b"")) is None
-    assert sender(Frame(0x709, b"\x7f")) == 9
+    assert sender(CanFrame(0x000, bytes([NmtCommand.START, 0]))) == -1
+    assert sender(CanFrame(0x080, b"")) == -1
+    assert sender(CanFrame(0x201, bytes(8))) == -1
+    assert sender(CanFrame(0x601, bytes([0x2B, 0x40, 0x60, 0, 6, 0, 0, 0]))) == -1
+    assert sender(CanFrame(0x77F, b"\x05")) == -1
+    assert sender(CanFrame(0x601, bytes([0x40, 0x41, 0x60, 0, 0, 0, 0, 0]))) is None, "it only reads"
+    assert sender(CanFrame(0x100, bytes(6))) is None
+    assert sender(CanFrame(0x7E5, bytes(8))) is None
+    assert sender(encode_emergency(9, EmergencyMessage(0x1000, 1))) == 9
+    assert sender(CanFrame(0x789 & 0x7FF, b"")) is None
+    assert sender(CanFrame(0x709, b"\x7f")) == 9
 
 
 def test_scan_lists_identity_modes_and_state_of_every_node() -> None:

@@ -17,12 +17,12 @@ from snakesim_can_backend.cia402.backend import Cia402Backend
 from snakesim_can_backend.cia402.drives import Cia402Drives
 from snakesim_can_backend.cia402.eds import BUNDLED, SIZES, read_eds
 from snakesim_can_backend.cia402.frames import ABORTS, SYNC_ID, describe_error
-from snakesim_can_backend.cia402.state_machine import Control, PowerState, decode_statusword
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.cia402.state_machine import ControlwordCommand, PowerState, decode_statusword
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drives import BusCommand
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.driver_loop import config
 
 JOINTS = 2
@@ -37,16 +37,16 @@ class LibraryWire:
 
     def __init__(self) -> None:
         self.network = LibraryNetwork(self)
-        self.arrived: list[Frame] = []
-        self.when_sent: Callable[[Frame], None] = lambda _frame: None
+        self.arrived: list[CanFrame] = []
+        self.when_sent: Callable[[CanFrame], None] = lambda _frame: None
         self.when_arrived: Callable[[], None] = lambda: None
 
-    def send(self, frame: Frame) -> bool:
+    def send(self, frame: CanFrame) -> bool:
         self.network.notify(frame.id, bytearray(frame.data), 0.0)
         self.when_sent(frame)
         return True
 
-    def receive(self) -> list[Frame]:
+    def receive(self) -> list[CanFrame]:
         frames, self.arrived = self.arrived, []
         return frames
 
@@ -75,7 +75,7 @@ class LibraryNetwork(canopen.Network):
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         assert not remote
-        self._wire.arrived.append(Frame(can_id, bytes(data)))
+        self._wire.arrived.append(CanFrame(can_id, bytes(data)))
         self._wire.when_arrived()
 
     def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> Any:
@@ -122,7 +122,7 @@ def test_states_and_commands_are_those_of_the_library() -> None:
         ours = decode_statusword(bits)
         assert ours.value.upper().removesuffix(" ACTIVE") == name.removesuffix(" ACTIVE"), name
         assert decode_statusword(bits | 0xFF90) == ours, "bits that do not belong to the state"
-    assert {Control(word) for word in State402.CW_CODE_COMMANDS} == set(Control)
+    assert {ControlwordCommand(word) for word in State402.CW_CODE_COMMANDS} == set(ControlwordCommand)
 
 
 def test_abort_codes_and_errors_are_those_of_the_library() -> None:
@@ -148,7 +148,7 @@ def test_bundled_eds_is_read_equally_by_the_library() -> None:
 def test_every_object_of_the_driver_has_the_type_of_the_eds() -> None:
     theirs = canopen.import_od(EDS, 5)
     for entry in vars(objects).values():
-        if not isinstance(entry, objects.Entry):
+        if not isinstance(entry, objects.ObjectEntry):
             continue
         found: Any = theirs[entry.index]
         variable: Any = found if isinstance(found, ODVariable) else found[entry.sub]
@@ -177,7 +177,7 @@ def test_library_leads_an_emulated_drive_through_its_states(master: Master) -> N
     master.node.sdo["Target torque"].raw = 100
     master.pass_time(0.05)
     assert master.node.sdo["Torque actual value"].raw == pytest.approx(100, abs=10)
-    master.node.controlword = Control.QUICK_STOP
+    master.node.controlword = ControlwordCommand.QUICK_STOP
     master.pass_time(0.5)
     assert master.drive.state == PowerState.SWITCH_ON_DISABLED
     assert master.node.sdo["Torque actual value"].raw == 0
@@ -218,9 +218,9 @@ def test_drive_stops_by_itself_without_heartbeats_and_reports_it(master: Master)
     [error] = node.emcy.active
     assert (error.code, error.register) == (0x8130, 0x11)
     assert node.sdo["Error code"].raw == 0x8130
-    node.sdo["Controlword"].raw = Control.ENABLE_OPERATION
+    node.sdo["Controlword"].raw = ControlwordCommand.ENABLE_OPERATION
     assert node.state == "FAULT", "only a fault reset ends it"
-    node.sdo["Controlword"].raw = Control.FAULT_RESET
+    node.sdo["Controlword"].raw = ControlwordCommand.FAULT_RESET
     assert node.state == "SWITCH ON DISABLED"
     assert node.emcy.active == []
 
@@ -262,7 +262,7 @@ class LibraryDrives:
         )
         self.wire.when_sent = self._answer_sync
 
-    def _answer_sync(self, frame: Frame) -> None:
+    def _answer_sync(self, frame: CanFrame) -> None:
         if frame.id != SYNC_ID:
             return
         for i, node in enumerate(self.nodes):
@@ -313,12 +313,17 @@ def test_our_setpoints_are_decoded_by_drives_of_the_library() -> None:
     everybody = frozenset(range(JOINTS))
     targets = drives.readings.angle_rad * 0 + 3.14159265
     limits = drives.readings.angle_rad * 0 + 2.0
-    command = BusCommand(everybody, [Mode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False)
+    command = BusCommand(everybody, [JointMode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False)
     for word in (0x0040, 0x0021, 0x0023, 0x0027):
         drives.words = [word] * JOINTS
         drives.readings.start_request()
         drives.driver.read()
         drives.driver.send_setpoints(command)
     controls = [values[0] for values in received]
-    assert controls == [0x00, Control.SWITCH_ON, Control.ENABLE_OPERATION, Control.ENABLE_OPERATION]
+    assert controls == [
+        0x00,
+        ControlwordCommand.SWITCH_ON,
+        ControlwordCommand.ENABLE_OPERATION,
+        ControlwordCommand.ENABLE_OPERATION,
+    ]
     assert {values[1:] for values in received} == {(2048, 400)}

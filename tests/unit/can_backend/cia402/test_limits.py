@@ -19,16 +19,16 @@ from snakesim_can_backend.cia402.objects import (
     RATED_CURRENT,
     RATED_TORQUE,
     SUPPORTED_MODES,
-    Entry,
+    ObjectEntry,
 )
-from snakesim_can_backend.cia402.sdo import Read, Write
+from snakesim_can_backend.cia402.sdo import ReadStep, WriteStep
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.messages import raises_error
 
-FITTING: dict[Entry, int] = {  # for a joint of 4 N·m, 5 rad/s and 1.5 rad
+FITTING: dict[ObjectEntry, int] = {  # for a joint of 4 N·m, 5 rad/s and 1.5 rad
     DEVICE_TYPE: 0x0002_0192,
     SUPPORTED_MODES: 0x380,
     ENCODER_INCREMENTS: 10_000,
@@ -44,7 +44,7 @@ def joint(**dotted: Any) -> Joint:
     return config(1, backend="cia402", **dotted).robot.joint_table[0]
 
 
-def objections(changed: dict[Entry, int], one: Joint | None = None, **settings: Any) -> list[str]:
+def objections(changed: dict[ObjectEntry, int], one: Joint | None = None, **settings: Any) -> list[str]:
     values = FITTING | changed
     used = Cia402Settings(**settings)
     scaling = determine_scaling(values, used, one or joint())
@@ -76,7 +76,7 @@ def test_drive_with_fitting_limits_has_no_objections() -> None:
     ],
 )
 def test_limit_or_unit_that_does_not_suit_the_joint_is_named(
-    changed: dict[Entry, int], settings: dict[str, Any], words: str
+    changed: dict[ObjectEntry, int], settings: dict[str, Any], words: str
 ) -> None:
     found = objections(changed, **settings)
     assert any(words in objection for objection in found), found
@@ -116,7 +116,7 @@ def test_rated_torque_comes_from_rated_current_if_the_drive_has_no_other() -> No
 
 def test_each_mapping_is_written_while_off_and_read_back() -> None:
     steps = list_configuration_steps(5, Cia402Settings(), 0.01)
-    writes = [step for step in steps if isinstance(step, Write) and step.entry.index in (0x1400, 0x1600)]
+    writes = [step for step in steps if isinstance(step, WriteStep) and step.entry.index in (0x1400, 0x1600)]
     assert [(step.entry.index, step.entry.sub, step.value) for step in writes] == [
         (0x1400, 1, 0x8000_0205),
         (0x1600, 0, 0),
@@ -127,8 +127,8 @@ def test_each_mapping_is_written_while_off_and_read_back() -> None:
         (0x1400, 2, 255),
         (0x1400, 1, 0x205),
     ]
-    checked = {step.entry: step.expected for step in steps if isinstance(step, Read)}
-    last_written = {step.entry: step.value for step in steps if isinstance(step, Write) and not step.optional}
+    checked = {step.entry: step.expected for step in steps if isinstance(step, ReadStep)}
+    last_written = {step.entry: step.value for step in steps if isinstance(step, WriteStep) and not step.optional}
     assert {entry: checked[entry] for entry in last_written} == last_written
 
 

@@ -24,8 +24,8 @@ from snakesim_can_backend.driver.parameters import plan_parameters
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
 from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleParameter,
     Opcode,
     ParameterOperation,
@@ -35,17 +35,17 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.can.frames import heartbeat, read
 from snakesim_testing.can.module_rig import chain
 from snakesim_testing.messages import raises_error
 
 NAMES = [f"joint_{i}" for i in range(1, 5)]
-Spoil = Callable[[Frame], list[Frame]]
+Spoil = Callable[[CanFrame], list[CanFrame]]
 
 
-def as_it_is(frame: Frame) -> list[Frame]:
+def as_it_is(frame: CanFrame) -> list[CanFrame]:
     return [frame]
 
 
@@ -60,7 +60,7 @@ class Modules:
         self.to_modules: Spoil = as_it_is
         self.to_host: Spoil = as_it_is
         self.beside: Callable[[], None] = lambda: None
-        self.heard: list[Frame] = []
+        self.heard: list[CanFrame] = []
         self.bus = ModuleBus(self.near, range(1, 5))
 
     def __call__(self) -> float | None:
@@ -74,7 +74,7 @@ class Modules:
         self.beside()
         return 0.001
 
-    def inject(self, injection: Injection, *, begins: bool) -> None:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> None:
         raise NotImplementedError
 
     def close(self) -> None:
@@ -88,13 +88,13 @@ def modules() -> Iterator[Modules]:
     made.near.close()
 
 
-def losing(number: int, which: Callable[[Frame], bool] = lambda _frame: True) -> Spoil:
+def losing(number: int, which: Callable[[CanFrame], bool] = lambda _frame: True) -> Spoil:
     """Of the frames that are meant, the one of this number gets lost; the first is 1."""
     met = count(1)
     return lambda frame: [] if which(frame) and next(met) == number else [frame]
 
 
-def actions(frames: list[Frame]) -> list[float]:
+def actions(frames: list[CanFrame]) -> list[float]:
     return [read(f)["action"] for f in frames if parse_opcode(f.id) == Opcode.COMMAND]
 
 
@@ -115,7 +115,7 @@ def test_bring_up_finds_every_module_with_identity_requests_only(modules: Module
 def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Modules) -> None:
     answered_at: list[float] = []
 
-    def watch_the_last(frame: Frame) -> list[Frame]:
+    def watch_the_last(frame: CanFrame) -> list[CanFrame]:
         if parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 4:
             answered_at.append(time.monotonic())
         return [frame]
@@ -149,10 +149,10 @@ def test_bring_up_lost_identity_answer_is_requested_again(modules: Modules) -> N
 
 def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(modules: Modules) -> None:
     beat = heartbeat(3, 1.0)
-    cut = Frame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
+    cut = CanFrame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
     for frame in (beat, cut):
         modules.far.send(frame)
-    handed_on: list[Frame] = []
+    handed_on: list[CanFrame] = []
     assert [i.node for i in find_modules([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
     assert [frame for frame in handed_on if parse_opcode(frame.id) != Opcode.HEARTBEAT] == [cut]
     assert beat in handed_on
@@ -266,11 +266,11 @@ def test_bring_up_lost_parameter_answer_is_requested_again(modules: Modules, way
 
 
 def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(modules: Modules) -> None:
-    def noisily(frame: Frame) -> list[Frame]:
+    def noisily(frame: CanFrame) -> list[CanFrame]:
         other = load_layouts()[Opcode.PARAMETER_ANSWER].encode(
             parse_node(frame.id), index=200, result=ParameterResult.UNKNOWN_INDEX
         )
-        return [Frame(frame.id, frame.data[:3]), other, frame, frame]
+        return [CanFrame(frame.id, frame.data[:3]), other, frame, frame]
 
     modules.to_host = noisily
     in_force = configure_modules([modules.bus], wanted(damping=0.5), 5.0)
@@ -282,7 +282,7 @@ def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(modules: Mod
 def test_other_frames_are_not_lost_while_it_waits(modules: Modules) -> None:
     beat = heartbeat(3, 9.0)
     modules.far.send(beat)
-    handed_on: list[Frame] = []
+    handed_on: list[CanFrame] = []
     configure_modules([modules.bus], wanted(), 5.0, handed_on.append)
     assert beat in handed_on
 
@@ -300,10 +300,10 @@ def test_an_armed_module_refuses(modules: Modules) -> None:
 
 
 def test_bring_up_unknown_result_code_counts_as_refusal(modules: Modules) -> None:
-    def oddly(frame: Frame) -> list[Frame]:
+    def oddly(frame: CanFrame) -> list[CanFrame]:
         if parse_opcode(frame.id) != Opcode.PARAMETER_ANSWER:
             return [frame]
-        return [Frame(frame.id, frame.data[:1] + bytes((frame.data[1] | 0xF0,)) + frame.data[2:])]
+        return [CanFrame(frame.id, frame.data[:1] + bytes((frame.data[1] | 0xF0,)) + frame.data[2:])]
 
     modules.to_host = oddly
     with raises_error(BackendError, code="drive/parameter-refused"):

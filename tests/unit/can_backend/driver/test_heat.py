@@ -11,13 +11,13 @@ import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.settings import CanSettings
-from snakesim_hal.physics.thermal import Thermal
+from snakesim_hal.physics.thermal import ThermalModel
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Mode, Power
+from snakesim_hal.wire.messages import JointMode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.can.driver_loop import chain_of
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import BackendRig
 from snakesim_testing.hal.small_robots import make_run_config
 
 RATED_NM = 4.0
@@ -27,7 +27,7 @@ CURVES = {"usual": (80.0, 105.0), "cool": (50.0, 70.0)}
 
 
 @contextmanager
-def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[Rig]:
+def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[BackendRig]:
     """The winding of joint_1 stays at a temperature, and the robot is armed."""
     derate_from_c, stop_at_c = CURVES[curve]
     config = make_run_config(
@@ -42,18 +42,18 @@ def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[Rig]:
     opened = SimBackend(config, SimSettings()) if backend == "sim" else CanBackend(config, CanSettings())
     try:
         windings(opened).winding_temperature_c[0] = celsius
-        yield Rig(opened, "lockstep", config.period_ns)
+        yield BackendRig(opened, "lockstep", config.period_ns)
     finally:
         opened.close()
 
 
-def windings(backend: SimBackend | CanBackend) -> Thermal:
+def windings(backend: SimBackend | CanBackend) -> ThermalModel:
     if isinstance(backend, SimBackend):
         return backend._windings
     return chain_of(backend).thermal
 
 
-def until_told(rig: Rig, celsius: float) -> None:
+def until_told(rig: BackendRig, celsius: float) -> None:
     """Until the robot's power samples tell the temperature."""
     for _ in range(100):
         rig.wait_periods()
@@ -63,10 +63,10 @@ def until_told(rig: Rig, celsius: float) -> None:
     raise AssertionError(f"{celsius} °C were not told")
 
 
-def pushes_nm(rig: Rig, limit_nm: float) -> float:
+def pushes_nm(rig: BackendRig, limit_nm: float) -> float:
     """What the joint gives at its stop when that much is allowed."""
     limits = [limit_nm, *[RATED_NM] * (rig.joint_count - 1)]
-    record = rig.command_without_limiter({0: (Mode.TORQUE, 2 * RATED_NM)}, AT_STOP_TICKS, torque_limit_nm=limits)
+    record = rig.command_without_limiter({0: (JointMode.TORQUE, 2 * RATED_NM)}, AT_STOP_TICKS, torque_limit_nm=limits)
     assert np.abs(record.velocity_rad_s[-5:, 0]).max() < 0.05, "it is at its stop"
     return float(record.torque_nm[-5:, 0].mean())
 

@@ -14,20 +14,20 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.module_monitor import ROBOT_FAULT_KINDS
 from snakesim_can_backend.emulator.firmware import PASSIVE
 from snakesim_can_backend.protocol.commands import make_command, make_emergency
-from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleFault, ModuleState
+from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, ModuleFault, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_hal.wire.messages import LifecycleRequest, Mode
+from snakesim_hal.wire.messages import JointMode, LifecycleRequest
 from snakesim_testing.can.driver_loop import JOINTS, chain_of, config
 from snakesim_testing.can.module_faults import MODULE_FAULTS
-from snakesim_testing.contract.rig import Rig
+from snakesim_testing.contract.rig import BackendRig
 
 FAILS = 2  # joint_3
 OTHERS = [i for i in range(JOINTS) if i != FAILS]
 DEADLINE = 5  # periods: 50 ms
 
 
-class Lame(Rig):
+class Lame(BackendRig):
     """What the contract's tests drive, and what there is to see of its modules."""
 
     @property
@@ -49,7 +49,7 @@ class Lame(Rig):
         """The others turn at a steady speed, and back."""
         for _ in range(periods):
             there = 0.5 if self.tick // 50 % 2 else -0.5
-            self.command_joints(dict.fromkeys(OTHERS, (Mode.VELOCITY, there)))
+            self.command_joints(dict.fromkeys(OTHERS, (JointMode.VELOCITY, there)))
 
     def turning(self) -> list[bool]:
         return [abs(self.newest_joints.velocity_rad_s[i]) > 0.2 for i in OTHERS]
@@ -176,10 +176,10 @@ def test_isolated_joint_reset_within_one_period_still_clears(
 @pytest.mark.parametrize("then", ["reset", "estop", "fault"])
 def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch, then: str) -> None:
     """A module that is lost needs its parameters again and does not take them: that takes a second."""
-    sent: list[Frame] = []
+    sent: list[CanFrame] = []
     send = VirtualWire.send
 
-    def overheard(wire: VirtualWire, frame: Frame) -> bool:
+    def overheard(wire: VirtualWire, frame: CanFrame) -> bool:
         sent.append(frame)
         return send(wire, frame)
 
@@ -207,7 +207,7 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
     """Not braked: its own sensor may be what is wrong."""
     with lame_robot() as robot:
         robot.arm()
-        robot.command_joints({FAILS: (Mode.VELOCITY, 0.5)}, 30)
+        robot.command_joints({FAILS: (JointMode.VELOCITY, 0.5)}, 30)
         robot.isolate_joint(FAILS)
         robot.wave(3)
         robot.assert_armed()

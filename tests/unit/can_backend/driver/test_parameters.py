@@ -15,7 +15,7 @@ from snakesim_can_backend.driver.parameters import (
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParameter, Opcode, SafeMotion
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.mounted import Mounted, validate_mounting_overrides
+from snakesim_drivers.emulation.mounted import MountedDrive, validate_mounting_overrides
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
 from snakesim_hal.model.joints import JointExceptions
@@ -65,10 +65,10 @@ MISPLACED = {
     "an id": (JointExceptions(id=25), {}),
     "a port": (JointExceptions(port="can3"), {}),
     "a zero": (JointExceptions(zero_rad=2.5), {}),
-    "a joint": (JointExceptions(), {"mounted": {"joint_99": Mounted(sign=-1)}}),
+    "a joint": (JointExceptions(), {"mounted": {"joint_99": MountedDrive(sign=-1)}}),
     "no emulators": (
         JointExceptions(),
-        {"mounted": {"joint_2": Mounted(sign=-1)}, "emulators": "none", "channels": ["can0"]},
+        {"mounted": {"joint_2": MountedDrive(sign=-1)}, "emulators": "none", "channels": ["can0"]},
     ),
 }
 

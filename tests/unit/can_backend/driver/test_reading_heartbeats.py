@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
-    Frame,
+    CanFrame,
     LastStop,
     ModuleState,
     Opcode,
@@ -109,8 +109,8 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
     before = copy.deepcopy(made.modules)
     good = [joint_state(2, made.sync), heartbeat(2, 0.0), contact(2, 0), gyro(2, 0, 0.0), health(2)]
     for i, frame in enumerate(good):
-        made.process_frame(Frame(frame.id, frame.data[:-1]))
-        made.process_frame(Frame(frame.id, b""))
+        made.process_frame(CanFrame(frame.id, frame.data[:-1]))
+        made.process_frame(CanFrame(frame.id, b""))
         assert made.malformed == 2 * (i + 1)
     before[1].frame_count = made.modules[1].frame_count
     assert made.modules == before
@@ -120,16 +120,16 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
 def test_strangers_are_counted_by_node() -> None:
     made = reading()
     for node in (4, 4, LAST_NODE, 0):
-        made.process_frame(Frame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
+        made.process_frame(CanFrame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
     assert made.unknown_node_frame_counts == {4: 2, LAST_NODE: 1, 0: 1}
     assert not made.other_host_frame_counts
 
 
 # --- whatever comes ----------------------------------------------------------------------------------------
 
-any_frame = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=8))
+any_frame = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
 ours = st.builds(
-    lambda opcode, node, data: Frame(frame_id(opcode, node), data[: load_layouts()[opcode].length]),
+    lambda opcode, node, data: CanFrame(frame_id(opcode, node), data[: load_layouts()[opcode].length]),
     st.sampled_from(list(Opcode)),
     st.integers(1, JOINTS),
     st.binary(min_size=8, max_size=8),
@@ -137,8 +137,10 @@ ours = st.builds(
 
 
 @given(st.lists(any_frame | ours, max_size=40), st.lists(st.booleans(), min_size=40, max_size=40))
-@example([Frame(frame_id(Opcode.JOINT_STATE, 2), b"")], [False] * 40)
-def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(frames: list[Frame], sync_before: list[bool]) -> None:
+@example([CanFrame(frame_id(Opcode.JOINT_STATE, 2), b"")], [False] * 40)
+def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(
+    frames: list[CanFrame], sync_before: list[bool]
+) -> None:
     made = reading()
     for frame, contacts in zip(frames, sync_before, strict=False):
         if contacts:
@@ -159,6 +161,6 @@ def test_no_single_wrong_bit_moves_a_joint(node: int, bit: int) -> None:
     made = reading()
     begin(made)
     whole = int.from_bytes(joint_state(node, made.sync, 0.9).data, "little") ^ 1 << bit
-    made.process_frame(Frame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
+    made.process_frame(CanFrame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
     assert angles(made) == pytest.approx([0.1] * JOINTS)
     assert made.modules[node - 1].corrupt_state_count == 1

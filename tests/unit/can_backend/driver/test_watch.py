@@ -7,7 +7,7 @@ from snakesim_can_backend.driver.module_monitor import (
     CLEAR_GRACE_SYNCS,
     MAX_FRAMES_PER_CYCLE,
     ROBOT_FAULT_KINDS,
-    Finding,
+    FaultFinding,
     ModuleMonitor,
 )
 from snakesim_can_backend.driver.reports import ModuleReports
@@ -19,7 +19,7 @@ from snakesim_testing.can.monitor_rig import (
     HOT_AND_WET,
     PERIOD_S,
     WHO,
-    Bench,
+    MonitorRig,
     Speak,
     answering,
     list_findings,
@@ -65,9 +65,9 @@ WRONGS = [
 
 @pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
 def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, after: int, what: str, cause: str) -> None:
-    bench = Bench()
+    bench = MonitorRig()
     assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
-    assert bench.tick(speak) == [Finding(what, WHO + cause, 1, affects_only_joint=what not in ROBOT_FAULT_KINDS)]
+    assert bench.tick(speak) == [FaultFinding(what, WHO + cause, 1, affects_only_joint=what not in ROBOT_FAULT_KINDS)]
     assert bench.ticks(40, speak) == []
     bench.reset()
     assert (what, 1) in list_findings(bench.ticks(CLEAR_GRACE_SYNCS + 1, speak))
@@ -77,7 +77,7 @@ def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, aft
 @pytest.mark.parametrize("speak", [quiet, frozen, miscounting, corrupt, doubled])
 @pytest.mark.parametrize("length", [1, 2])
 def test_watch_glitches_report_nothing(speak: Speak, length: int) -> None:
-    bench = Bench()
+    bench = MonitorRig()
     for _ in range(20):
         assert bench.ticks(length, speak) == []
         assert bench.ticks(2) == []
@@ -85,7 +85,7 @@ def test_watch_glitches_report_nothing(speak: Speak, length: int) -> None:
 
 @pytest.mark.parametrize("bad", [corrupt, miscounting])
 def test_watch_module_with_invalid_frames_is_not_silent(bad: Speak) -> None:
-    bench = Bench()
+    bench = MonitorRig()
     assert bench.ticks(2, bad) == []
     assert bench.tick(quiet) == []
     assert bench.ticks(1) == []
@@ -99,11 +99,11 @@ def test_watch_module_never_received_is_reported_only_as_silent() -> None:
 
 
 def test_watch_silent_module_with_heartbeat_differs_from_dead_one() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.tick(lambda reading: reading.process_frame(heartbeat(2, 1.0)))
     (found,) = bench.ticks(2, quiet)
     assert "it still sends heartbeats" in found.cause
-    bench = Bench()
+    bench = MonitorRig()
     bench.tick(reporting())
     (found,) = bench.ticks(3, quiet)
     assert "no heartbeat either: power, cable or reset" in found.cause
@@ -112,15 +112,15 @@ def test_watch_silent_module_with_heartbeat_differs_from_dead_one() -> None:
 # --- restarts ----------------------------------------------------------------------------------------------
 
 
-def restarting(bench: Bench) -> list[Finding]:
-    found: list[Finding] = []
+def restarting(bench: MonitorRig) -> list[FaultFinding]:
+    found: list[FaultFinding] = []
     for uptime_s in (50.0, 0.1, 0.2):
         found += bench.tick(answering(ModuleState.DISARMED, heartbeat(2, uptime_s)))
     return found
 
 
 def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     found = restarting(bench) + bench.ticks(10)
     assert list_findings(found) == [("module_restarted", 1)]
     assert found[0].cause.startswith(WHO + "has restarted")
@@ -133,7 +133,7 @@ def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
 
 
 def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured={1}) == []
     assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
     (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured={1})
@@ -148,20 +148,20 @@ def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
         reading.process_frame(heartbeat(2, 50.0 + 0.01 * reading.sync))
         reading.process_frame(heartbeat(2, 0.01 * reading.sync))
 
-    bench = Bench()
+    bench = MonitorRig()
     assert list_findings(bench.ticks(30, two_hearts)) == [("duplicate_node", 1)]
     assert bench.watch.pop_changed_joints() == set()
 
 
 def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.tick(doubled)
     bench.ticks(5)
     assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
 
 
 def test_watch_isolated_joint_reports_only_robot_wide_faults() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.isolated = {1}
     assert bench.ticks(9, answering(ModuleState.FAULT)) == []
     (found,) = bench.ticks(9, HOT_AND_WET)
@@ -171,7 +171,7 @@ def test_watch_isolated_joint_reports_only_robot_wide_faults() -> None:
 
 
 def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.isolated = {1}
     stopped = reporting(ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1)
     (found,) = bench.ticks(9, stopped)
@@ -180,21 +180,21 @@ def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
 
 
 def test_water_after_heat_is_told_again_with_all_reasons() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     (found,) = bench.ticks(9, HOT)
     assert found.affects_only_joint
     reasons = "reports overheat, leak; it stopped because of overheat"
-    assert bench.ticks(9, HOT_AND_WET) == [Finding("module_overheat", WHO + reasons, 1, affects_only_joint=False)]
+    assert bench.ticks(9, HOT_AND_WET) == [FaultFinding("module_overheat", WHO + reasons, 1, affects_only_joint=False)]
 
 
 def test_watch_fault_without_heartbeat_is_reported_from_state() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     found = bench.ticks(9, answering(ModuleState.FAULT))
     assert list_findings(found) == [("module_fault", 1)]
 
 
 def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.tick(HOT_AND_WET)
     bench.reset()
     assert bench.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
@@ -209,24 +209,24 @@ def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
 def test_an_emergency_is_as_it_should_be_only_in_one(
     lifecycle: LifecycleState, reported: list[tuple[str, int]]
 ) -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.lifecycle = lifecycle
     assert list_findings(bench.ticks(9, answering(ModuleState.EMERGENCY))) == reported
 
 
 def test_watch_module_that_does_not_arm_is_reported_after_grace() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     found = [bench.tick(answering(ModuleState.DISARMED)) for _ in range(20)]
     first = next(i for i, reported in enumerate(found) if reported)
     assert ARM_GRACE_SYNCS < first <= ARM_GRACE_SYNCS + 3
     assert [f for reported in found for f in reported] == [
-        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1)
+        FaultFinding("module_not_armed", WHO + "does not arm: it is disarmed", 1)
     ]
 
 
 def test_watch_module_armed_within_grace_is_not_reported() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.lifecycle = "armed"
     assert bench.ticks(ARM_GRACE_SYNCS) == []
     bench.state = ModuleState.ARMED
@@ -236,17 +236,17 @@ def test_watch_module_armed_within_grace_is_not_reported() -> None:
 
 
 def test_watch_module_that_disarms_itself_is_reported_at_once() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     assert bench.ticks(2) == [], "within the grace"
     found = bench.tick(answering(ModuleState.DISARMED))
     assert found == [
-        Finding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1, affects_only_joint=True)
+        FaultFinding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1, affects_only_joint=True)
     ]
 
 
 def test_the_grace_begins_with_every_arming() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     bench.ticks(20)
     bench.lifecycle, bench.state = "disarmed", ModuleState.DISARMED

@@ -3,13 +3,13 @@
 import pytest
 
 from snakesim_can_backend.bus.bus_errors import BusError, Kind
-from snakesim_can_backend.driver.module_monitor import Finding
+from snakesim_can_backend.driver.module_monitor import FaultFinding
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
-from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode, frame_id
+from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, ModuleState, Opcode, frame_id
 from snakesim_testing.can.frames import answer, joint_state
-from snakesim_testing.can.monitor_rig import Bench, answering, list_findings, quiet
+from snakesim_testing.can.monitor_rig import MonitorRig, answering, list_findings, quiet
 
 # --- the bus -----------------------------------------------------------------------------------------------
 
@@ -25,7 +25,7 @@ from snakesim_testing.can.monitor_rig import Bench, answering, list_findings, qu
     ],
 )
 def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
-    bench = Bench()
+    bench = MonitorRig()
     error = BusError(kind, "can0", "transmit errors 200, receive errors 3")
     (found,) = bench.tick(errors=[error])
     assert found.what == kind
@@ -40,14 +40,14 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
 
 @pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
 def test_lesser_errors_are_only_counted(kind: Kind) -> None:
-    bench = Bench()
+    bench = MonitorRig()
     for _ in range(2):
         assert bench.tick(errors=[BusError(kind, "can0", "")]) == []
     assert bench.watch.minor_error_counts == {kind: 2}
 
 
 def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     for unsent in ("can1", "can1", "", "can1", "can1"):
         assert bench.tick(unsent=unsent) == [], "full for a moment"
     (found,) = bench.tick(unsent="can1")
@@ -67,10 +67,10 @@ def stranger(reading: ModuleReports) -> None:
 
 
 def test_a_stranger_that_answers_every_sync_is_found() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     assert bench.ticks(2, stranger) == []
     (found,) = bench.tick(stranger)
-    assert found == Finding("unknown_node", "node 9 is on the bus, but is not a joint of this robot")
+    assert found == FaultFinding("unknown_node", "node 9 is on the bus, but is not a joint of this robot")
     assert bench.ticks(5, stranger) == []
 
 
@@ -81,11 +81,11 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
         (load_layouts()[Opcode.SET_POINT].encode(2), "second_host", "end one of the two"),
         (load_layouts()[Opcode.SET_POINT].encode(40), "second_host", "end one of the two"),
         (load_layouts()[Opcode.COMMAND].encode(2, action=CommandAction.STOP), "second_host", "another program"),
-        (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
+        (CanFrame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
     ],
 )
-def test_bus_watch_reports_a_second_host(frame: Frame, what: str, words: str) -> None:
-    bench, speak = Bench(), answering(ModuleState.DISARMED, frame)
+def test_bus_watch_reports_a_second_host(frame: CanFrame, what: str, words: str) -> None:
+    bench, speak = MonitorRig(), answering(ModuleState.DISARMED, frame)
     (found,) = bench.tick(speak)
     assert found.what == what
     assert found.joint is None
@@ -97,21 +97,21 @@ def test_bus_watch_reports_a_second_host(frame: Frame, what: str, words: str) ->
 
 
 def test_what_another_host_may_have_changed_is_written_anew() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.reading.process_frame(load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1))
     assert list_findings(bench.tick()) == [("second_host", None)]
     assert bench.watch.pop_changed_joints() == {0, 1, 2}
 
 
 def test_bus_watch_identity_request_is_no_second_host() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     bench.reading.process_frame(make_command(CommandAction.IDENTIFY))
     assert bench.tick() == []
     assert bench.watch.pop_changed_joints() == set()
 
 
 def test_a_module_is_not_silent_that_was_not_asked() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     for i in range(10):
         assert list_findings(bench.tick(quiet, unsent="can0")) == ([("bus_stuck", None)] if i == 2 else [])
     assert bench.ticks(2, quiet) == []
@@ -119,7 +119,7 @@ def test_a_module_is_not_silent_that_was_not_asked() -> None:
 
 
 def test_bus_watch_interface_down_is_not_also_reported_stuck() -> None:
-    bench = Bench()
+    bench = MonitorRig()
     down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
     assert list_findings(bench.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
     for _ in range(10):

@@ -6,14 +6,14 @@ from snakesim_can_backend.bus.load import ReportSchedule, compute_bus_load, comp
 from snakesim_can_backend.emulator.bus_time import MAX_AHEAD_US, BusTime, traffic_by_opcode
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_sync
-from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id, parse_opcode
+from snakesim_can_backend.protocol.definitions import CanFrame, Opcode, frame_id, parse_opcode
 from snakesim_testing.can.module_rig import measure_bus_traffic, setpoint
 
 FULL = compute_max_frame_bits(8)
 
 
-def frame(opcode: Opcode, node: int, mark: int = 0) -> Frame:
-    return Frame(frame_id(opcode, node), bytes((mark,)) + bytes(load_layouts()[opcode].length - 1))
+def frame(opcode: Opcode, node: int, mark: int = 0) -> CanFrame:
+    return CanFrame(frame_id(opcode, node), bytes((mark,)) + bytes(load_layouts()[opcode].length - 1))
 
 
 def test_a_frame_is_there_when_its_last_bit_is():

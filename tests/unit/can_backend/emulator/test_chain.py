@@ -12,9 +12,9 @@ from snakesim_can_backend.protocol.commands import make_command, make_sync
 from snakesim_can_backend.protocol.definitions import CommandAction, ModuleParameter, ModuleState, Opcode
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.physics.physics_model import LinkLoad
-from snakesim_hal.wire.messages import Imu, Mode
+from snakesim_hal.wire.messages import Imu, JointMode
 from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.module_rig import Host, chain, only, setpoint
+from snakesim_testing.can.module_rig import RigHost, chain, only, setpoint
 from snakesim_testing.hal.small_robots import make_pose
 
 G = 9.81
@@ -155,7 +155,7 @@ def test_the_pose_is_sent_once_a_sync_before_the_answers():
 
 def run_of(seed: int) -> tuple[list, list]:
     noisy: dict[str, Any] = {"robot__sensors": {"joints": {"angle_noise_rad": 1e-3}}, "seed": seed}
-    host = Host(chain(config(**noisy)))
+    host = RigHost(chain(config(**noisy)))
     host.arm()
     return [host.tick(0.3 if k < 50 else -0.3) for k in range(100)], host.states()
 
@@ -170,10 +170,10 @@ def test_the_same_commands_give_the_same_frames():
 
 
 def test_the_watchdog_ends_within_the_step_in_stepped_time_too():
-    host = Host(chain())
+    host = RigHost(chain())
     host.arm()
     for _ in range(5):
-        host.tick(2.0, Mode.TORQUE)
+        host.tick(2.0, JointMode.TORQUE)
     frames = [f for _ in range(12) for f in host.tick()]
     assert host.states() == [ModuleState.FAULT] * 4
     ups = [b["uptime"] for b in only(frames, Opcode.HEARTBEAT, 1) if b["last_stop"] == 3]
@@ -193,10 +193,10 @@ def test_chain_in_real_time_catches_up_only_short_pauses():
 
 
 def test_overheating_fades_torque_before_it_stops():
-    host = Host(chain(physics_model=Pushed(4)))
+    host = RigHost(chain(physics_model=Pushed(4)))
     host.arm()
     host.chain.thermal.winding_temperature_c[1] = 95.0
-    frames = host.ticks(10, 4.0, Mode.TORQUE)
+    frames = host.ticks(10, 4.0, JointMode.TORQUE)
     states = only(frames, Opcode.JOINT_STATE)
     assert [s["derated"] for s in states] == [0, 1, 0, 0]
     assert states[1]["torque"] / 4.0 == pytest.approx(1.0 - 0.8 * 15 / 25, abs=0.01)

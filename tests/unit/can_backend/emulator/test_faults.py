@@ -4,12 +4,12 @@ import pytest
 
 from snakesim_can_backend.emulator.faults import format_typed_fault, parse_fault, parse_typed_fault
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import Injection
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_testing.messages import raises_error
 
 
 def test_emulator_typed_fault_starts_or_ends_immediately():
-    fault = Injection("mute", "joint_2", 7.0)
+    fault = FaultInjection("mute", "joint_2", 7.0)
     assert parse_typed_fault("mute joint_2\n", 4, 7.0) == (fault, True)
     assert parse_typed_fault("mute joint_2 off", 4, 7.0) == (fault, False)
     for begins in (True, False):

@@ -18,7 +18,7 @@ from snakesim_can_backend.protocol.definitions import (
     ModuleState,
     Opcode,
 )
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.frames import corrupted
 from snakesim_testing.can.module_rig import (
     BOOTED,
@@ -68,7 +68,7 @@ def test_firmware_sends_ten_heartbeats_and_two_health_reports_per_second():
 
 def test_position_targets_end_at_the_angle_limit():
     module = armed(angle_limit=0.5)
-    drive(module, 0, BOOTED, mode=Mode.POSITION, target=-1.0)
+    drive(module, 0, BOOTED, mode=JointMode.POSITION, target=-1.0)
     assert module.demand.target == -0.5
 
 
@@ -118,11 +118,11 @@ def test_set_points_without_syncs_do_not_keep_a_module_alive():
     module = armed()
     drive(module, 0, BOOTED)
     for k in range(1, 30):
-        module.receive_setpoint(setpoint(k, Mode.PASSIVE), BOOTED + k * 10 * MS)
+        module.receive_setpoint(setpoint(k, JointMode.PASSIVE), BOOTED + k * 10 * MS)
         module.poll(BOOTED + k * 10 * MS)
     assert module.state == ModuleState.FAULT
     assert module.last_stop == LastStop.WATCHDOG
-    assert module.demand.mode == Mode.PASSIVE
+    assert module.demand.mode == JointMode.PASSIVE
 
 
 def test_a_wrong_checksum_is_as_if_nothing_had_come():
@@ -141,14 +141,14 @@ def test_stopping_damps_until_at_rest():
     module.health.speed_rad_s = 3.0
     module.receive(make_command(CommandAction.STOP), BOOTED)
     assert module.state == ModuleState.STOPPING
-    assert module.demand[:2] == (Mode.VELOCITY, 0.0)
-    assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == Mode.VELOCITY
+    assert module.demand[:2] == (JointMode.VELOCITY, 0.0)
+    assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == JointMode.VELOCITY
     module.poll(BOOTED + 50 * MS)
     assert module.state == ModuleState.STOPPING
     module.health.speed_rad_s = 0.04
     module.poll(BOOTED + 51 * MS)
     assert module.state == ModuleState.DISARMED
-    assert module.demand.mode == Mode.PASSIVE
+    assert module.demand.mode == JointMode.PASSIVE
     assert module.last_stop == LastStop.STOP
 
 
@@ -156,7 +156,7 @@ def test_firmware_stopping_ends_after_watchdog_time():
     module = armed(stop_mode=0, watchdog=0.05)
     module.health.speed_rad_s = 3.0
     module.receive(make_command(CommandAction.STOP), BOOTED)
-    assert module.demand.mode == Mode.PASSIVE
+    assert module.demand.mode == JointMode.PASSIVE
     module.poll(BOOTED + 50 * MS)
     assert module.state == ModuleState.DISARMED
 
@@ -213,10 +213,10 @@ def test_firmware_hanging_module_repeats_state_until_hardware_watchdog_opens_bri
     module.handle_sync(4, QUIET)
     [state] = only(module.frames, Opcode.JOINT_STATE)
     assert state["count"] == 3
-    assert module.demand.mode == Mode.TORQUE
+    assert module.demand.mode == JointMode.TORQUE
     for k in range(1, 300):
         module.poll(BOOTED + k * MS)
-        assert (module.demand.mode == Mode.PASSIVE) == (k >= 100)
+        assert (module.demand.mode == JointMode.PASSIVE) == (k >= 100)
     assert not only(module.frames, Opcode.HEARTBEAT)
     module.is_hanging = False
     module.poll(BOOTED + 301 * MS)
@@ -228,7 +228,7 @@ def test_firmware_hanging_module_repeats_state_until_hardware_watchdog_opens_bri
 ANYTHING = st.one_of(
     st.sampled_from(list(CommandAction)).map(make_command),
     st.just(make_emergency()),
-    st.builds(setpoint, st.integers(0, 15), st.sampled_from(list(Mode))),
+    st.builds(setpoint, st.integers(0, 15), st.sampled_from(list(JointMode))),
     st.builds(corrupted, st.builds(setpoint, st.integers(0, 15))),
     st.builds(corrupted, st.just(make_command(CommandAction.ARM))),
     st.builds(parameter, st.integers(0, 20), st.floats(-1, 40, width=32), st.integers(0, 4)),
@@ -262,7 +262,7 @@ def test_firmware_drives_only_when_armed_with_valid_setpoints(sent):
             assert frame.id >> 6 == Opcode.SET_POINT
             assert module.rejected_frame_count == refused
         if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):
-            assert module.demand.mode == Mode.PASSIVE
+            assert module.demand.mode == JointMode.PASSIVE
 
 
 @pytest.mark.parametrize(("voltage_v", "faults"), [(18.0, 0), (17.99, 1 << ModuleFault.VOLTAGE)])

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
-    Frame,
+    CanFrame,
     ModuleParameter,
     Opcode,
     ParameterOperation,
@@ -52,7 +52,7 @@ def test_what_is_wrong_is_refused_and_changes_nothing(index, value, result):
 def test_nan_is_refused():
     module = booted()
     good = parameter(ModuleParameter.DAMPING, 1.0)
-    module.receive(Frame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED)
+    module.receive(CanFrame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED)
     assert only(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"] == ParameterResult.OUT_OF_RANGE
 
 

@@ -11,14 +11,14 @@ from snakesim_can_backend.bus.bus import VirtualWire, wait
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer, InProcessEmulators
 from snakesim_can_backend.protocol.commands import make_command, make_sync
-from snakesim_can_backend.protocol.definitions import CommandAction, Frame, ModuleState, Opcode
+from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, ModuleState, Opcode
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.module_rig import chain, only, setpoint
 from snakesim_testing.messages import raises_error
 
-Wall = tuple[VirtualWire, EmulatorServer, Callable[[float], list[Frame]]]
+Wall = tuple[VirtualWire, EmulatorServer, Callable[[float], list[CanFrame]]]
 JOINTS = 4
 
 
@@ -30,7 +30,7 @@ def served(made: ModuleChain) -> Iterator[Wall]:
     server = EmulatorServer([far], made)
     now_s = 0.0
 
-    def until(end_s: float) -> list[Frame]:
+    def until(end_s: float) -> list[CanFrame]:
         nonlocal now_s
         while True:
             pause_s = server.run_due(round(now_s * 1e9))
@@ -50,7 +50,7 @@ def served(made: ModuleChain) -> Iterator[Wall]:
 def send_tick(near: VirtualWire, tick: int) -> None:
     near.send(make_sync(tick, 0))
     for node in range(1, JOINTS + 1):
-        near.send(setpoint(tick, Mode.POSITION, 0.2, node=node))
+        near.send(setpoint(tick, JointMode.POSITION, 0.2, node=node))
 
 
 def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():

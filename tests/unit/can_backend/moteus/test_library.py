@@ -18,11 +18,11 @@ from snakesim_can_backend.moteus.controllers import (
     get_configured_gains,
 )
 from snakesim_can_backend.moteus.settings import MoteusSettings
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.drivers.drive_rig import drives_of
 from snakesim_testing.messages import raises_error
@@ -37,8 +37,8 @@ def theirs(number: int = 1, **options: Any) -> moteus.Controller:
     return moteus.Controller(id=number, transport=object(), **options)  # pyright: ignore[reportArgumentType]
 
 
-def as_frame(command: Any, number: int = 1) -> Frame:
-    return Frame((0x8000 if command.reply_required else 0) | command.source << 8 | number, bytes(command.data))
+def as_frame(command: Any, number: int = 1) -> CanFrame:
+    return CanFrame((0x8000 if command.reply_required else 0) | command.source << 8 | number, bytes(command.data))
 
 
 def test_registers_modes_and_faults_have_their_numbers() -> None:
@@ -97,7 +97,7 @@ def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
     asked = protocol.make_frame(0, 1, *MOTION_REQUESTS, reply=True)
     assert asked.id == as_frame(theirs().make_query()).id == 0x8001
     assert to_python_can(asked, fd=True).is_extended_id
-    assert not to_python_can(Frame(0x100, b""), fd=True).is_extended_id
+    assert not to_python_can(CanFrame(0x100, b""), fd=True).is_extended_id
     assert len(protocol.make_frame(0, 1, *HEALTH_REQUESTS).data) == 6
     assert len(protocol.make_frame(0, 1, *MOTION_REQUESTS).data) == 5
     assert parse_registers(protocol.make_frame(0, 1, *IDENTITY_REQUESTS).data).query == [
@@ -159,13 +159,15 @@ def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
 def test_moteus_library_reads_every_frame_of_a_run() -> None:
     backend = MoteusBackend(CONFIG, MoteusSettings(physics_model="inertia"))
     drives = drives_of(backend)
-    sent: list[Frame] = []
+    sent: list[CanFrame] = []
     send = drives.wire.send
     drives.wire.send = lambda frame: sent.append(frame) or send(frame)
     joints = backend.sample(0, 0).joints
     for tick in range(1, 20):
         joints = backend.sample(tick, tick * CONFIG.period_ns).joints
-        backend.enact(SafeSetpoints([Mode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed")
+        backend.enact(
+            SafeSetpoints([JointMode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed"
+        )
         backend.advance()
     backend.close()
     read = [parse_registers(frame.data) for frame in sent]

@@ -21,7 +21,7 @@ from snakesim_can_backend.odrive.protocol import (
     encode_request,
     split_id,
 )
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 
 DATABASE: Any = cantools.database.load_file(Path(__file__).with_name("odrive-cansimple.dbc"))
 SAME = {
@@ -57,9 +57,9 @@ def test_odrive_database_and_our_codec_read_each_other(message: MessageId) -> No
 
 def test_messages_without_data_and_ids_of_other_axes_are_theirs() -> None:
     assert DATABASE.get_message_by_name("Axis0_Clear_Errors").frame_id == encode_message(0, MessageId.CLEAR_ERRORS).id
-    assert encode_message(0, MessageId.CLEAR_ERRORS) == Frame(24, b"")
-    assert encode_request(3, MessageId.MOTION) == Frame(3 << 5 | 9, b"")
-    assert split_id(Frame(62 << 5 | 0x1B, b"")) == (62, MessageId.SET_VELOCITY_GAINS)
+    assert encode_message(0, MessageId.CLEAR_ERRORS) == CanFrame(24, b"")
+    assert encode_request(3, MessageId.MOTION) == CanFrame(3 << 5 | 9, b"")
+    assert split_id(CanFrame(62 << 5 | 0x1B, b"")) == (62, MessageId.SET_VELOCITY_GAINS)
 
 
 def test_states_modes_and_senders_are_theirs() -> None:

@@ -14,7 +14,7 @@ from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.endpoints import EMULATED, AxisSetting, read_endpoints
 from snakesim_can_backend.odrive.protocol import MessageId, decode_setting_answer, encode_setting_request, split_id
 from snakesim_can_backend.odrive.settings import MountedAxis, OdriveSettings
-from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
@@ -34,7 +34,7 @@ class Robot(DriveRig):
         config = self.configuration()
         fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 0.3}
         super().__init__(config, OdriveBackend(config, OdriveSettings(**fixed | settings)))
-        self.sent: list[Frame] = []
+        self.sent: list[CanFrame] = []
         send = self.drives.wire.send
         self.drives.wire.send = lambda frame: self.sent.append(frame) or send(frame)
 
@@ -209,7 +209,7 @@ def test_odrive_axis_without_readable_configuration_is_refused(monkeypatch: pyte
 
 def test_questions_and_answers_are_those_of_odrives_examples() -> None:
     """Their form is `<BHB` and the value: opcode, endpoint, reserved; `can_param_access.py` of ODriveResources."""
-    assert encode_setting_request(3, 271) == Frame(3 << 5 | 0x04, struct.pack("<BHB", 0, 271, 0))
+    assert encode_setting_request(3, 271) == CanFrame(3 << 5 | 0x04, struct.pack("<BHB", 0, 271, 0))
     assert decode_setting_answer(struct.pack("<BHBf", 0, 271, 0, 12.5)) == (271, struct.pack("<f", 12.5))
     with pytest.raises(struct.error):
         decode_setting_answer(b"\0\1")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_can_backend.protocol.codec import CodecError, MessageLayout, Signal, load_database, load_layouts
+from snakesim_can_backend.protocol.codec import CodecError, FrameSignal, MessageLayout, load_database, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     WITH_CHECKSUM,
@@ -37,15 +37,15 @@ often = settings(max_examples=400)
 nodes = st.integers(1, LAST_NODE)
 
 
-def slack(signal: Signal, value: float) -> float:
+def slack(signal: FrameSignal, value: float) -> float:
     """Half a step, and what double precision makes of it."""
     half = abs(value) * 2**-24 + 2**-150 if signal.is_float else signal.scale / 2
     return half * (1 + 1e-9) + 1e-12 * abs(value)
 
 
-def raw_numbers(signal: Signal) -> st.SearchStrategy[int]:
+def raw_numbers(signal: FrameSignal) -> st.SearchStrategy[int]:
     if signal.is_float:
-        return st.floats(-(2.0**127), 2.0**127, width=32).map(lambda v: Signal.encode(signal, v))
+        return st.floats(-(2.0**127), 2.0**127, width=32).map(lambda v: FrameSignal.encode(signal, v))
     return st.integers(
         round((signal.low - signal.offset) / signal.scale), round((signal.high - signal.offset) / signal.scale)
     )
@@ -68,7 +68,7 @@ def contents(draw: st.DrawFn, layout: MessageLayout) -> dict[str, int]:
 @given(any_signal, st.data(), nodes)
 @often
 def test_every_value_comes_back_within_half_a_step(
-    of: tuple[MessageLayout, Signal], data: st.DataObject, node: int
+    of: tuple[MessageLayout, FrameSignal], data: st.DataObject, node: int
 ) -> None:
     layout, signal = of
     value = data.draw(st.floats(signal.low, signal.high))
@@ -80,7 +80,7 @@ def test_every_value_comes_back_within_half_a_step(
 
 
 @each_signal
-def test_both_ends_of_a_range_fit_and_come_back(layout: MessageLayout, signal: Signal) -> None:
+def test_both_ends_of_a_range_fit_and_come_back(layout: MessageLayout, signal: FrameSignal) -> None:
     for end in (signal.low, signal.high):
         back = layout.decode(layout.encode(1, **{signal.name: end}).data)[signal.name]
         assert abs(back - end) <= slack(signal, end)
@@ -90,7 +90,7 @@ def test_both_ends_of_a_range_fit_and_come_back(layout: MessageLayout, signal: S
 
 @each_signal
 @pytest.mark.parametrize("wrong", ["above", "below", math.nan, math.inf, -math.inf])
-def test_codec_value_out_of_range_is_refused(layout: MessageLayout, signal: Signal, wrong: float | str) -> None:
+def test_codec_value_out_of_range_is_refused(layout: MessageLayout, signal: FrameSignal, wrong: float | str) -> None:
     step = 1e32 if signal.is_float else signal.scale
     value = {"above": signal.high + step, "below": signal.low - step}[wrong] if isinstance(wrong, str) else wrong
     with pytest.raises(CodecError) as caught:

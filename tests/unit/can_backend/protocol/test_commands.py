@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleState,
     Opcode,
 )
-from snakesim_hal.wire.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import JointMode, LifecycleState
 from snakesim_testing.can.frames import read
 
 LIFECYCLES: tuple[LifecycleState, ...] = get_args(LifecycleState)
-TARGET = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "torque"}
+TARGET = {JointMode.POSITION: "position", JointMode.VELOCITY: "velocity", JointMode.TORQUE: "torque"}
 
 
-def one(mode: Mode, target: float, limit_nm: float = 4.0) -> Frame:
+def one(mode: JointMode, target: float, limit_nm: float = 4.0) -> CanFrame:
     (frame,) = commands.SetpointWriter(1).encode([mode], np.array([target]), np.array([limit_nm]))
     return frame
 
@@ -32,7 +32,7 @@ def one(mode: Mode, target: float, limit_nm: float = 4.0) -> Frame:
 
 
 @given(st.sampled_from(list(TARGET)), st.floats(-3.2767, 3.2767), st.floats(0, 65.535))
-def test_targets_and_limits_are_rounded_to_the_nearest_step(mode: Mode, target: float, limit_nm: float) -> None:
+def test_targets_and_limits_are_rounded_to_the_nearest_step(mode: JointMode, target: float, limit_nm: float) -> None:
     said = read(one(mode, target, limit_nm))
     step = load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert abs(said[TARGET[mode]] - target) <= step / 2 * (1 + 1e-9)
@@ -40,7 +40,7 @@ def test_targets_and_limits_are_rounded_to_the_nearest_step(mode: Mode, target: 
 
 
 @given(st.sampled_from(list(TARGET)), st.floats(33, 1e9) | st.just(math.inf), st.booleans())
-def test_what_is_beyond_the_range_is_sent_as_its_end(mode: Mode, beyond: float, negative: bool) -> None:
+def test_what_is_beyond_the_range_is_sent_as_its_end(mode: JointMode, beyond: float, negative: bool) -> None:
     said = read(one(mode, -beyond if negative else beyond, 65.6 + beyond))
     most = 32767 * load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert said[TARGET[mode]] == pytest.approx(-most if negative else most)
@@ -50,13 +50,13 @@ def test_what_is_beyond_the_range_is_sent_as_its_end(mode: Mode, beyond: float, 
 
 @given(st.floats(-1e6, 1e6))
 def test_a_passive_joint_gets_no_target(target: float) -> None:
-    frame = one(Mode.PASSIVE, target, 0.0)
+    frame = one(JointMode.PASSIVE, target, 0.0)
     assert frame.data[:5] == bytes(5)
 
 
 def test_joints_and_set_points_must_be_as_many() -> None:
     with pytest.raises(ValueError):
-        commands.SetpointWriter(3).encode([Mode.PASSIVE] * 2, np.zeros(2), np.zeros(2))
+        commands.SetpointWriter(3).encode([JointMode.PASSIVE] * 2, np.zeros(2), np.zeros(2))
 
 
 # --- changes of the robot's lifecycle ----------------------------------------------------------------------
@@ -65,7 +65,7 @@ CLEAR, ARM, STOP, DISARM = (
     commands.make_command(a) for a in (CommandAction.CLEAR, CommandAction.ARM, CommandAction.STOP, CommandAction.DISARM)
 )
 EMERGENCY = commands.make_emergency()
-TOLD: dict[tuple[LifecycleState, LifecycleState], list[Frame]] = {
+TOLD: dict[tuple[LifecycleState, LifecycleState], list[CanFrame]] = {
     ("disarmed", "armed"): [ARM],
     ("disarmed", "fault"): [],
     ("disarmed", "estop"): [EMERGENCY],
@@ -91,7 +91,7 @@ def test_commands_on_state_change_address_all_modules(before: LifecycleState, no
 @pytest.mark.parametrize("lifecycle", LIFECYCLES)
 @pytest.mark.parametrize("state", list(ModuleState))
 def test_commands_repeat_state_to_a_module_that_differs(lifecycle: LifecycleState, state: ModuleState) -> None:
-    expected: Frame | None = None
+    expected: CanFrame | None = None
     if (lifecycle, state) == ("armed", ModuleState.DISARMED):
         expected = commands.make_command(CommandAction.ARM, 3)
     elif lifecycle == "estop" and state not in (ModuleState.EMERGENCY, ModuleState.BOOT):

@@ -18,8 +18,8 @@ from snakesim_can_backend.protocol.definitions import (
     MAX_WRONG_COUNTS,
     NODE_BITS,
     PARAMETERS,
+    CanFrame,
     CommandAction,
-    Frame,
     ModuleState,
     Opcode,
 )
@@ -247,5 +247,5 @@ def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: M
 def test_protocol_document_examples_contain_only_defined_frames() -> None:
     lengths = {int(opcode): load_layouts()[opcode].length for opcode in Opcode}
     for identifier, data in re.findall(r"\b([0-9A-F]{3})#([0-9A-F]*)", TEXT):
-        frame = Frame(int(identifier, 16), bytes.fromhex(data))
+        frame = CanFrame(int(identifier, 16), bytes.fromhex(data))
         assert lengths[frame.id >> NODE_BITS] == len(frame.data)

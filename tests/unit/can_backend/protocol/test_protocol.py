@@ -15,9 +15,9 @@ from snakesim_can_backend.protocol.definitions import (
     NODE_BITS,
     NODE_MASK,
     WITH_CHECKSUM,
+    CanFrame,
     CommandAction,
     EmergencyReason,
-    Frame,
     LastStop,
     ModuleFault,
     ModuleParameter,
@@ -29,12 +29,12 @@ from snakesim_can_backend.protocol.definitions import (
     frame_id,
     has_valid_checksum,
 )
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 DATABASE = load_database()
 NAMED: dict[str, type[IntEnum]] = {
     "state": ModuleState,
-    "mode": Mode,
+    "mode": JointMode,
     "action": CommandAction,
     "reason": EmergencyReason,
     "last_stop": LastStop,
@@ -102,10 +102,10 @@ def test_signals_of_a_message_overlap_only_for_setpoint_targets() -> None:
 # --- checksum ----------------------------------------------------------------------------------------------
 
 
-def checked(opcode: Opcode, node: int, payload: bytes) -> Frame:
+def checked(opcode: Opcode, node: int, payload: bytes) -> CanFrame:
     identifier = frame_id(opcode, node)
     data = payload[: load_layouts()[opcode].length - 1]
-    return Frame(identifier, data + bytes((checksum(identifier, data),)))
+    return CanFrame(identifier, data + bytes((checksum(identifier, data),)))
 
 
 @pytest.mark.parametrize("opcode", sorted(WITH_CHECKSUM))
@@ -116,11 +116,11 @@ def test_checksum_detects_every_single_bit_error_and_wrong_node(opcode: Opcode, 
     number = int.from_bytes(frame.data, "little")
     for bit in range(8 * len(frame.data)):
         wrong = (number ^ 1 << bit).to_bytes(len(frame.data), "little")
-        assert not has_valid_checksum(Frame(frame.id, wrong)), bit
+        assert not has_valid_checksum(CanFrame(frame.id, wrong)), bit
     for bit in range(11):
-        assert not has_valid_checksum(Frame(frame.id ^ 1 << bit, frame.data)), bit
+        assert not has_valid_checksum(CanFrame(frame.id ^ 1 << bit, frame.data)), bit
     for other in range(NODE_MASK + 1):
-        assert has_valid_checksum(Frame(frame_id(opcode, other), frame.data)) == (other == node)
+        assert has_valid_checksum(CanFrame(frame_id(opcode, other), frame.data)) == (other == node)
 
 
 def test_messages_with_checksum_have_distinct_lengths() -> None:

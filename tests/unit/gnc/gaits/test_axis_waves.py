@@ -9,11 +9,11 @@ from snakesim_gnc.control.gaits.axis_waves import RaisedHead, Rolling, Sidewindi
 from snakesim_hal.controller import Controller
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.run.in_process import Result, simulate
+from snakesim_operator.run.in_process import InProcessResult, simulate
 from snakesim_testing.gnc.stage import make_stage
 
 
-def on_flat_ground(*sets: str) -> Result:
+def on_flat_ground(*sets: str) -> InProcessResult:
     result = simulate(load_scenario("mamba_flat", [parse_set_option(text) for text in sets]).config)
     assert result.summary.ended == "complete"
     return result

@@ -12,10 +12,10 @@ from snakesim_gnc.control.gaits.backbones import (
     compute_helix,
     compute_node_fractions,
 )
-from snakesim_gnc.control.gaits.chain_fit import Backbone, ChainFit, KeyframeWaves
+from snakesim_gnc.control.gaits.chain_fit import BackboneCurve, ChainFit, KeyframeWaves
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.kinematics import compute_link_frames
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_testing.gnc.stage import make_robot
 from snakesim_testing.messages import raises_error
 
@@ -23,15 +23,15 @@ MAX_DISTANCE = 0.012  # of a node from its place on the curve, in body lengths
 PARAMETERS = BackboneSidewindingParameters()
 
 
-def make_alternating_robot(modules: int = 18) -> Description:
+def make_alternating_robot(modules: int = 18) -> RobotDescription:
     return make_robot(modules, ("yaw", "pitch"))
 
 
-def measure_length_m(robot: Description) -> float:
+def measure_length_m(robot: RobotDescription) -> float:
     return sum(link.length_m for link in robot.links)
 
 
-def fit_helix(robot: Description, phases: int = 16) -> KeyframeWaves:
+def fit_helix(robot: RobotDescription, phases: int = 16) -> KeyframeWaves:
     places, length_m = compute_node_fractions(robot), measure_length_m(robot)
     waves = KeyframeWaves(robot, lambda phase: compute_helix(places, length_m, PARAMETERS, phase), phases)
     assert waves.advance_fit()
@@ -54,7 +54,7 @@ def test_a_chain_that_lies_on_a_curve_already_is_found() -> None:
     origins, rotations = compute_link_frames(np.zeros(3), np.eye(3), angles, axes, lengths_m)
     nodes = np.vstack([origins, origins[-1] + lengths_m[-1] * rotations[-1][:, 0]])
     chain = ChainFit(robot)
-    for _ in chain.fit_first(Backbone(nodes, np.cross(rotations[5][:, 0], rotations[5][:, 1]))):
+    for _ in chain.fit_first(BackboneCurve(nodes, np.cross(rotations[5][:, 0], rotations[5][:, 1]))):
         pass
     assert np.linalg.norm(chain.compute_node_positions() - nodes, axis=1).max() < 0.02 * measure_length_m(robot)
 
@@ -138,7 +138,7 @@ def test_a_helix_that_the_joints_cannot_form_is_refused(gait, parameters) -> Non
 
 
 @pytest.mark.parametrize("robot", [make_alternating_robot(), make_robot(13)], ids=["alternating", "planar"])
-def test_the_default_parameters_are_accepted(robot: Description) -> None:
+def test_the_default_parameters_are_accepted(robot: RobotDescription) -> None:
     """A planar robot is not refused: it holds its pose and reports the reason."""
     BackboneSidewinding.check(robot, PARAMETERS)
     BackboneRolling.check(robot, BackboneRollingParameters())

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.gaits.cpg import MAX_FEEDBACK_RATIO, Cpg, CpgParameters, Oscillators
+from snakesim_gnc.control.gaits.cpg import MAX_FEEDBACK_RATIO, Cpg, CpgParameters, OscillatorChains
 from snakesim_gnc.control.gaits.serpenoid import Serpenoid, SerpenoidParameters
 from snakesim_testing.gnc.stage import make_contact, make_stage
 
@@ -15,14 +15,14 @@ LIMIT_RAD = np.full((2, 4), 0.2)
 TURN_RAD_S = 4.0
 
 
-def advance(oscillators: Oscillators, seconds: float, feedback_rad_s: Any = 0.0) -> None:
+def advance(oscillators: OscillatorChains, seconds: float, feedback_rad_s: Any = 0.0) -> None:
     feedback = np.broadcast_to(feedback_rad_s, (2, 4))
     for _ in range(round(seconds / 0.01)):
         oscillators.integrate(0.01, TURN_RAD_S, LIMIT_RAD, feedback)
 
 
 def test_disturbed_oscillators_return_to_the_traveling_wave() -> None:
-    oscillators = Oscillators(PHASES, coupling=30.0, amplitude_rate=10.0)
+    oscillators = OscillatorChains(PHASES, coupling=30.0, amplitude_rate=10.0)
     oscillators.theta_rad = oscillators.theta_rad + np.array([[0.8, -0.5, 0.3, 0.0], [0.0, 0.6, -0.9, 0.2]])
     advance(oscillators, 5.0)
     assert np.diff(oscillators.theta_rad[0]) == pytest.approx(np.diff(PHASES), abs=1e-3)
@@ -32,7 +32,7 @@ def test_disturbed_oscillators_return_to_the_traveling_wave() -> None:
 
 def test_amplitudes_approach_their_limit_without_overshoot() -> None:
     """The equation is critically damped: r = R (1 - (1 + a t / 2) exp(-a t / 2))."""
-    oscillators = Oscillators(PHASES, coupling=30.0, amplitude_rate=10.0)
+    oscillators = OscillatorChains(PHASES, coupling=30.0, amplitude_rate=10.0)
     seen: list[float] = []
     for _ in range(300):
         oscillators.integrate(0.01, TURN_RAD_S, LIMIT_RAD, np.zeros((2, 4)))
@@ -43,7 +43,7 @@ def test_amplitudes_approach_their_limit_without_overshoot() -> None:
 
 
 def test_the_phase_grows_by_the_frequency() -> None:
-    oscillators = Oscillators(PHASES, coupling=30.0, amplitude_rate=10.0)
+    oscillators = OscillatorChains(PHASES, coupling=30.0, amplitude_rate=10.0)
     advance(oscillators, 3.0)
     before = oscillators.theta_rad.copy()
     advance(oscillators, 1.0)

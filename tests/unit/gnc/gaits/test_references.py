@@ -20,20 +20,22 @@ from snakesim_gnc.control.gaits.serpenoid import Serpenoid, SerpenoidParameters
 from snakesim_gnc.control.gaits.sinus_lifting import SinusLifting, SinusLiftingParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand
-from snakesim_testing.gnc.stage import PERIOD_S, Stage, make_stage
+from snakesim_testing.gnc.stage import PERIOD_S, ObservationStage, make_stage
 
 PLANAR = [Serpenoid, Cpg, Concertina]
 SPATIAL = [BackboneSidewinding, BackboneRolling, SinusLifting, Rectilinear]
 MAX_STEP_RAD = 0.075  # of a target in a tick: what the limiter of this robot allows at 7.5 rad/s
 
 
-def make_stage_for(gait: type[Controller[Any]]) -> Stage:
+def make_stage_for(gait: type[Controller[Any]]) -> ObservationStage:
     if gait in PLANAR:
         return make_stage(13)
     return make_stage(18, ("yaw", "pitch"))
 
 
-def drive(controller: Controller[Any], stage: Stage, ticks: range, **changes: Any) -> list[ControllerCommand]:
+def drive(
+    controller: Controller[Any], stage: ObservationStage, ticks: range, **changes: Any
+) -> list[ControllerCommand]:
     """The commands for a body that does not move. To lay it on the path again in every tick would take long."""
     seen = stage.make_observation(ticks.start, 0.3, **changes)
     observations = [dataclasses.replace(seen, tick=tick, time_s=tick * PERIOD_S) for tick in ticks]

@@ -5,9 +5,9 @@ import pytest
 
 from snakesim_gnc.guidance.anchoring import ESTIMATED_CONTACT_TRUST, MEASURED_CONTACT_TRUST, ObstacleAnchors
 from snakesim_gnc.guidance.body_history import BasePose
-from snakesim_gnc.guidance.localization import Localizer, PoseNoise
+from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
 from snakesim_hal.model.kinematics import compute_link_frames
-from snakesim_hal.wire.messages import Contact, Obstacle
+from snakesim_hal.wire.messages import Contact, KnownObstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot
 from snakesim_testing.hal.small_robots import make_link_contact
 
@@ -23,15 +23,17 @@ def base_at(planar_w) -> BasePose:
     return BasePose(np.array(planar_w), BODY_RADIUS_M, np.eye(3))
 
 
-def pegs(apart_m: float = 0.0) -> list[Obstacle]:
+def pegs(apart_m: float = 0.0) -> list[KnownObstacle]:
     """At the middles of the links of a body that lies where it is in truth."""
     base = base_at(TRUE_W)
     rear, frames = compute_link_frames(base.position_w, base.rotation, SHAPE, ["yaw"] * len(SHAPE), LENGTHS)
-    found: list[Obstacle] = []
+    found: list[KnownObstacle] = []
     for link, side in TOUCHED:
         away_m = side * (BODY_RADIUS_M + PEG_M + apart_m)
         x, y, _ = (rear[link] + 0.5 * LENGTHS[link] * frames[link][:, 0] + away_m * frames[link][:, 1]).tolist()
-        found.append(Obstacle(name=f"{link}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_M, height_m=0.2))
+        found.append(
+            KnownObstacle(name=f"{link}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_M, height_m=0.2)
+        )
     return found
 
 
@@ -49,9 +51,9 @@ def pushes(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     ]
 
 
-def held(off_w, obstacles, contacts, trust=ESTIMATED_CONTACT_TRUST, turns: int = 20) -> Localizer:
+def held(off_w, obstacles, contacts, trust=ESTIMATED_CONTACT_TRUST, turns: int = 20) -> PoseLocalizer:
     """A localizer that begins off the truth, and what is known after some turns."""
-    localizer = Localizer(ROBOT, base_at(TRUE_W + off_w), PoseNoise())
+    localizer = PoseLocalizer(ROBOT, base_at(TRUE_W + off_w), PoseNoise())
     localizer.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
     anchors = ObstacleAnchors(ROBOT, obstacles)
     for _ in range(turns):

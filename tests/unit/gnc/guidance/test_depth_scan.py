@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.guidance.depth_scan import DepthScanner, decode_depth_m
 from snakesim_gnc.guidance.ground import fit_plane_under_body, refine_plane
-from snakesim_gnc.guidance.scan import RangeNoise, Scan, make_scan
+from snakesim_gnc.guidance.scan import AzimuthScan, RangeNoise, make_scan
 from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_testing.gnc.rendered import (
     INTRINSICS,
@@ -31,7 +31,7 @@ SCENE = [
 ]
 
 
-def look(obstacles, rotation, *, ground=flat_ground, eye=None, at=(0.0, 0.0)) -> Scan:
+def look(obstacles, rotation, *, ground=flat_ground, eye=None, at=(0.0, 0.0)) -> AzimuthScan:
     z = EYE_M + float(ground(np.array(at[0]), np.array(at[1])))
     position = np.array([*at, z])
     image = render_depth_image(obstacles, position, rotation, ground=ground, sensor_errors=eye)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from snakesim_gnc.guidance import obstacle_map
 from snakesim_gnc.guidance.obstacle_map import FORGET_DISTANCE_M, ObstacleMap
 from snakesim_hal.model.outlines import compute_outline_distance_m
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.rendered import make_box, make_cylinder, make_lidar_scan
 
 S = 1_000_000_000
@@ -30,7 +30,7 @@ def touch(map_, center, radius_m, angle_rad) -> None:
     map_.add_touches([(np.array(center) + radius_m * normal, normal)], 0)
 
 
-def only(map_, now_ns=0) -> Obstacle:
+def only(map_, now_ns=0) -> KnownObstacle:
     (reported,) = map_.list_obstacles(now_ns, 0.0)
     return reported
 
@@ -115,7 +115,7 @@ def test_where_the_body_lies_nothing_reaches():
     assert _depth_beyond(only(map_), axis) < 0.012
 
 
-def _depth_beyond(reported: Obstacle, axis: np.ndarray) -> float:
+def _depth_beyond(reported: KnownObstacle, axis: np.ndarray) -> float:
     """How far an obstacle reaches into the body."""
     return BODY_M - min(compute_outline_distance_m(reported, p) for p in axis)
 

@@ -6,14 +6,14 @@ import pytest
 
 from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
-from snakesim_hal.wire.messages import Contacts, World
+from snakesim_hal.wire.messages import Contacts, WorldModel
 from snakesim_operator.results.metrics.map_score import MapScore, align_map, score_map
 from snakesim_testing.gnc.rendered import make_cylinder, make_hills, render_lidar_scan
 from snakesim_testing.gnc.sliding_snake import NOISE, STEP_NS, SlidingSnake, make_random_obstacles
 from snakesim_testing.hal.small_robots import make_link_contact
 
 
-def reported(drive: SlidingSnake) -> World:
+def reported(drive: SlidingSnake) -> WorldModel:
     world = drive.world.make_world(drive.turn, drive.turn * STEP_NS)
     assert world is not None
     return world

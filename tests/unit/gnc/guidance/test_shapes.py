@@ -9,17 +9,17 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.guidance.clusters import find_clusters
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.surfaces import MAX_CELLS, MAX_INFORMATION, Surface
-from snakesim_gnc.guidance.tracks import Track, fit_shapes
+from snakesim_gnc.guidance.surfaces import MAX_CELLS, MAX_INFORMATION, SurfaceCells
+from snakesim_gnc.guidance.tracks import ObstacleTrack, fit_shapes
 from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_testing.gnc.rendered import make_box, make_cylinder, make_lidar_scan
 
 NOISE_M = 0.002
 
 
-def track_shape(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
+def track_shape(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> ObstacleTrack:
     """A track of what a lidar saw of one obstacle, from some places."""
-    track = Track(1, "it")
+    track = ObstacleTrack(1, "it")
     for x, y in views:
         scan = make_lidar_scan(truth, at=(x, y))
         hits = np.flatnonzero(np.isfinite(scan.range_m))
@@ -99,7 +99,7 @@ def test_a_long_face_is_a_thin_wall():
 
 
 def test_a_short_arc_leaves_the_line_of_sight_uncertain():
-    whole, part = track_shape(make_cylinder("it", 0.8, 0.0)), Track(2, "part")
+    whole, part = track_shape(make_cylinder("it", 0.8, 0.0)), ObstacleTrack(2, "part")
     few = slice(len(whole.surface) // 2 - 2, len(whole.surface) // 2 + 2)
     part.surface.add(whole.surface.points_w[few], np.full(4, NOISE_M), whole.surface.outward_directions_w[few])
     fit_shapes([part])
@@ -108,7 +108,7 @@ def test_a_short_arc_leaves_the_line_of_sight_uncertain():
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=300))
 def test_a_surface_is_bounded_and_never_surer_than_the_mount(places):
-    surface = Surface()
+    surface = SurfaceCells()
     for _ in range(3):
         surface.add(np.array(places), np.full(len(places), 0.001), np.tile([1.0, 0.0], (len(places), 1)))
     assert 0 < len(surface) <= MAX_CELLS

@@ -7,13 +7,15 @@ from snakesim_drivers.kit.drive_states import DriveStates
 from snakesim_drivers.kit.drives import BusCommand
 from snakesim_drivers.kit.holding_brakes import BrakePlan, HoldingBrakes
 from snakesim_drivers.kit.limit_switches import LimitSwitches
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 
 PERIOD_NS = 10_000_000
 ANGLE_RAD = np.array([0.5])
 
 
-def command(*, follow: bool, mode: Mode = Mode.POSITION, target: float = 0.9, emergency: bool = False) -> BusCommand:
+def command(
+    *, follow: bool, mode: JointMode = JointMode.POSITION, target: float = 0.9, emergency: bool = False
+) -> BusCommand:
     following = frozenset({0}) if follow else frozenset[int]()
     return BusCommand(following, [mode], np.array([target]), np.array([2.0]), may_enable=follow, emergency=emergency)
 
@@ -44,10 +46,10 @@ def test_torque_is_held_until_the_brake_has_closed() -> None:
     brake = Brake()
     for _ in range(8):
         brake.step(command(follow=True))
-    plans = [brake.step(command(follow=False, mode=Mode.PASSIVE, target=0.0)) for _ in range(5)]
+    plans = [brake.step(command(follow=False, mode=JointMode.PASSIVE, target=0.0)) for _ in range(5)]
     assert not any(plan.released for plan in plans)
     assert [bool(plan.command.enabled_drives) for plan in plans] == [True] * 3 + [False] * 2
-    assert plans[0].command.modes == [Mode.POSITION]
+    assert plans[0].command.modes == [JointMode.POSITION]
     assert plans[0].command.targets[0] == 0.5
     assert plans[0].command.limits_nm[0] == 2.0
 
@@ -66,9 +68,11 @@ def test_drive_that_was_never_enabled_holds_nothing_when_disarmed() -> None:
 
 @pytest.mark.parametrize(
     ("mode", "into", "kept_at", "away"),
-    [(Mode.POSITION, 0.9, 0.5, 0.1), (Mode.VELOCITY, 1.0, 0.0, -1.0), (Mode.TORQUE, 1.0, 0.0, -1.0)],
+    [(JointMode.POSITION, 0.9, 0.5, 0.1), (JointMode.VELOCITY, 1.0, 0.0, -1.0), (JointMode.TORQUE, 1.0, 0.0, -1.0)],
 )
-def test_closed_switch_allows_motion_away_from_it_alone(mode: Mode, into: float, kept_at: float, away: float) -> None:
+def test_closed_switch_allows_motion_away_from_it_alone(
+    mode: JointMode, into: float, kept_at: float, away: float
+) -> None:
     switches = LimitSwitches(["joint_1"])
     switches.record_switches(0, lower=False, upper=True)
     for target, expected in ((into, kept_at), (away, away)):

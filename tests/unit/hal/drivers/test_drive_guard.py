@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from snakesim_drivers.kit.braking import Braking
+from snakesim_drivers.kit.braking import BrakingJoints
 from snakesim_drivers.kit.drive_guard import DriveGuard
-from snakesim_drivers.kit.findings import Finding
-from snakesim_hal.wire.messages import Mode
+from snakesim_drivers.kit.findings import FaultFinding
+from snakesim_hal.wire.messages import JointMode
 
 MS = 1_000_000
 GAP_NS, GRACE_NS = 50 * MS, 50 * MS
@@ -28,7 +28,7 @@ class Bench:
         return self.guard.select_drives_to_enable(BOTH, may_enable=False)
 
     def finds(self, joint: int | None) -> None:
-        self.guard.note_findings([Finding("drive_fault", "it is too hot", joint)])
+        self.guard.note_findings([FaultFinding("drive_fault", "it is too hot", joint)])
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ EVERYBODY = frozenset({0, 1, 2})
 
 
 def test_guard_joint_brakes_until_rest_or_watchdog_time() -> None:
-    braking, modes = Braking([100 * MS, 200 * MS, 100 * MS], is_hold_mode=False), [Mode.VELOCITY] * 3
+    braking, modes = BrakingJoints([100 * MS, 200 * MS, 100 * MS], is_hold_mode=False), [JointMode.VELOCITY] * 3
     for _ in range(2):  # a fault, and the next one
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 0) == {0, 1}
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 99 * MS) == {0, 1}
@@ -108,8 +108,8 @@ def test_guard_joint_brakes_until_rest_or_watchdog_time() -> None:
 
 
 def test_guard_hold_has_no_end_and_passive_disables_at_once() -> None:
-    braking = Braking([100 * MS] * 3, is_hold_mode=True)
-    assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
-    assert braking.select_braking_joints(EVERYBODY, [Mode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY
-    modes = [Mode.PASSIVE, Mode.POSITION, Mode.POSITION]
+    braking = BrakingJoints([100 * MS] * 3, is_hold_mode=True)
+    assert braking.select_braking_joints(EVERYBODY, [JointMode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
+    assert braking.select_braking_joints(EVERYBODY, [JointMode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY
+    modes = [JointMode.PASSIVE, JointMode.POSITION, JointMode.POSITION]
     assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 10_000 * MS) == {1, 2}

@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_drivers.mounting import Mounting
-from snakesim_hal.wire.messages import Mode
+from snakesim_drivers.mounting import DriveMounting
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.hal.small_robots import make_robot_file
 
 MIXED = {
     "joint_1": {"sign": -1, "zero_rad": 3.0, "gear": 9.0, "angle_min_rad": -0.4},
     "joint_3": {"sign": 1, "zero_rad": -0.2},
 }
-mounting = Mounting(make_robot_file(joints=MIXED).joint_table)
-plain = Mounting(make_robot_file().joint_table)
+mounting = DriveMounting(make_robot_file(joints=MIXED).joint_table)
+plain = DriveMounting(make_robot_file().joint_table)
 numbers = st.lists(st.floats(-10, 10), min_size=3, max_size=3).map(np.array)
 
 
@@ -48,6 +48,10 @@ def test_plainly_mounted_drives_have_the_joints_numbers_to_the_bit(values: np.nd
 
 def test_targets_are_converted_by_the_mode_of_each_joint() -> None:
     asked = [1.0, 1.0, 0.5]
-    assert mounting.to_drive_targets([Mode.POSITION] * 3, asked) == pytest.approx([-6.0, 1.0, 0.3])
-    assert mounting.to_drive_targets([Mode.VELOCITY, Mode.TORQUE, Mode.PASSIVE], asked).tolist() == [-9.0, 1.0, 0.0]
-    assert mounting.to_drive_targets([Mode.TORQUE] * 3, asked) == pytest.approx([-1 / 9, 1.0, 0.5])
+    assert mounting.to_drive_targets([JointMode.POSITION] * 3, asked) == pytest.approx([-6.0, 1.0, 0.3])
+    assert mounting.to_drive_targets([JointMode.VELOCITY, JointMode.TORQUE, JointMode.PASSIVE], asked).tolist() == [
+        -9.0,
+        1.0,
+        0.0,
+    ]
+    assert mounting.to_drive_targets([JointMode.TORQUE] * 3, asked) == pytest.approx([-1 / 9, 1.0, 0.5])

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.faults.disturbance import MAX_REPEATS_PER_CALL, MessageDisturbance, corrupt_payload
-from snakesim_hal.model.fault_kinds import Injection, validate_and_complete_injection
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.model.fault_kinds import FaultInjection, validate_and_complete_injection
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointCommand
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 
@@ -19,11 +19,11 @@ MESSAGES = [b"%05d" % i for i in range(400)]
 STEP_S = 0.01
 
 
-def on(kind: str, amount: float | None = None) -> Injection:
-    return validate_and_complete_injection(Injection(kind, KEY, amount=amount))
+def on(kind: str, amount: float | None = None) -> FaultInjection:
+    return validate_and_complete_injection(FaultInjection(kind, KEY, amount=amount))
 
 
-def disturbed(*faults: Injection, seed: str = "1") -> MessageDisturbance:
+def disturbed(*faults: FaultInjection, seed: str = "1") -> MessageDisturbance:
     made = MessageDisturbance(seed)
     for fault in faults:
         made.start_fault(fault, 0.0)
@@ -53,7 +53,7 @@ faults = st.lists(
 
 
 @given(faults, st.text(max_size=5))
-def test_nothing_is_invented_and_nothing_comes_before_its_time(chosen: list[Injection], seed: str) -> None:
+def test_nothing_is_invented_and_nothing_comes_before_its_time(chosen: list[FaultInjection], seed: str) -> None:
     way = disturbed(*chosen, seed=seed)
     out = sent(way, MESSAGES[:40])
     assert {payload for _, payload in out} <= set(MESSAGES[:40])
@@ -70,7 +70,7 @@ def test_nothing_is_invented_and_nothing_comes_before_its_time(chosen: list[Inje
 
 
 @given(faults, st.integers(0, 39))
-def test_when_all_is_over_everything_is_as_before(chosen: list[Injection], at: int) -> None:
+def test_when_all_is_over_everything_is_as_before(chosen: list[FaultInjection], at: int) -> None:
     way = disturbed(*chosen)
     for message in MESSAGES[:at]:
         way.disturb_payload(message, 0.0)
@@ -150,7 +150,11 @@ def test_corrupt_bytes_are_other_bytes(payload: bytes, seed: int) -> None:
 
 
 def test_disturbance_corrupted_payloads_are_refused_by_decoders() -> None:
-    payload, decoder, rng = encode(make_joint_command(make_description(), 0.1)), Decoder(JointCommand), random.Random(5)
+    payload, decoder, rng = (
+        encode(make_joint_command(make_description(), 0.1)),
+        MessageDecoder(JointCommand),
+        random.Random(5),
+    )
     lengths, refused, taken = set(), 0, 0
     for _ in range(20_000):
         wrong = corrupt_payload(payload, rng)

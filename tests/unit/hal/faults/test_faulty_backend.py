@@ -10,8 +10,8 @@ import pytest
 from snakesim_hal.backend import Backend, SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.model.fault_kinds import Injection, parse_injection
-from snakesim_hal.wire.messages import Description, JointState, Mode
+from snakesim_hal.model.fault_kinds import FaultInjection, parse_injection
+from snakesim_hal.wire.messages import JointMode, JointState, RobotDescription
 from snakesim_testing.hal.local_network import LagBackend
 from snakesim_testing.hal.small_robots import PERIOD_NS, make_run_config
 from snakesim_testing.messages import raises_error
@@ -20,7 +20,7 @@ from snakesim_testing.messages import raises_error
 class Emulated(LagBackend):
     """Says that nothing real moves."""
 
-    def describe(self) -> Description:
+    def describe(self) -> RobotDescription:
         return msgspec.structs.replace(super().describe(), emulated=True)
 
 
@@ -31,7 +31,7 @@ class Leaky(Emulated):
         super().__init__(config)
         self.injected: list[tuple[str, bool]] = []
 
-    def inject(self, injection: Injection, *, begins: bool) -> bool:
+    def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         if injection.kind != "leak":
             return False
         self.injected.append((str(injection), begins))
@@ -46,7 +46,7 @@ class Bench:
         self.tick = 0
 
     def sample(self) -> JointState:
-        self.backend.enact(SafeSetpoints([Mode.VELOCITY] * 3, [1.0] * 3, [4.0] * 3), "armed")
+        self.backend.enact(SafeSetpoints([JointMode.VELOCITY] * 3, [1.0] * 3, [4.0] * 3), "armed")
         self.backend.advance()
         self.tick += 1
         return self.backend.sample(self.tick, self.tick * PERIOD_NS).joints

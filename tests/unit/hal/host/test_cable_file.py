@@ -13,7 +13,7 @@ from snakesim_hal.host.cable_file import CABLE_FILENAME, MAX_DECLARATION_AGE_S, 
 from snakesim_hal.model.files import SHIPPED_FILES_DIR, decode_table, read_table_with_base
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile, describe_robot
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_testing.hal.small_robots import make_joint_state
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
@@ -37,7 +37,7 @@ class Bench:
     def __init__(self, folder: Path, joint_2: str = f'cable_turns = 0.6\ncable_unwound = "{DECLARED}"') -> None:
         self.folder = folder
         self.joints: list[Joint] = []
-        self.robot: Description
+        self.robot: RobotDescription
         self.serial = "A1"
         self.file(joint_2)
 

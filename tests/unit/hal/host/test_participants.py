@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_hal.host.participants import Participants
+from snakesim_hal.host.participants import LockstepParticipants
 from snakesim_hal.model.scenario import ServiceSchedule
 
 SERVICES = {
@@ -12,7 +12,7 @@ SERVICES = {
 
 
 def test_service_that_connects_at_tick_zero_is_awaited_there() -> None:
-    participants = Participants(SERVICES)
+    participants = LockstepParticipants(SERVICES)
     participants.mark_present("control", 0)
     assert participants.find_services_behind(0) == ["control"]
     participants.mark_done("control", 0)
@@ -22,7 +22,7 @@ def test_service_that_connects_at_tick_zero_is_awaited_there() -> None:
 
 def test_service_is_not_awaited_for_a_tick_that_was_published_before_it_connected() -> None:
     """The host would wait for an answer to a clock that the service never gets, and the service for the next clock."""
-    participants = Participants(SERVICES)
+    participants = LockstepParticipants(SERVICES)
     participants.mark_present("control", 8)  # it connects while the host waits at the end of tick 7
     assert participants.find_services_behind(7) == []
     assert participants.find_services_behind(8) == ["control"]
@@ -31,20 +31,20 @@ def test_service_is_not_awaited_for_a_tick_that_was_published_before_it_connecte
 @pytest.mark.parametrize(("next_tick", "awaited_from"), [(5, 9), (8, 9), (9, 13)])
 def test_service_with_decimation_is_awaited_from_its_first_due_tick_on(next_tick: int, awaited_from: int) -> None:
     """The end of tick 9 needs the answer to tick 8: navigation is due every 4 ticks, and has 2 ticks for it."""
-    participants = Participants(SERVICES)
+    participants = LockstepParticipants(SERVICES)
     participants.mark_present("navigation", next_tick)
     assert [tick for tick in range(16) if participants.find_services_behind(tick)] == list(range(awaited_from, 16))
 
 
 def test_second_token_of_a_connected_service_changes_nothing() -> None:
-    participants = Participants(SERVICES)
+    participants = LockstepParticipants(SERVICES)
     participants.mark_present("control", 3)
     participants.mark_present("control", 9)
     assert participants.find_services_behind(3) == ["control"]
 
 
 def test_service_that_reconnects_counts_anew() -> None:
-    participants = Participants(SERVICES)
+    participants = LockstepParticipants(SERVICES)
     participants.mark_present("control", 0)
     participants.mark_done("control", 4)
     assert participants.mark_absent("control")

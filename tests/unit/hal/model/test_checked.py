@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord, compute_mounting_digest, find_unchecked_reason
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import RobotDescription
 from snakesim_testing.hal.small_robots import make_description, make_robot_file
 
 JOINTS = make_robot_file().joint_table
@@ -20,7 +20,7 @@ CHECKED = StartCheckRecord(
 )
 
 
-def robot(serials: str = "", **fields: Any) -> Description:
+def robot(serials: str = "", **fields: Any) -> RobotDescription:
     plain = make_description()
     given = serials.split(",") if serials else [""] * len(plain.joints)
     joints = [msgspec.structs.replace(one, serial=serial) for one, serial in zip(plain.joints, given, strict=True)]
@@ -45,7 +45,7 @@ SERIALS = [f"S{i}" for i in range(len(JOINTS))]
     ],
 )
 def test_check_counts_only_for_judged_joints_and_drives(
-    checked: StartCheckRecord | None, here: Description, words: str
+    checked: StartCheckRecord | None, here: RobotDescription, words: str
 ) -> None:
     found = find_unchecked_reason(checked, JOINTS, here)
     assert words in found if words else found == ""

@@ -11,7 +11,7 @@ from msgspec import Meta
 from snakesim_hal.model.field_docs import FieldDoc, collect_field_descriptions, document_fields
 from snakesim_hal.model.field_words import find_unit, format_value
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.joints import JointExceptions, Limits
+from snakesim_hal.model.joints import JointExceptions, MotionLimits
 from snakesim_hal.model.json_schema import list_structs, make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, load_plugin
 from snakesim_hal.wire.quantities import about, above
@@ -69,7 +69,7 @@ def test_descriptions_are_inherited_and_overridden() -> None:
 
 
 def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
-    assert collect_field_descriptions(Limits)["torque_nm"] == "Maximum torque of the joint."
+    assert collect_field_descriptions(MotionLimits)["torque_nm"] == "Maximum torque of the joint."
     exceptions: Any = JointExceptions
     described = collect_field_descriptions(exceptions)
     assert described["torque_nm"] == "Maximum torque of the joint. None: as in the section for all."

@@ -5,13 +5,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.friction import Skin, Surface, Wheels, compute_link_factors, compute_surface_friction
+from snakesim_hal.model.friction import PassiveWheels, Skin, Surface, compute_link_factors, compute_surface_friction
 from snakesim_testing.sim.simulator_rig import make_config
 
 SCALES = {"forward": 0.11, "backward": 0.14, "sideways": 0.19}
 WHEELS = {"radius_m": 0.03, "bearing_radius_m": 0.004, "bearing_friction": 0.03}
 MILK_SNAKE = msgspec.convert(SCALES, Skin)
-BALL_BEARINGS = msgspec.convert(WHEELS, Wheels)
+BALL_BEARINGS = msgspec.convert(WHEELS, PassiveWheels)
 
 
 def test_robot_without_skin_rubs_equally_in_all_directions() -> None:
@@ -32,7 +32,7 @@ def test_coefficients_of_a_surface_replace_those_of_the_skin() -> None:
 
 
 def test_wheels_roll_along_and_slide_sideways() -> None:
-    wheels = msgspec.convert({**WHEELS, "rolling_resistance": 0.01, "tire_friction": 0.6}, Wheels)
+    wheels = msgspec.convert({**WHEELS, "rolling_resistance": 0.01, "tire_friction": 0.6}, PassiveWheels)
     assert compute_surface_friction(0.2, Surface(forward_friction=0.1), None, wheels) == pytest.approx(
         (0.014, 0.014, 0.6)
     )

@@ -148,4 +148,4 @@ def test_plugin_name_in_two_packages_is_refused(tmp_path: Path, monkeypatch: pyt
     with raises_error(ConfigError, code="plugin/ambiguous", field="wave") as raised:
         load_plugin(CONTROLLERS, "wave")
     assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(re.split(": | and |; ", str(raised.value)))
-    assert load_plugin(CONTROLLERS, "hold").__name__ == "Hold"
+    assert load_plugin(CONTROLLERS, "hold").__name__ == "HoldPose"

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
-from snakesim_hal.model.joints import Drive, Heat, JointExceptions, Limits, Motor, Supply
+from snakesim_hal.model.joints import JointDrive, JointExceptions, JointMotor, JointSupply, MotionLimits, MotorHeat
 from snakesim_hal.model.robot import RobotFile, compute_layout_hash, describe_robot
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
+from snakesim_hal.wire.messages import JointMode, RobotDescription
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, ROBOT, make_description, make_robot_file
 from snakesim_testing.messages import raises_error
 
@@ -23,7 +23,7 @@ SECTIONS = ("limits", "motor", "drive", "heat", "supply")
 def test_every_shipped_robot_can_be_published(name: str) -> None:
     robot = decode_table(read_table_with_base(name, "robots"), RobotFile)
     described = describe_robot(robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0")
-    assert Decoder(Description).decode(encode(described), format_encoding(Description)) == described
+    assert MessageDecoder(RobotDescription).decode(encode(described), format_encoding(RobotDescription)) == described
     assert len(described.joints) == robot.chain.modules == len(described.links) - 1
     for joint in described.joints:
         assert joint.angle_min_rad < 0 < joint.angle_max_rad
@@ -90,16 +90,20 @@ def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
 def test_the_description_says_what_each_joint_can_do_and_measure() -> None:
     own = {"joint_2": {"modes": ["torque", "position"], "measures": ["torque"]}}
     first, second, third = make_description(drive__modes=["position"], drive__measures=[], joints=own).joints
-    assert first.modes == third.modes == [Mode.PASSIVE, Mode.POSITION]
+    assert first.modes == third.modes == [JointMode.PASSIVE, JointMode.POSITION]
     assert first.measures == []
-    assert second.modes == [Mode.PASSIVE, Mode.POSITION, Mode.TORQUE]
+    assert second.modes == [JointMode.PASSIVE, JointMode.POSITION, JointMode.TORQUE]
     assert second.measures == ["torque"]
-    assert make_description().joints[0].modes == list(Mode), "all, where nothing is said"
+    assert make_description().joints[0].modes == list(JointMode), "all, where nothing is said"
     assert make_description().joints[0].measures == ["torque", "temperature", "voltage"]
 
 
 def test_robot_every_section_field_has_a_joint_field() -> None:
-    said = {field for section in (Limits, Motor, Drive, Heat, Supply) for field in section.__struct_fields__}
+    said = {
+        field
+        for section in (MotionLimits, JointMotor, JointDrive, MotorHeat, JointSupply)
+        for field in section.__struct_fields__
+    }
     assert said - set(JointExceptions.__struct_fields__) == {"ambient_c"}, "the water is the same for all"
 
 

@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.host.participants import Participants
+from snakesim_hal.host.participants import LockstepParticipants
 from snakesim_hal.model.fault_plan import parse_and_validate_planned_faults
 from snakesim_hal.model.files import list_shipped_names
 from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
-from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.model.scenario import (
+    KeyOverride,
     LoadedScenario,
-    Override,
     ServiceSchedule,
     WaypointGoal,
     compute_config_hash,
@@ -90,7 +90,7 @@ def test_scenario_parts_beside_it_or_shipped_are_named_by_flags(tmp_path: Path) 
     assert load_scenario(path).config.robot.name == "planar13"
     other = tmp_path / "elsewhere" / "other.toml"
     other.write_text(ROBOT_TOML.replace('"worm"', '"other"'))
-    flag = Override("robot", str(other), f"--set robot={other}")
+    flag = KeyOverride("robot", str(other), f"--set robot={other}")
     found = load_scenario(path, [flag])
     assert found.config.robot.name == "other"
     assert found.table.find_origin("robot.name") == str(other)
@@ -135,7 +135,7 @@ def test_an_external_service_is_waited_for_and_not_started() -> None:
     policies = [with_flags("triplet", f"controller=policy:{model}").config for model in ("clutter", "./mine.onnx")]
     assert [policy.commander_name for policy in policies] == ["policy:clutter", "policy:./mine.onnx"]
     assert set(external.services) - set(external.internal_services) == {"control"}
-    assert list(Participants(external.services)) == list(own.services)
+    assert list(LockstepParticipants(external.services)) == list(own.services)
     for text in ("kill:control@1", "hang:control@1", "drop:actuator/joints@1"):
         parse_and_validate_planned_faults(with_flags("triplet", f'faults=["{text}"]').config)
         with raises_error(ConfigError, code="injection/unknown-target", field="faults[0]"):
@@ -182,7 +182,7 @@ def test_scenario_samples_at_a_tick_are_due_and_aged(tick: int, every: int, lag:
     ],
 )
 def test_set_reads_values_as_toml_and_else_as_text(text: str, key: str, value: Any) -> None:
-    assert parse_set_option(text) == Override(key, value, f"--set {text}")
+    assert parse_set_option(text) == KeyOverride(key, value, f"--set {text}")
 
 
 @pytest.mark.parametrize("text", ["", "seed", "=3", " = 3"])
@@ -337,7 +337,7 @@ def test_random_fields_stay_clear_of_the_start() -> None:
     assert len(placed) == 18
     snake = make_start_capsules(config)
     rears, fronts = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
-    links = Outlines.from_segments(rears, fronts, snake[0].radius_m)
+    links = ObstacleOutlines.from_segments(rears, fronts, snake[0].radius_m)
     for item in placed:
         assert (
             links.compute_distances_m(np.array(item.obstacle.position_w[:2])).min() - item.obstacle.radius_m

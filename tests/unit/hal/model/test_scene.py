@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable, decode_table
-from snakesim_hal.model.outlines import Capsule, Outlines, compute_outline_distance_m
+from snakesim_hal.model.outlines import CapsuleOutline, ObstacleOutlines, compute_outline_distance_m
 from snakesim_hal.model.placement import PlacedObstacle, place_scene_obstacles, validate_start_clearance
 from snakesim_hal.model.scene import SceneFile, make_route
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.hal.small_robots import SCENE
 from snakesim_testing.messages import raises_error
 
@@ -29,9 +29,10 @@ FIELD: dict[str, Any] = {
     "clearance_m": 0.05,
 }
 SNAKE = [
-    Capsule(name=f"link_{i}", rear_m=(0.2 * i, 0.0), front_m=(0.2 * i + 0.2, 0.0), radius_m=0.04) for i in range(3)
+    CapsuleOutline(name=f"link_{i}", rear_m=(0.2 * i, 0.0), front_m=(0.2 * i + 0.2, 0.0), radius_m=0.04)
+    for i in range(3)
 ]
-LINKS = Outlines.from_segments(
+LINKS = ObstacleOutlines.from_segments(
     np.array([link.rear_m for link in SNAKE]), np.array([link.front_m for link in SNAKE]), 0.04
 )
 
@@ -58,7 +59,7 @@ def test_scene_cylinder_stands_on_ground_with_its_name_and_friction() -> None:
     )
     center_height_m = 0.4 / 2
     assert placed == PlacedObstacle(
-        obstacle=Obstacle(
+        obstacle=KnownObstacle(
             name="post", shape="cylinder", position_w=(1, 2, center_height_m), radius_m=0.1, height_m=0.4
         ),
         friction=0.3,
@@ -272,9 +273,9 @@ def test_a_snake_may_start_on_a_step() -> None:
 
 
 def test_distances_to_outlines() -> None:
-    peg = Obstacle(name="p", shape="cylinder", position_w=(1, 0, 0), radius_m=0.2)
+    peg = KnownObstacle(name="p", shape="cylinder", position_w=(1, 0, 0), radius_m=0.2)
     assert compute_outline_distance_m(peg, np.array([2.0, 0.0])) == pytest.approx(0.8)
-    block = Obstacle(name="b", shape="box", position_w=(0, 0, 0), yaw_rad=math.pi / 2, half_size_m=(2, 1, 1))
+    block = KnownObstacle(name="b", shape="box", position_w=(0, 0, 0), yaw_rad=math.pi / 2, half_size_m=(2, 1, 1))
     assert compute_outline_distance_m(block, np.array([0.0, 3.0])) == pytest.approx(1.0)
     assert compute_outline_distance_m(block, np.array([4.0, 6.0])) == pytest.approx(5.0)
     assert compute_outline_distance_m(block, np.array([0.5, 0.0])) == pytest.approx(-0.5)

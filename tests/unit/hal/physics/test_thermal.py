@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_hal.physics.thermal import HeatLimits, Thermal
+from snakesim_hal.physics.thermal import HeatLimits, ThermalModel
 from snakesim_testing.hal.small_robots import make_robot_file
 
 LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 
 
-def windings(count: int = 1, **exceptions: Any) -> Thermal:
+def windings(count: int = 1, **exceptions: Any) -> ThermalModel:
     robot = make_robot_file(chain__modules=count, limits__torque_nm=4.0, joints={"joint_1": exceptions})
-    return Thermal(robot.joint_table)
+    return ThermalModel(robot.joint_table)
 
 
 def test_thermal_half_rated_torque_settles_at_80_degrees() -> None:

@@ -13,14 +13,14 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_box
 from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contacts, Mode
+from snakesim_hal.wire.messages import Contacts, JointMode
 from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_link_contact, make_pose
 from snakesim_testing.messages import raises_error
 
 ROBOT = make_description()
 
 
-def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> TickOutput:
+def decision(target: float = 0.1, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0) -> TickOutput:
     return TickOutput(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
 
 
@@ -65,7 +65,7 @@ def long_run() -> BlackBox:
         if tick == RELEASE_TICK:
             others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=[])
         joints = make_joint_state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
-        box.record_tick(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
+        box.record_tick(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, JointMode.TORQUE))
     return box
 
 
@@ -92,7 +92,7 @@ def test_black_box_of_long_run_has_setpoints(long_run: BlackBox) -> None:
     columns = all_rows(long_run)
     assert columns["target"][4321] == pytest.approx([0.4321] * 3)
     assert columns["torque_limit_nm"][0].tolist() == [4.0] * 3
-    assert set(columns["mode"].flat) == {Mode.TORQUE}
+    assert set(columns["mode"].flat) == {JointMode.TORQUE}
 
 
 def test_black_box_pose_is_nan_before_first_pose_and_kept_afterwards(long_run: BlackBox) -> None:
@@ -118,7 +118,7 @@ def test_black_box_digest_depends_only_on_commands() -> None:
         digest((0, decision())),
         digest((0, decision()), (2, decision())),
         digest((0, decision()), (1, decision(0.1 + 1e-15))),
-        digest((0, decision()), (1, decision(mode=Mode.VELOCITY))),
+        digest((0, decision()), (1, decision(mode=JointMode.VELOCITY))),
         digest((0, decision()), (1, decision(torque_limit=3.9))),
         digest((1, decision()), (0, decision())),
     ]
@@ -221,7 +221,7 @@ def test_black_box_tick_has_constant_cost_and_memory() -> None:
         BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes),
         Samples(make_joint_state(robot, 0.1)),
     )
-    reported = TickOutput(SafeSetpoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    reported = TickOutput(SafeSetpoints([JointMode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
     for tick in range(300):
         box.record_tick(tick, tick, row, reported)
     peaks = [0] * 700

@@ -5,11 +5,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.safety.authority import RECENT_COMMAND_COUNT, Authority, TickOutput
+from snakesim_hal.safety.authority import RECENT_COMMAND_COUNT, CommandAuthority, TickOutput
 from snakesim_hal.safety.cables import CableTracker
 from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault, LeaseRequest, Mode, SensorDescription
+from snakesim_hal.wire.messages import Fault, JointMode, LeaseRequest, SensorDescription
 from snakesim_testing.hal.authority_rig import (
     ARM,
     CLEAR,
@@ -40,9 +40,9 @@ def test_arming_unmet_conditions_are_named_until_met() -> None:
     assert rig.arm().reason == "no commands from control yet"
     rig.send(0.7)
     assert "joint_1 has a target +0.60 rad" in rig.arm().reason
-    rig.send(0.1, Mode.TORQUE)
+    rig.send(0.1, JointMode.TORQUE)
     assert "joint_1 is commanded in mode torque; it must hold its position at arming" in rig.arm().reason
-    rig.send(0.0, Mode.PASSIVE)
+    rig.send(0.0, JointMode.PASSIVE)
     assert rig.authority.list_unmet_conditions(rig.now_ns) == []
     rig.send(0.1)
     assert rig.authority.list_unmet_conditions(rig.now_ns) == []
@@ -161,7 +161,7 @@ def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
     """Time may stand still until the robot is armed, so that no report can arrive."""
     power_sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
     rig = AuthorityRig()
-    rig.authority = Authority(msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power_sensor]))
+    rig.authority = CommandAuthority(msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power_sensor]))
     rig.observe(0.1)
     rig.acquire()
     rig.tick_with(0.1)
@@ -207,7 +207,7 @@ def test_lease_without_commands_expires_with_a_fault() -> None:
     decision = rig.pass_tick()
     assert rig.authority.state == "fault"
     assert decision.command_sequence is None
-    assert list_modes(decision) == {Mode.VELOCITY}
+    assert list_modes(decision) == {JointMode.VELOCITY}
     assert decision.setpoints.target == [0.0] * JOINTS
     (fault,) = rig.authority.faults
     assert fault.what == "lease_expired"
@@ -224,7 +224,7 @@ def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None
     answer = rig.acquire("teleop", priority=200)
     assert answer.epoch == 2
     assert answer.lifecycle == "disarmed"
-    assert list_modes(rig.pass_tick()) == {Mode.PASSIVE}
+    assert list_modes(rig.pass_tick()) == {JointMode.PASSIVE}
     assert rig.send(0.1, lease_epoch=1) == "wrong_epoch"
     assert rig.arm().reason == "no commands from teleop yet"
     rig.send(0.1, sequence=1)  # the sequence numbers of a new holder start anew
@@ -260,7 +260,7 @@ def test_holder_gone_after_estop_frees_lease_and_keeps_reason() -> None:
 def test_decision_before_any_input_is_passive() -> None:
     rig = AuthorityRig()
     assert rig.send(0.1) == "no_lease"
-    assert list_modes(rig.authority.compute_setpoints()) == {Mode.PASSIVE}
+    assert list_modes(rig.authority.compute_setpoints()) == {JointMode.PASSIVE}
 
 
 def test_decision_in_lockstep_uses_the_command_of_its_tick() -> None:
@@ -297,20 +297,20 @@ def test_estop_stays_until_reset_and_arming() -> None:
     rig.tick_with(0.2)
     assert rig.authority.handle_estop_request(ESTOP, rig.tick).ok
     for _ in range(3):
-        assert list_modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
+        assert list_modes(rig.tick_with(0.2)) == {JointMode.PASSIVE}
     assert not rig.arm().ok
     assert not rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
     assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
-    assert list_modes(rig.tick_with(0.2)) == {Mode.PASSIVE}
+    assert list_modes(rig.tick_with(0.2)) == {JointMode.PASSIVE}
     assert rig.arm().ok
     assert rig.pass_tick().setpoints.target == [0.1] * JOINTS  # resumes from the measured pose
 
 
 @pytest.mark.parametrize(
     ("stop_mode", "mode", "target"),
-    [("passive", Mode.PASSIVE, 0.0), ("damp", Mode.VELOCITY, 0.0), ("hold", Mode.POSITION, 0.4)],
+    [("passive", JointMode.PASSIVE, 0.0), ("damp", JointMode.VELOCITY, 0.0), ("hold", JointMode.POSITION, 0.4)],
 )
-def test_fault_starts_the_stop_mode_of_the_robot(stop_mode: str, mode: Mode, target: float) -> None:
+def test_fault_starts_the_stop_mode_of_the_robot(stop_mode: str, mode: JointMode, target: float) -> None:
     rig = make_armed_rig(safety__action=stop_mode)
     rig.observe(0.4)
     rig.authority.latch_fault(HOT)
@@ -327,10 +327,10 @@ def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
     rig.observe(0.1, 1.0)
     rig.authority.latch_fault(HOT)
     braking = rig.pass_tick().setpoints
-    assert braking.mode == [Mode.VELOCITY, Mode.POSITION, Mode.VELOCITY]
+    assert braking.mode == [JointMode.VELOCITY, JointMode.POSITION, JointMode.VELOCITY]
     assert 0.1 < braking.target[1] < 0.2
     at_rest = rig.pass_tick().setpoints
-    assert at_rest.mode == [Mode.VELOCITY, Mode.PASSIVE, Mode.VELOCITY]
+    assert at_rest.mode == [JointMode.VELOCITY, JointMode.PASSIVE, JointMode.VELOCITY]
     assert at_rest.target == [0.0] * JOINTS
 
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import initialize, invariant, precondition, rule, run_state_machine_as_test
 
 from snakesim_hal.safety import authority as under_test
-from snakesim_hal.safety.authority import Authority
-from snakesim_hal.safety.lease import Lease
+from snakesim_hal.safety.authority import CommandAuthority
+from snakesim_hal.safety.lease import CommandLease
 from snakesim_hal.wire.freshness import FRESH_NS
-from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
+from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, JointMode, LeaseRequest, LifecycleRequest
 from snakesim_testing.hal.authority_model import (
     ALL,
     ANGLE_LIMIT_RAD,
@@ -103,7 +103,7 @@ class Everything(AuthorityModel):
         self.action = action
         self.lag = lag  # in lockstep; None: the newest command counts
         kept, under_test.RECENT_COMMAND_COUNT = under_test.RECENT_COMMAND_COUNT, KEPT
-        self.authority = Authority(self.robot, first_epoch=first_epoch)
+        self.authority = CommandAuthority(self.robot, first_epoch=first_epoch)
         under_test.RECENT_COMMAND_COUNT = kept
         self.epoch = first_epoch
         if at_once:
@@ -238,7 +238,7 @@ class Everything(AuthorityModel):
 
     @rule(
         wanted=per_joint(NUMBERS),
-        mode=per_joint(st.sampled_from(list(Mode))),
+        mode=per_joint(st.sampled_from(list(JointMode))),
         torque_limit=st.none() | per_joint(st.sampled_from([0.0, 1.0, 3.9, 4.0, 1e5])),
         near=st.booleans(),
         defects=st.sets(st.sampled_from(DEFECTS), max_size=2),
@@ -250,7 +250,7 @@ class Everything(AuthorityModel):
     def send_commands(
         self,
         wanted: list[float],
-        mode: list[Mode],
+        mode: list[JointMode],
         torque_limit: list[float] | None,
         near: bool,
         defects: set[str],
@@ -262,7 +262,7 @@ class Everything(AuthorityModel):
         """One command, or a flood of them; `back`: ticks between the state that it answers and now."""
         defects = defects if broken else set()
         if near:
-            wanted, mode = list(self.measured[0]), [Mode.POSITION] * JOINTS
+            wanted, mode = list(self.measured[0]), [JointMode.POSITION] * JOINTS
         if "length" in defects:
             wanted = wanted[1:]
         if "finite" in defects:
@@ -334,8 +334,8 @@ class Everything(AuthorityModel):
             received_ns, asked = self.newest_command
             ready = self.now_ns - received_ns <= LEASE_NS and all(
                 i in self.isolated
-                or mode == Mode.PASSIVE
-                or (mode == Mode.POSITION and abs(target - angle) <= MAX_STEP_RAD)
+                or mode == JointMode.PASSIVE
+                or (mode == JointMode.POSITION and abs(target - angle) <= MAX_STEP_RAD)
                 for i, mode, target, angle in zip(ALL, asked.mode, asked.target, self.measured[0], strict=True)
             )
         assert (not self.authority.list_unmet_conditions(self.now_ns)) == ready
@@ -417,7 +417,7 @@ class Everything(AuthorityModel):
     def stay(self) -> None:
         """A good command to stay where the joints are."""
         near = [clamp(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in self.measured[0]]
-        still = [Mode.POSITION] * JOINTS
+        still = [JointMode.POSITION] * JOINTS
         self.send_commands(near, still, None, False, set(), False, 0, 0, 1)
 
     @precondition(lambda self: self.state != "armed")
@@ -436,7 +436,7 @@ class Everything(AuthorityModel):
     @precondition(lambda self: self.state == "armed")
     @rule(
         wanted=per_joint(NUMBERS),
-        mode=per_joint(st.sampled_from(list(Mode))),
+        mode=per_joint(st.sampled_from(list(JointMode))),
         torque_limit=st.none() | per_joint(st.sampled_from([0.0, 1.0, 3.9, 4.0, 1e5])),
         moves=per_joint(st.floats(-0.1, 0.1) | st.floats(-1, 1)),
         torque=per_joint(st.floats(-5, 5)),
@@ -446,7 +446,7 @@ class Everything(AuthorityModel):
     def go_on_for_some_ticks(
         self,
         wanted: list[float],
-        mode: list[Mode],
+        mode: list[JointMode],
         torque_limit: list[float] | None,
         moves: list[float],
         torque: list[float],
@@ -483,7 +483,9 @@ class Everything(AuthorityModel):
     def send_for_the_arm_session_before(self, later: int) -> None:
         """Only a command that answers a state after the arming counts as rejected."""
         back = self.tick - self.armed_tick - later
-        self.send_commands([0.0] * JOINTS, [Mode.POSITION] * JOINTS, None, False, set(), False, -1, max(back, 0), 1)
+        self.send_commands(
+            [0.0] * JOINTS, [JointMode.POSITION] * JOINTS, None, False, set(), False, -1, max(back, 0), 1
+        )
 
     # --- time, and what goes out -------------------------------------------------------------------------------
 
@@ -534,7 +536,9 @@ class Everything(AuthorityModel):
         found = self.authority
         assert found.state == self.state, f"{found.state}, not {self.state}: {found.reason}"
         assert found.arm_session == self.arm_session
-        expected = Lease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else Lease()
+        expected = (
+            CommandLease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else CommandLease()
+        )
         assert found.lease.epoch == self.epoch  # the model's only ever grows
         assert found.lease.holder == self.holder
         assert found.lease.is_held(self.now_ns) == self.is_lease_held

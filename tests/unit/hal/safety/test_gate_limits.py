@@ -18,7 +18,7 @@ from snakesim_hal.safety.limiter import (
     compute_velocity_bounds,
     limit_command,
 )
-from snakesim_hal.wire.messages import JointCommand, Mode
+from snakesim_hal.wire.messages import JointCommand, JointMode
 from snakesim_testing.hal.limiter_rig import (
     ANGLE_STEP,
     COOL,
@@ -38,9 +38,9 @@ from snakesim_testing.hal.limiter_rig import (
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 
 
-def ends(mode: Mode, measured: MeasuredState, i: int) -> tuple[float, float]:
+def ends(mode: JointMode, measured: MeasuredState, i: int) -> tuple[float, float]:
     angle, velocity = float(measured.angle_rad[i]), float(measured.velocity_rad_s[i])
-    if mode is Mode.VELOCITY:
+    if mode is JointMode.VELOCITY:
         return compute_velocity_bounds(ROBOT.joints[i], angle, LIMITS.period_s)
     return compute_torque_bounds(ROBOT.joints[i], angle, velocity, LIMITS.period_s)
 
@@ -63,7 +63,7 @@ def situations(draw: st.DrawFn) -> tuple[JointCommand, MeasuredState, AppliedSet
     """Any command that passes the refusals, any state, and any setpoints that were applied before."""
     any_target = st.floats(-2, 2) | HUGE
     torque_limit = draw(st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10)))
-    modes = draw(per_joint(st.sampled_from(list(Mode))))
+    modes = draw(per_joint(st.sampled_from(list(JointMode))))
     asked = make_joint_command(ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit)
     measured = MeasuredState(
         np.array(draw(per_joint(ANY_ANGLE))),
@@ -96,9 +96,9 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
         target, moved = applied.target[i], abs(applied.target[i] - start[i])
         assert applied.mode[i] == asked.mode[i]
         match asked.mode[i]:
-            case Mode.PASSIVE:
+            case JointMode.PASSIVE:
                 assert target == 0.0
-            case Mode.POSITION:
+            case JointMode.POSITION:
                 assert LIMITS.angle_min_rad[i] <= target <= LIMITS.angle_max_rad[i]
                 near = abs(target - measured.angle_rad[i])
                 inside = abs(measured.angle_rad[i]) <= 1.5 + 0.3
@@ -108,12 +108,12 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
                 # Only where staying near the measured angle, or inside the limits, leaves no choice:
                 edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
                 assert moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY or np.abs(edges - target).min() < TINY
-            case Mode.VELOCITY:
+            case JointMode.VELOCITY:
                 low, high = ends(asked.mode[i], measured, i)
                 assert abs(target) <= 5.0
                 assert low - TINY <= target <= high + TINY
                 assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, 5.0, low, high)
-            case Mode.TORQUE:
+            case JointMode.TORQUE:
                 low, high = ends(asked.mode[i], measured, i)
                 most = applied.torque_limit_nm[i]
                 assert abs(target) <= most
@@ -128,7 +128,7 @@ def test_gate_names_exactly_the_targets_it_changes(
 ) -> None:
     asked, measured, last = case
     applied = limited(asked, measured, last)
-    changed = {i for i in range(JOINTS) if asked.mode[i] != Mode.PASSIVE and applied.target[i] != asked.target[i]}
+    changed = {i for i in range(JOINTS) if asked.mode[i] != JointMode.PASSIVE and applied.target[i] != asked.target[i]}
     assert set(words(asked, applied, measured)) == changed
     again = limited(msgspec.structs.replace(asked, target=applied.target.tolist()), measured, applied)
     assert (again.target == applied.target).all()  # what came out once passes unchanged
@@ -137,7 +137,7 @@ def test_gate_names_exactly_the_targets_it_changes(
 @given(st.lists(per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
 def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]]) -> None:
     """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
-    zero, last = np.zeros(JOINTS), before(Mode.POSITION)
+    zero, last = np.zeros(JOINTS), before(JointMode.POSITION)
     for target in stream:
         applied = limited(make_joint_command(ROBOT, target), MeasuredState(last.target, zero, zero), last)
         assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
@@ -146,9 +146,9 @@ def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]])
 
 def test_a_target_that_waits_is_reached() -> None:
     for mode, wanted, step in (
-        (Mode.POSITION, 0.2, ANGLE_STEP),
-        (Mode.VELOCITY, 4.0, SPEED_STEP),
-        (Mode.TORQUE, 3.0, TORQUE_STEP),
+        (JointMode.POSITION, 0.2, ANGLE_STEP),
+        (JointMode.VELOCITY, 4.0, SPEED_STEP),
+        (JointMode.TORQUE, 3.0, TORQUE_STEP),
     ):
         last = before(mode)
         steps = int(np.ceil(wanted / step - 1e-9))
@@ -168,11 +168,11 @@ def test_gate_joint_beyond_its_end_is_only_commanded_back(angle: float, side: in
 
 def test_with_no_torque_allowed_there_is_none() -> None:
     none = [0.0] * JOINTS
-    for mode in Mode:
+    for mode in JointMode:
         applied = applied_for(make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0)
         assert (applied.torque_limit_nm == 0).all()
     assert (
-        applied_for(make_joint_command(ROBOT, 1.0, Mode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0
+        applied_for(make_joint_command(ROBOT, 1.0, JointMode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0
     ).all()
 
 
@@ -196,7 +196,7 @@ def test_a_torque_limit_never_raises_the_robots_own() -> None:
 
 
 def test_modes_may_differ_from_joint_to_joint() -> None:
-    mixed = make_joint_command(ROBOT, 9.0, [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
+    mixed = make_joint_command(ROBOT, 9.0, [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE])
     assert applied_for(mixed).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
 
 
@@ -213,10 +213,10 @@ def motor_torque(target: float, angle: float, velocity: float) -> float:
     velocity=st.floats(-2, 2),
     torque=st.floats(-4, 4),
     wanted=st.floats(-10, 10),
-    mode=st.sampled_from([Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE]),
+    mode=st.sampled_from([JointMode.PASSIVE, JointMode.VELOCITY, JointMode.TORQUE]),
 )
 def test_gate_switch_to_position_mode_keeps_present_torque(
-    angle: float, velocity: float, torque: float, wanted: float, mode: Mode
+    angle: float, velocity: float, torque: float, wanted: float, mode: JointMode
 ) -> None:
     applied = applied_for(make_joint_command(ROBOT, wanted), angle, velocity, torque, mode)
     implied = motor_torque(applied.target[0], angle, velocity)
@@ -226,16 +226,16 @@ def test_gate_switch_to_position_mode_keeps_present_torque(
 @given(
     torque=st.floats(-4, 4),
     wanted=st.floats(-10, 10),
-    mode=st.sampled_from([Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]),
+    mode=st.sampled_from([JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]),
 )
-def test_gate_switch_to_torque_mode_keeps_present_torque(torque: float, wanted: float, mode: Mode) -> None:
-    applied = applied_for(make_joint_command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, mode)
+def test_gate_switch_to_torque_mode_keeps_present_torque(torque: float, wanted: float, mode: JointMode) -> None:
+    applied = applied_for(make_joint_command(ROBOT, wanted, JointMode.TORQUE), 0.3, 1.0, torque, mode)
     assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
 
 
 @given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
 def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, wanted: float) -> None:
-    applied = applied_for(make_joint_command(ROBOT, wanted, Mode.VELOCITY), 0.3, velocity, 1.0, Mode.POSITION)
+    applied = applied_for(make_joint_command(ROBOT, wanted, JointMode.VELOCITY), 0.3, velocity, 1.0, JointMode.POSITION)
     joint = ROBOT.joints[0]
     bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
     top = joint.speed_limit_rad_s
@@ -245,30 +245,30 @@ def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, want
 
 def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
     none = AppliedSetpoints(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied = limited(make_joint_command(ROBOT, 0.3, Mode.POSITION), every(), none)
+    applied = limited(make_joint_command(ROBOT, 0.3, JointMode.POSITION), every(), none)
     assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
 
 
 def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
     measured = MeasuredState(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0]))
-    hold = bumpless([Mode.POSITION] * JOINTS, measured)
+    hold = bumpless([JointMode.POSITION] * JOINTS, measured)
     implied = [motor_torque(*row) for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)]
     assert implied == pytest.approx(measured.torque_nm.tolist())
-    assert bumpless([Mode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
+    assert bumpless([JointMode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
 
 
 def test_a_switch_to_velocity_mode_reckons_with_the_gain() -> None:
     joint = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=2.0)
-    assert compute_bumpless_target(joint, Mode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
-    assert compute_bumpless_target(joint, Mode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
+    assert compute_bumpless_target(joint, JointMode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
+    assert compute_bumpless_target(joint, JointMode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
 
 
 def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     limp = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
-    assert compute_bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
+    assert compute_bumpless_target(limp, JointMode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
-    measured, last = every(torque=4.0), before(Mode.PASSIVE)
+    measured, last = every(torque=4.0), before(JointMode.PASSIVE)
     applied = limit_command(
         make_joint_command(ROBOT, 0.0), measured=measured, last=last, limits=soft, torque_fraction=COOL
     )
@@ -292,10 +292,10 @@ def test_a_joint_can_stop_before_its_end() -> None:
 def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) -> None:
     """A joint that turns as it is told, one or two periods later."""
     angle, reported = 0.0, [0.0] * delay
-    last = before(Mode.VELOCITY)
+    last = before(JointMode.VELOCITY)
     speeds: list[float] = []
     for _ in range(400):
-        last = limited(make_joint_command(ROBOT, side * 5.0, Mode.VELOCITY), every(angle, reported[0]), last)
+        last = limited(make_joint_command(ROBOT, side * 5.0, JointMode.VELOCITY), every(angle, reported[0]), last)
         reported = [*reported[1:], float(last.target[0])]
         angle += reported[0] * 0.01
         speeds.append(abs(reported[0]))
@@ -306,11 +306,11 @@ def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) 
 
 
 @pytest.mark.parametrize("side", [1, -1])
-@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.TORQUE])
+@pytest.mark.parametrize("mode", [JointMode.VELOCITY, JointMode.TORQUE])
 @pytest.mark.parametrize("beyond", [0.0, 0.2])
-def test_at_the_end_nothing_drives_outwards(side: int, mode: Mode, beyond: float) -> None:
+def test_at_the_end_nothing_drives_outwards(side: int, mode: JointMode, beyond: float) -> None:
     for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
-        for last in (before(mode, side * 3.0), before(Mode.POSITION, side * 3.0)):
+        for last in (before(mode, side * 3.0), before(JointMode.POSITION, side * 3.0)):
             for wanted in (-9.0, 9.0):
                 applied = limited(make_joint_command(ROBOT, wanted, mode), every(side * (1.5 + beyond), velocity), last)
                 assert (side * applied.target <= 0.0).all()
@@ -318,8 +318,8 @@ def test_at_the_end_nothing_drives_outwards(side: int, mode: Mode, beyond: float
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_gate_torque_mode_brakes_a_fast_joint(side: int) -> None:
-    measured, asked = every(side * 1.4, side * 5.0), make_joint_command(ROBOT, side * 4.0, Mode.TORQUE)
-    applied = limited(asked, measured, before(Mode.TORQUE, side * 4.0))
+    measured, asked = every(side * 1.4, side * 5.0), make_joint_command(ROBOT, side * 4.0, JointMode.TORQUE)
+    applied = limited(asked, measured, before(JointMode.TORQUE, side * 4.0))
     allowed = compute_stoppable_speed(0.1, 100.0, 0.01)
     assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))  # gain 1 N·m·s/rad
     assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
@@ -339,16 +339,16 @@ def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
 
 
 def test_gate_joint_near_its_end_is_named_angle_limited() -> None:
-    asked = make_joint_command(ROBOT, 5.0, Mode.VELOCITY)
-    applied = limited(asked, every(1.45), before(Mode.VELOCITY, 5.0))
+    asked = make_joint_command(ROBOT, 5.0, JointMode.VELOCITY)
+    applied = limited(asked, every(1.45), before(JointMode.VELOCITY, 5.0))
     assert words(asked, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
     assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
 
 
 def test_gate_torque_far_from_ends_is_not_named_angle_limited() -> None:
-    asked = make_joint_command(ROBOT, 5.0, Mode.TORQUE)
+    asked = make_joint_command(ROBOT, 5.0, JointMode.TORQUE)
     measured = every(0.0, 1.45)
-    applied = limited(asked, measured, before(Mode.TORQUE, 4.0))
+    applied = limited(asked, measured, before(JointMode.TORQUE, 4.0))
     assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
 
 
@@ -370,9 +370,9 @@ def test_the_tightest_limit_is_the_one_that_is_named(
     side: int, angle: float, wanted: float, speed_limit: float, word: str
 ) -> None:
     robot = make_description(limits__speed_rad_s=speed_limit)
-    asked, limits = make_joint_command(robot, side * wanted, Mode.VELOCITY), JointLimits.from_description(robot)
+    asked, limits = make_joint_command(robot, side * wanted, JointMode.VELOCITY), JointLimits.from_description(robot)
     named = find_active_limits(
-        asked, before(Mode.VELOCITY), measured=every(side * angle), limits=limits, torque_fraction=COOL
+        asked, before(JointMode.VELOCITY), measured=every(side * angle), limits=limits, torque_fraction=COOL
     )
     assert named == dict.fromkeys(range(JOINTS), word)
 

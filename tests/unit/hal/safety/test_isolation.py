@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from snakesim_hal.safety.fault_log import MAX_FAULTS
-from snakesim_hal.wire.messages import Fault, Mode
+from snakesim_hal.wire.messages import Fault, JointMode
 from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, AuthorityRig, make_armed_rig, report_power
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state
@@ -48,7 +48,7 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
         assert rig.send(0.12, torque_limit_nm=[3.0] * JOINTS) is None
         decision = rig.pass_tick()
         points = decision.setpoints
-        assert points.mode == [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]
+        assert points.mode == [JointMode.POSITION, JointMode.PASSIVE, JointMode.POSITION]
         assert points.target == [0.12, 0.0, 0.12]
         assert points.torque_limit_nm == [3.0, 0.0, 3.0]
         assert points.isolated == {1}
@@ -60,7 +60,9 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
 
 def test_nothing_is_limited_where_nothing_is_asked() -> None:
     rig = armed_without_joint_2()
-    assert rig.tick_with([0.1, 0.0, 0.1], [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]).limit_by_joint == {}
+    assert (
+        rig.tick_with([0.1, 0.0, 0.1], [JointMode.POSITION, JointMode.PASSIVE, JointMode.POSITION]).limit_by_joint == {}
+    )
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -157,7 +159,7 @@ def test_isolation_ends_after_reset_and_a_new_state() -> None:
     rig.observe(0.1)
     rig.send(0.1)
     assert rig.arm().ok
-    assert rig.tick_with(0.1).setpoints.mode == [Mode.POSITION] * JOINTS
+    assert rig.tick_with(0.1).setpoints.mode == [JointMode.POSITION] * JOINTS
 
 
 @pytest.mark.parametrize("action", ["passive", "damp", "hold"])
@@ -167,7 +169,7 @@ def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
     assert rig.authority.state == "fault"
     points = rig.pass_tick().setpoints
     assert points.isolated == {1}
-    assert points.mode[1] is Mode.PASSIVE
+    assert points.mode[1] is JointMode.PASSIVE
     assert points.torque_limit_nm[1] == 0.0
     assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
     assert rig.authority.isolated_joints == []

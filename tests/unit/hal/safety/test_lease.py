@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.lease import Lease, LeaseDecision, decide_lease_request, free_lease, renew_lease
+from snakesim_hal.safety.lease import CommandLease, LeaseDecision, decide_lease_request, free_lease, renew_lease
 from snakesim_hal.wire.messages import LeaseRequest
 
 TERM = 50
-HELD = Lease(holder="control", epoch=4, priority=100, expires_ns=1000)
-FREE = Lease(epoch=4)
+HELD = CommandLease(holder="control", epoch=4, priority=100, expires_ns=1000)
+FREE = CommandLease(epoch=4)
 DURING, AFTER = 990, 1001
 
 
@@ -20,7 +20,7 @@ def request(action: str, holder: str = "control", epoch: int = 4, priority: int 
 
 
 def taken(holder: str, now: int, priority: int = 100) -> LeaseDecision:
-    return LeaseDecision(Lease(holder, 5, priority, now + TERM), None, True)
+    return LeaseDecision(CommandLease(holder, 5, priority, now + TERM), None, True)
 
 
 GRANTED = {
@@ -28,9 +28,14 @@ GRANTED = {
     "acquire a lease that ran out": (HELD, request("acquire", "teleop", 0), AFTER, taken("teleop", AFTER)),
     "acquire again after it ran out": (HELD, request("acquire"), AFTER, taken("control", AFTER)),
     "preempt": (HELD, request("acquire", "teleop", 0, 101), DURING, taken("teleop", DURING, 101)),
-    "renew": (HELD, request("renew"), DURING, LeaseDecision(Lease("control", 4, 100, DURING + TERM))),
-    "renew at the last moment": (HELD, request("renew"), 1000, LeaseDecision(Lease("control", 4, 100, 1000 + TERM))),
-    "release": (HELD, request("release"), DURING, LeaseDecision(Lease(epoch=4), None, True)),
+    "renew": (HELD, request("renew"), DURING, LeaseDecision(CommandLease("control", 4, 100, DURING + TERM))),
+    "renew at the last moment": (
+        HELD,
+        request("renew"),
+        1000,
+        LeaseDecision(CommandLease("control", 4, 100, 1000 + TERM)),
+    ),
+    "release": (HELD, request("release"), DURING, LeaseDecision(CommandLease(epoch=4), None, True)),
 }
 
 
@@ -67,7 +72,7 @@ def test_refused_and_nothing_changed(case: str) -> None:
 
 
 def test_the_refusal_says_how_long_it_may_take() -> None:
-    lease = Lease("control", 4, 100, 50_000_000)
+    lease = CommandLease("control", 4, 100, 50_000_000)
     ruling = decide_lease_request(lease, request("acquire", "teleop"), 20_000_000, TERM)
     assert ruling.refusal is not None
     assert "for another 30 ms" in ruling.refusal
@@ -77,7 +82,7 @@ def test_live_until_the_last_nanosecond() -> None:
     assert HELD.is_held(1000)
     assert not HELD.is_held(1001)
     assert not FREE.is_held(0)
-    assert free_lease(HELD) == Lease(epoch=4)
+    assert free_lease(HELD) == CommandLease(epoch=4)
     assert renew_lease(HELD, 2000, TERM).expires_ns == 2050
 
 
@@ -85,7 +90,7 @@ def test_nobody_changes_a_lease_in_place() -> None:
     for held in (HELD, LeaseDecision(HELD)):
         with pytest.raises(dataclasses.FrozenInstanceError):
             held.lease = FREE  # pyright: ignore[reportAttributeAccessIssue]
-    assert Lease() == Lease(None, 0, 0, 0)
+    assert CommandLease() == CommandLease(None, 0, 0, 0)
 
 
 REQUESTS = st.tuples(
@@ -99,7 +104,7 @@ REQUESTS = st.tuples(
 
 @given(st.lists(REQUESTS, max_size=30))
 def test_lease_every_holder_in_any_history_has_unique_epoch(history: list[tuple[str, str, int, int, int]]) -> None:
-    lease, now, holders = Lease(), 0, {}
+    lease, now, holders = CommandLease(), 0, {}
     for action, holder, epoch, priority, passes in history:
         now += passes
         before = lease

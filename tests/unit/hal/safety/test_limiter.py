@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from snakesim_hal.safety.joint_limits import JointLimits
-from snakesim_hal.safety.lease import Lease
+from snakesim_hal.safety.lease import CommandLease
 from snakesim_hal.safety.limiter import RejectionReason, find_rejection_reason, make_safe_setpoints
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
+from snakesim_hal.wire.messages import JointCommand, JointMode, SensorDescription
 from snakesim_testing.hal.limiter_rig import JOINTS, LEASE, LIMITS, ROBOT, applied_for, before, every, limited, words
 from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command
 
@@ -28,7 +28,7 @@ SERVOS = JointLimits.from_description(
 )
 NAN, INF = float("nan"), float("inf")
 REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
-    "no_lease": [({}, {"lease": Lease(epoch=1)}), ({}, {"now_ns": 1001})],
+    "no_lease": [({}, {"lease": CommandLease(epoch=1)}), ({}, {"now_ns": 1001})],
     "wrong_epoch": [({"lease_epoch": 0}, {}), ({"lease_epoch": 2}, {})],
     "replayed": [({"sequence": 1}, {"last_sequence": 1}), ({"sequence": 1}, {"last_sequence": 2})],
     "from_the_future": [({"tick": 6}, {})],
@@ -42,20 +42,20 @@ REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
         ({"target": [0.0] * (JOINTS - 1)}, {}),
         ({"target": [0.0] * (JOINTS + 1)}, {}),
         ({"target": []}, {}),
-        ({"mode": [Mode.POSITION] * (JOINTS + 1)}, {}),
+        ({"mode": [JointMode.POSITION] * (JOINTS + 1)}, {}),
         ({"mode": [], "target": []}, {}),
         ({"torque_limit_nm": [1.0]}, {}),
         ({"torque_limit_nm": []}, {}),
     ],
     "wrong_mode": [
-        ({"mode": [Mode.POSITION, Mode.TORQUE, Mode.POSITION]}, {"limits": SERVOS}),
-        ({"mode": [Mode.VELOCITY] * JOINTS}, {"limits": SERVOS}),
+        ({"mode": [JointMode.POSITION, JointMode.TORQUE, JointMode.POSITION]}, {"limits": SERVOS}),
+        ({"mode": [JointMode.VELOCITY] * JOINTS}, {"limits": SERVOS}),
     ],
     "not_finite": [
         ({"target": [0.0, NAN, 0.0]}, {}),
         ({"target": [INF, 0.0, 0.0]}, {}),
         ({"target": [0.0, 0.0, -INF]}, {}),
-        ({"target": [NAN] * JOINTS, "mode": [Mode.PASSIVE] * JOINTS}, {}),
+        ({"target": [NAN] * JOINTS, "mode": [JointMode.PASSIVE] * JOINTS}, {}),
         ({"torque_limit_nm": [1.0, NAN, 1.0]}, {}),
         ({"torque_limit_nm": [1.0, INF, 1.0]}, {}),
     ],
@@ -68,7 +68,12 @@ def test_a_good_command_passes() -> None:
     assert judge(make_joint_command(ROBOT, tick=5), now_ns=1000) is None
     assert judge(make_joint_command(ROBOT, valid_for_ns=10), age_ns=10) is None
     assert judge(make_joint_command(ROBOT, valid_for_ns=0), age_ns=0) is None
-    assert judge(make_joint_command(ROBOT, mode=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]), limits=SERVOS) is None
+    assert (
+        judge(
+            make_joint_command(ROBOT, mode=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]), limits=SERVOS
+        )
+        is None
+    )
 
 
 @pytest.mark.parametrize(("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases])
@@ -108,7 +113,7 @@ TORQUE_FRACTIONS = np.array([1.0, 0.5, 0.25])  # of the 4 N·m of each joint, wh
 
 def limit_hot_joints(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
     """Limit a command to joints that are cool, warm and hot; return torque limits, and reasons by joint."""
-    applied = limited(asked, every(), before(Mode.TORQUE, 2.0), TORQUE_FRACTIONS)
+    applied = limited(asked, every(), before(JointMode.TORQUE, 2.0), TORQUE_FRACTIONS)
     return applied.torque_limit_nm.tolist(), words(asked, applied, every(), TORQUE_FRACTIONS)
 
 
@@ -124,22 +129,22 @@ def test_limiter_hot_joint_has_lower_torque_limit(
     commanded_limit_nm: float | None, applied_limit_nm: list[float], reasons: dict[int, str]
 ) -> None:
     limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINTS
-    asked = make_joint_command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=limits_nm)
+    asked = make_joint_command(ROBOT, 2.0, JointMode.TORQUE, torque_limit_nm=limits_nm)
     assert limit_hot_joints(asked) == (applied_limit_nm, reasons)
 
 
 def test_limiter_cool_joint_with_excessive_torque_is_limited_by_rating() -> None:
-    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, Mode.TORQUE))
+    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, JointMode.TORQUE))
     assert reasons == {0: "torque", 1: "thermal", 2: "thermal"}
 
 
 def test_limiter_changed_target_of_hot_joint_names_target_limit() -> None:
-    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, Mode.POSITION))
+    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, JointMode.POSITION))
     assert reasons == dict.fromkeys(range(JOINTS), "angle")
 
 
 def test_limiter_passive_hot_joint_is_not_limited() -> None:
-    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, Mode.PASSIVE))
+    _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, JointMode.PASSIVE))
     assert reasons == {}
 
 
@@ -149,24 +154,24 @@ def test_limiter_passive_hot_joint_is_not_limited() -> None:
 @pytest.mark.parametrize(
     ("mode", "wanted", "word"),
     [
-        (Mode.POSITION, 2.0, "angle"),
-        (Mode.POSITION, -2.0, "angle"),
-        (Mode.POSITION, 1.0, "angle_rate"),
-        (Mode.POSITION, 1.5, "angle_rate"),
-        (Mode.POSITION, -1.5, "angle_rate"),
-        (Mode.VELOCITY, 6.0, "speed"),
-        (Mode.VELOCITY, -4.0, "acceleration"),
-        (Mode.VELOCITY, 5.0, "acceleration"),
-        (Mode.TORQUE, 5.0, "torque"),
-        (Mode.TORQUE, 4.0, "torque_rate"),
-        (Mode.TORQUE, -3.0, "torque_rate"),
-        (Mode.POSITION, 0.01, None),
-        (Mode.VELOCITY, 0.5, None),
-        (Mode.TORQUE, 0.5, None),
-        (Mode.PASSIVE, 3.0, None),
+        (JointMode.POSITION, 2.0, "angle"),
+        (JointMode.POSITION, -2.0, "angle"),
+        (JointMode.POSITION, 1.0, "angle_rate"),
+        (JointMode.POSITION, 1.5, "angle_rate"),
+        (JointMode.POSITION, -1.5, "angle_rate"),
+        (JointMode.VELOCITY, 6.0, "speed"),
+        (JointMode.VELOCITY, -4.0, "acceleration"),
+        (JointMode.VELOCITY, 5.0, "acceleration"),
+        (JointMode.TORQUE, 5.0, "torque"),
+        (JointMode.TORQUE, 4.0, "torque_rate"),
+        (JointMode.TORQUE, -3.0, "torque_rate"),
+        (JointMode.POSITION, 0.01, None),
+        (JointMode.VELOCITY, 0.5, None),
+        (JointMode.TORQUE, 0.5, None),
+        (JointMode.PASSIVE, 3.0, None),
     ],
 )
-def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word: str | None) -> None:
+def test_a_changed_target_is_named_by_its_limit(mode: JointMode, wanted: float, word: str | None) -> None:
     asked = make_joint_command(ROBOT, [0.0, wanted, 0.0], mode)
     applied = limited(asked, every(), before(mode))
     assert words(asked, applied, every()) == ({} if word is None else {1: word})
@@ -176,8 +181,8 @@ def test_set_points_for_the_backend_are_plain_python() -> None:
     applied = applied_for(make_joint_command(ROBOT, 0.01))
     points = make_safe_setpoints(applied, frozenset({1}))
     assert points.isolated == {1}
-    assert points.mode == [Mode.POSITION] * JOINTS
-    assert all(type(m) is Mode for m in points.mode)
+    assert points.mode == [JointMode.POSITION] * JOINTS
+    assert all(type(m) is JointMode for m in points.mode)
     assert all(type(value) is float for value in points.target + points.torque_limit_nm)
 
 

@@ -12,7 +12,7 @@ import pytest
 from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, JointMask
 from snakesim_hal.safety.plausibility import PlausibilityChecker, replace_non_finite_values
 from snakesim_hal.wire.freshness import FRESH_PERIODS
-from snakesim_hal.wire.messages import Fault, JointState, Mode
+from snakesim_hal.wire.messages import Fault, JointMode, JointState
 from snakesim_testing.hal.limiter_rig import JOINTS, LIMITS, ROBOT
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, make_description, make_joint_state
 
@@ -21,7 +21,7 @@ WORD = "state_invalid"
 NOBODY: JointMask = np.zeros(JOINTS, dtype=np.bool_)
 
 
-def targets(target: Any = 0.0, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> AppliedSetpoints:
+def targets(target: Any = 0.0, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0) -> AppliedSetpoints:
     return AppliedSetpoints(np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit))
 
 
@@ -273,7 +273,7 @@ FAR_PERIODS = 4  # until a target that moves by 0.02 rad a period is further tha
 
 
 def stuck(
-    bench: Bench, periods: int, step: float = 0.02, torque: float = 0.5, mode: Mode = Mode.POSITION
+    bench: Bench, periods: int, step: float = 0.02, torque: float = 0.5, mode: JointMode = JointMode.POSITION
 ) -> Fault | None:
     return [bench.see(0.0, 0.0, torque, applied=targets(step * k, mode)) for k in range(periods)][-1]
 
@@ -314,7 +314,7 @@ def test_plausibility_saturated_motor_may_repeat_its_state() -> None:
 
 
 def test_plausibility_frozen_needs_position_target_of_armed_robot() -> None:
-    for mode in (Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE):
+    for mode in (JointMode.PASSIVE, JointMode.VELOCITY, JointMode.TORQUE):
         assert stuck(Bench(torque=0.5), 50, mode=mode) is None
     bench = Bench(torque=0.5)
     for _ in range(50):
@@ -328,7 +328,7 @@ def test_a_mode_between_begins_anew() -> None:
     bench = Bench(torque=0.5)
     for _ in range(4):
         assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None
-        assert bench.see(0.0, 0.0, 0.5, applied=targets(9.0, Mode.VELOCITY)) is None
+        assert bench.see(0.0, 0.0, 0.5, applied=targets(9.0, JointMode.VELOCITY)) is None
 
 
 def test_plausibility_revived_joint_has_a_full_lease_until_frozen() -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.hal.limiter_rig import ANGLE_STEP, JOINTS, TINY, before, every
 from snakesim_testing.hal.small_robots import make_description
 
@@ -15,7 +15,7 @@ ROBOT = make_description(motor__damping_nm_s_per_rad=2.0)
 LIMITS = JointLimits.from_description(ROBOT)
 
 
-def beginning(angle: float, velocity: float, torque: float, mode: Mode, target: float) -> StopRamp:
+def beginning(angle: float, velocity: float, torque: float, mode: JointMode, target: float) -> StopRamp:
     return StopRamp.start(every(angle, velocity, torque), before(mode, target), LIMITS)
 
 
@@ -28,41 +28,41 @@ def targets(halt: StopRamp, periods: int) -> list[float]:
 
 
 def test_a_joint_at_rest_is_held_where_it_is() -> None:
-    assert targets(beginning(0.4, 0.0, 0.0, Mode.PASSIVE, 0.0), 5) == [0.4] * 6
+    assert targets(beginning(0.4, 0.0, 0.0, JointMode.PASSIVE, 0.0), 5) == [0.4] * 6
 
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_moving_joint_slows_down_by_its_acceleration(side: int) -> None:
     """From 4 rad/s by 100 rad/s² within 40 ms, and 80 mrad further."""
-    way = targets(beginning(0.0, side * 4.0, 0.0, Mode.POSITION, 0.0), 10)
+    way = targets(beginning(0.0, side * 4.0, 0.0, JointMode.POSITION, 0.0), 10)
     assert way[1:6] == pytest.approx([side * x for x in (0.035, 0.06, 0.075, 0.08, 0.08)])
     assert way[-1] == pytest.approx(side * 4.0**2 / 200.0)
 
 
 def test_the_target_goes_on_from_where_it_was() -> None:
-    way = targets(beginning(0.0, 0.0, 0.0, Mode.POSITION, 0.2), 10)
+    way = targets(beginning(0.0, 0.0, 0.0, JointMode.POSITION, 0.2), 10)
     assert way[:6] == pytest.approx([0.2, 0.15, 0.1, 0.05, 0.0, 0.0])
 
 
 def test_stop_ramp_after_another_mode_starts_from_present_torque() -> None:
-    halt = beginning(0.1, 1.0, 2.0, Mode.VELOCITY, 1.0)
+    halt = beginning(0.1, 1.0, 2.0, JointMode.VELOCITY, 1.0)
     assert halt.target_rad == pytest.approx(np.full(JOINTS, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
 
 
 def test_it_begins_near_the_joint() -> None:
-    assert beginning(0.0, 0.0, 100.0, Mode.TORQUE, 1.0).target_rad.tolist() == [0.3] * JOINTS
-    assert beginning(0.0, 0.0, 0.0, Mode.POSITION, -1.0).target_rad.tolist() == [-0.3] * JOINTS
+    assert beginning(0.0, 0.0, 100.0, JointMode.TORQUE, 1.0).target_rad.tolist() == [0.3] * JOINTS
+    assert beginning(0.0, 0.0, 0.0, JointMode.POSITION, -1.0).target_rad.tolist() == [-0.3] * JOINTS
 
 
 @given(
     angle=st.floats(-2, 2),
     velocity=st.floats(-50, 50),
     torque=st.floats(-5, 5),
-    mode=st.sampled_from(list(Mode)),
+    mode=st.sampled_from(list(JointMode)),
     target=st.floats(-1.5, 1.5),
 )
 def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
-    angle: float, velocity: float, torque: float, mode: Mode, target: float
+    angle: float, velocity: float, torque: float, mode: JointMode, target: float
 ) -> None:
     way = np.array(targets(beginning(angle, velocity, torque, mode, target), 60))
     assert np.abs(way).max() <= 1.5

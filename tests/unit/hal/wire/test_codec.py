@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Clock,
     ColorImage,
     DepthImage,
     JointCommand,
+    JointMode,
     JointState,
     Message,
-    Mode,
 )
 from snakesim_testing.hal.strategies import (
     iter_places,
@@ -31,7 +31,7 @@ from snakesim_testing.hal.strategies import (
 from snakesim_testing.messages import raises_error
 
 ALL = list(VERSIONS)
-DECODERS: dict[type[Message], Decoder[Any]] = {message: Decoder(message) for message in ALL}
+DECODERS: dict[type[Message], MessageDecoder[Any]] = {message: MessageDecoder(message) for message in ALL}
 each_message = pytest.mark.parametrize("message", ALL, ids=lambda message: message.__name__)
 
 
@@ -166,5 +166,5 @@ def test_nobody_but_the_contract_can_write_a_mode() -> None:
     example = make_plain_example(JointCommand)
     for number in range(-2, 10):
         found = take(JointCommand, encode({**example, "mode": [number]}))
-        assert (found is not None) == (number in set(Mode))
-    assert msgspec.msgpack.decode(encode([Mode.TORQUE])) == [3]
+        assert (found is not None) == (number in set(JointMode))
+    assert msgspec.msgpack.decode(encode([JointMode.TORQUE])) == [3]

@@ -7,16 +7,16 @@ import pytest
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, WireError
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.custom_sample import make_message_schema, parse_custom_message
 from snakesim_hal.wire.messages import CustomSample
-from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
+from snakesim_testing.hal.custom_sample import GOOD, PLACE, SkinSample
 from snakesim_testing.messages import raises_error
 
 
 def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
-    kind, sample = parse_custom_message(make_message_schema(Skin, "skin")), Skin(**PLACE, **GOOD)
-    decoded = Decoder(kind.message).decode(encode(sample), format_encoding(Skin))
+    kind, sample = parse_custom_message(make_message_schema(SkinSample, "skin")), SkinSample(**PLACE, **GOOD)
+    decoded = MessageDecoder(kind.message).decode(encode(sample), format_encoding(SkinSample))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
     assert kind.units == {"pressed_n": "N", "flow_m_s": "m/s", "wet": "1", "count": "1"}
     assert kind.extract_numeric_values(decoded) == pytest.approx(
@@ -24,7 +24,7 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
         | {f"flow_m_s.{i}": i + 1 for i in range(3)},
         nan_ok=True,
     )
-    assert Decoder(CustomSample).decode(encode(sample), format_encoding(Skin)) == CustomSample(**PLACE)
+    assert MessageDecoder(CustomSample).decode(encode(sample), format_encoding(SkinSample)) == CustomSample(**PLACE)
 
 
 @pytest.mark.parametrize(
@@ -43,9 +43,9 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
 )
 def test_the_schema_refuses_what_the_class_would(wrong: dict[str, Any]) -> None:
     written = msgspec.msgpack.encode(PLACE | GOOD | wrong)
-    for message in (Skin, parse_custom_message(make_message_schema(Skin, "skin")).message):
+    for message in (SkinSample, parse_custom_message(make_message_schema(SkinSample, "skin")).message):
         with pytest.raises(WireError) as caught:
-            Decoder(message).decode(written, format_encoding(Skin))
+            MessageDecoder(message).decode(written, format_encoding(SkinSample))
         assert next(iter(wrong)) in str(caught.value)
 
 
@@ -58,7 +58,7 @@ class WithoutUnit(CustomSample, frozen=True, kw_only=True):
 
 
 class Nested(CustomSample, frozen=True, kw_only=True):
-    skin: Skin
+    skin: SkinSample
 
 
 class Empty(CustomSample, frozen=True, kw_only=True):

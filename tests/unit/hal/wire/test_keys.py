@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColorImage, DepthImage, Done, Ranges
+from snakesim_hal.wire.messages import ColorImage, DepthImage, RangeScan, TickDone
 
 CHUNK = st.text(st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12)
 NAMESPACE = st.lists(CHUNK, min_size=1, max_size=3).map("/".join)
@@ -39,10 +39,10 @@ def test_every_key_constant_is_in_the_space() -> None:
 @given(name=CHUNK)
 def test_keys_of_a_service_or_sensor_contain_its_name(name: str) -> None:
     assert keys.parse_service(keys.done_key(name)) == keys.parse_service(keys.alive_key(name)) == name
-    assert keys.find_message(keys.done_key(name)) is Done
+    assert keys.find_message(keys.done_key(name)) is TickDone
     assert keys.find_message(keys.depth_key(name)) is DepthImage
     assert keys.find_message(keys.color_key(name)) is ColorImage
-    assert keys.find_message(keys.ranges_key(name)) is Ranges
+    assert keys.find_message(keys.ranges_key(name)) is RangeScan
 
 
 @given(namespace=NAMESPACE, row=st.sampled_from(keys.SPACE))

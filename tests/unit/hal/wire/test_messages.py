@@ -8,7 +8,7 @@ import pytest
 from msgspec import inspect
 
 from snakesim_hal.wire import keys, messages
-from snakesim_hal.wire.messages import VERSIONS, Message, Mode
+from snakesim_hal.wire.messages import VERSIONS, JointMode, Message
 from snakesim_testing.hal.strategies import iter_places, make_plain_example
 
 each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)
@@ -61,7 +61,7 @@ def floats_of(about: Any) -> list[dict[str, Any]]:
 
 def test_modes_keep_their_numbers() -> None:
     """The numbers are the contract with other languages and with recordings."""
-    assert {mode.name: mode.value for mode in Mode} == {"PASSIVE": 0, "POSITION": 1, "VELOCITY": 2, "TORQUE": 3}
+    assert {mode.name: mode.value for mode in JointMode} == {"PASSIVE": 0, "POSITION": 1, "VELOCITY": 2, "TORQUE": 3}
 
 
 def test_messages_of_sensors_have_tick_and_timestamp() -> None:

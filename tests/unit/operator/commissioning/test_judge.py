@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
-from snakesim_hal.model.joints import Drive
+from snakesim_hal.model.joints import JointDrive
 from snakesim_operator.features.commissioning.check import format_report
 from snakesim_operator.features.commissioning.judge import MATCHES_FILE, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import CheckMeasurements, remove_clamped_targets
@@ -46,7 +46,7 @@ def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: floa
         period_s=PERIOD_S,
         joint_names=["joint_1", "joint_2", "joint_3"],
         axes=["yaw", "pitch", "yaw"],
-        drives=[Drive(), Drive(sign=-1, zero_rad=0.3), Drive()],
+        drives=[JointDrive(), JointDrive(sign=-1, zero_rad=0.3), JointDrive()],
         angle_rad=angle,
         velocity_rad_s=velocity,
         torque_nm=0.5 * np.sign(velocity),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
-from snakesim_hal.wire.messages import DepthImage, Obstacle
+from snakesim_hal.wire.messages import DepthImage, KnownObstacle
 from snakesim_operator.features.console.page.force_polygon import draw_force_polygon, format_push_point_table
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import M_PER_N, MAX_FORCE_ARROW_M, draw
@@ -90,9 +90,9 @@ def test_the_force_polygon_names_every_force_and_their_resultant():
 
 
 def test_what_a_map_tells_is_not_drawn_as_perceived():
-    mapped = Obstacle(name="a", shape="sphere", position_w=(0.0, 0.0, 0.0))
-    found = Obstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
-    felt = Obstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
+    mapped = KnownObstacle(name="a", shape="sphere", position_w=(0.0, 0.0, 0.0))
+    found = KnownObstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
+    felt = KnownObstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
     drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None)
     assert drawing is not None
     assert [o.name for o in drawing.perceived] == ["b", "c"]

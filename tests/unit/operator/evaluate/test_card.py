@@ -16,7 +16,7 @@ from snakesim_operator.features.evaluate.card import (
     read_card,
 )
 from snakesim_operator.features.evaluate.case import CaseOutcome
-from snakesim_operator.features.evaluate.suite import Suite, make_cases
+from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases
 from snakesim_testing.messages import raises_error
 
 
@@ -31,7 +31,7 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
     numbers = {"advance_m": 1.0, "advance_m_s": 0.1, "desired_force_error": None}
 
     def card(controllers: list[str], seed: int, crosses: bool, **more: float):
-        suite = Suite(scenario="surveyed_clutter", set={"duration_s": 3.0, **more})
+        suite = EvaluationSuite(scenario="surveyed_clutter", set={"duration_s": 3.0, **more})
         cases = make_cases(suite, "here", controllers, 6, first_field=seed)
         done = {
             case.id: CaseOutcome(numbers={**numbers, "crossed": crosses == (case.controller == "hold")})
@@ -61,7 +61,7 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
 
 
 def test_a_card_on_disk_is_the_card(tmp_path: Path) -> None:
-    suite = Suite(scenario="surveyed_clutter")
+    suite = EvaluationSuite(scenario="surveyed_clutter")
     cases = make_cases(suite, "here", ["hold"], 1, first_field=1)
     card = make_card("mine", cases, {cases[0].id: CaseOutcome(numbers={"crossed": False})})
     (tmp_path / CARD_FILENAME).write_bytes(msgspec.json.encode(card))

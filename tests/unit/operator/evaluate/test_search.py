@@ -14,7 +14,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import resolve_file_path
 from snakesim_hal.model.textfiles import read_text
 from snakesim_operator.features.evaluate import optimize as search
-from snakesim_operator.features.evaluate.case import Case, CaseOutcome
+from snakesim_operator.features.evaluate.case import CaseOutcome, EvaluationCase
 from snakesim_operator.features.evaluate.optimize import SearchRequest, run_optimization
 from snakesim_testing.messages import raises_error
 
@@ -39,7 +39,7 @@ def quick_runs() -> Iterator[None]:
         def count_workers(self) -> int:
             return 2
 
-        def run_cases(self, cases: Sequence[Case]) -> Iterator[tuple[Case, CaseOutcome]]:
+        def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
             for case in cases:
                 config = msgspec.json.decode(case.config)
                 value = config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]

@@ -9,8 +9,8 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import list_shipped_names
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.cli import main
-from snakesim_operator.features.evaluate.case import Case
-from snakesim_operator.features.evaluate.suite import Suite, make_cases, make_suite_settings, read_suite
+from snakesim_operator.features.evaluate.case import EvaluationCase
+from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases, make_suite_settings, read_suite
 from snakesim_testing.messages import raises_error
 
 ROWS = """
@@ -34,13 +34,13 @@ seed = 1
 """
 
 
-def read(folder: Path, text: str) -> tuple[Suite, str]:
+def read(folder: Path, text: str) -> tuple[EvaluationSuite, str]:
     path = folder / "mine.toml"
     path.write_text(text)
     return read_suite(str(path))
 
 
-def config(case: Case) -> RunConfig:
+def config(case: EvaluationCase) -> RunConfig:
     return msgspec.json.decode(case.config, type=RunConfig)
 
 

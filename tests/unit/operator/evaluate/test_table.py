@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_operator.features.evaluate.case import Case, CaseOutcome
+from snakesim_operator.features.evaluate.case import CaseOutcome, EvaluationCase
 from snakesim_operator.features.evaluate.table import (
     UNKNOWN_TEXT,
     compute_wilson_interval,
@@ -16,8 +16,8 @@ from snakesim_operator.features.evaluate.table import (
 from snakesim_operator.results.metrics.intervals import compute_mean_interval
 
 
-def case(field: int, controller: str = "poal", row: int = 1) -> Case:
-    return Case(f"{controller}-{row}-{field}", row, f"density {row}", controller, field, b"{}", 12.0, 60.0)
+def case(field: int, controller: str = "poal", row: int = 1) -> EvaluationCase:
+    return EvaluationCase(f"{controller}-{row}-{field}", row, f"density {row}", controller, field, b"{}", 12.0, 60.0)
 
 
 def outcome(advance_m: float, speed_m_s: float = 0.1) -> CaseOutcome:

@@ -19,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, ControlState, DepthImage
@@ -242,7 +242,7 @@ def test_foxglove_unfinished_recording_has_transforms_joints_and_images(run: Pat
     torn = tmp_path / "torn.mcap"
     recording = RecordingWriter(torn, "planar13_camera")
     for number, one in enumerate(RecordingReader(run / RECORDING_FILENAME).read_messages()):
-        recording.write_arrival(Arrival(one.key, one.payload, one.encoding, one.wall_time_ns))
+        recording.write_arrival(ReceivedSample(one.key, one.payload, one.encoding, one.wall_time_ns))
         if number % 100 == 0:
             recording.flush()
     found: dict[str, Any] = {}

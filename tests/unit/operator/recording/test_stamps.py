@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_hal.network.streams import Arrival
+from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Contacts
@@ -101,7 +101,9 @@ def test_recorder_writes_wall_stamps(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", log_time_clock="wall")
     contacts = Contacts(tick=3, timestamp_ns=3 * PERIOD_NS, contacts=[])
     before_ns = time.time_ns()
-    writer.write_arrival(Arrival(keys.CONTACTS, encode(contacts), format_encoding(Contacts), time.monotonic_ns()))
+    writer.write_arrival(
+        ReceivedSample(keys.CONTACTS, encode(contacts), format_encoding(Contacts), time.monotonic_ns())
+    )
     writer.close({})
     ((_, message, _),) = read_with_stock_reader(tmp_path / "a.mcap")
     assert message.publish_time == 3 * PERIOD_NS

@@ -13,16 +13,16 @@ from snakesim_operator.features.reproduce.comparison_text import (
     make_record,
 )
 from snakesim_operator.features.reproduce.experiment import (
-    Comparison,
-    Curve,
+    DifferenceReason,
     Experiment,
-    Findings,
-    Picture,
-    Reason,
-    Source,
+    ExperimentFindings,
+    ExperimentPicture,
+    PictureCurve,
+    PublishedComparison,
+    PublishedSource,
 )
 from snakesim_operator.features.reproduce.experiments import EXPERIMENTS
-from snakesim_operator.features.reproduce.trials import Trials
+from snakesim_operator.features.reproduce.trials import ExperimentTrials
 from snakesim_testing.messages import raises_error
 
 
@@ -30,7 +30,7 @@ class Sledge(Experiment):
     """An experiment for the tests."""
 
     name = "sledge"
-    source = Source(
+    source = PublishedSource(
         authors="A. Author", title="On sledges", published_in="Journal 1", year=1999, place="table 2", seen="the table"
     )
     claim = "A sledge slides at 2 m/s."
@@ -38,18 +38,23 @@ class Sledge(Experiment):
     our_conditions = "Ice."
     method = "By a stopwatch."
 
-    def run(self, trials: Trials) -> Findings:
+    def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         raise NotImplementedError
 
 
-SPEED = Comparison(
+SPEED = PublishedComparison(
     quantity="speed", unit="m/s", published=2.0, basis="printed", ours=1.5, interval=(1.25, 1.75), runs=3
 )
-ORDER = Comparison(quantity="order", unit="", published="a, b", basis="printed", ours="a, b", runs=1)
-FINDINGS = Findings(
+ORDER = PublishedComparison(quantity="order", unit="", published="a, b", basis="printed", ours="a, b", runs=1)
+FINDINGS = ExperimentFindings(
     comparisons=(SPEED, ORDER),
-    reasons=(Reason(cause="Ice is smooth.", effect=-0.00004, unit="m/s"), Reason(cause="The wind.")),
-    picture=Picture(x_label="x", y_label="y", curves=(Curve(label="ours", x=[1.0], y=[2.0], is_ours=True),)),
+    reasons=(
+        DifferenceReason(cause="Ice is smooth.", effect=-0.00004, unit="m/s"),
+        DifferenceReason(cause="The wind."),
+    ),
+    picture=ExperimentPicture(
+        x_label="x", y_label="y", curves=(PictureCurve(label="ours", x=[1.0], y=[2.0], is_ours=True),)
+    ),
     notes=("A note.",),
 )
 
@@ -84,7 +89,7 @@ def test_a_text_has_the_source_the_numbers_and_the_reasons() -> None:
 
 
 def test_texts_that_differ_are_said_to_differ() -> None:
-    other = Comparison(quantity="order", unit="", published="a", basis="printed", ours="b", runs=2)
+    other = PublishedComparison(quantity="order", unit="", published="a", basis="printed", ours="b", runs=2)
     assert describe_difference(other) == "they are not the same"
     assert describe_ours(other) == "b (2 runs)"
 

@@ -6,15 +6,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scenario import Override, load_scenario
+from snakesim_hal.model.scenario import KeyOverride, load_scenario
 from snakesim_operator.results.summary import summarize_run
-from snakesim_operator.run.in_process import Result, simulate
+from snakesim_operator.run.in_process import InProcessResult, simulate
 
 HEADING = {"kind": "heading", "distance_m": 0.3}
 
 
 @cache
-def simulate_run(controller: str, duration_s: float = 2.5, goal: str = "") -> Result:
+def simulate_run(controller: str, duration_s: float = 2.5, goal: str = "") -> InProcessResult:
     goals = {
         "heading": HEADING,
         "too far": {**HEADING, "distance_m": 50.0},
@@ -22,10 +22,10 @@ def simulate_run(controller: str, duration_s: float = 2.5, goal: str = "") -> Re
         "points": {"kind": "waypoints", "points_m": [[1.7, 0.0], [1.9, 0.0]], "within_m": 0.05},
     }
     asked = {"controller": controller, "duration_s": duration_s, **({"mission.goal": goals[goal]} if goal else {})}
-    return simulate(load_scenario("peg_row", [Override(key, value, "--set") for key, value in asked.items()]).config)
+    return simulate(load_scenario("peg_row", [KeyOverride(key, value, "--set") for key, value in asked.items()]).config)
 
 
-def center_m(result: Result, row: int) -> float:
+def center_m(result: InProcessResult, row: int) -> float:
     """Along x; all links of this robot weigh the same."""
     nodes = result.record.find_body_points_w(row)
     assert nodes is not None

@@ -15,7 +15,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.robot import add_drive_identities, describe_robot
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, write_config
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Mode
+from snakesim_hal.wire.messages import ControlState, JointMode
 from snakesim_operator.results.compare.command import compare_runs
 from snakesim_operator.results.compare.difference import RunDifference, compute_difference
 from snakesim_operator.results.compare.page import render_comparison_page
@@ -71,7 +71,7 @@ def made_up(
         angle_rad=0.3 * np.sin(phase),
         velocity_rad_s=0.6 * math.pi * np.cos(phase),
         torque_nm=2.0 * np.cos(phase),
-        mode=np.full((count, JOINTS), Mode.POSITION, dtype=np.int8),
+        mode=np.full((count, JOINTS), JointMode.POSITION, dtype=np.int8),
         target=0.3 * np.sin(phase) + 0.01,
         torque_limit_nm=np.full((count, JOINTS), 7.0),
         position_w_m=np.full((count, 3), np.nan),
@@ -300,7 +300,7 @@ def made_up_with_torque_joint(torque_nm: float) -> RunRecord:
     """Return the made-up run with one joint in torque mode from 1 s on."""
     run = made_up()
     mode = run.mode.copy()
-    mode[TORQUE_FROM_TICK:, TORQUE_JOINT] = Mode.TORQUE
+    mode[TORQUE_FROM_TICK:, TORQUE_JOINT] = JointMode.TORQUE
     target = run.target.copy()
     target[TORQUE_FROM_TICK:, TORQUE_JOINT] = torque_nm
     return dataclasses.replace(run, mode=mode, target=target)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.results.metrics.form_closure import compute_form_closure_margin, find_body_contacts
 
 
@@ -41,10 +41,10 @@ def test_form_closure_by_pegs_on_both_sides_of_a_wave() -> None:
 
 def test_form_closure_counts_an_obstacle_once_at_nearest_link() -> None:
     pegs = [
-        Obstacle(name=f"{x} {y}", shape="cylinder", position_w=(x, y, 0.1), radius_m=0.05)
+        KnownObstacle(name=f"{x} {y}", shape="cylinder", position_w=(x, y, 0.1), radius_m=0.05)
         for x, y in ((0.3, 0.105), (0.55, -0.1), (0.8, 0.2))
     ]
     chain = np.column_stack([np.linspace(0.0, 1.0, 11), np.zeros(11)])
-    places, normals = find_body_contacts(chain, 0.04, Outlines.from_obstacles(pegs))
+    places, normals = find_body_contacts(chain, 0.04, ObstacleOutlines.from_obstacles(pegs))
     assert places == pytest.approx(np.array([[0.3, 0.04], [0.55, -0.04]]), abs=0.011)
     assert normals == pytest.approx(np.array([[0.0, -1.0], [0.0, 1.0]]), abs=0.11)

@@ -4,18 +4,18 @@ import math
 
 import pytest
 
-from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.results.metrics.map_score import MapScore, align_map, score_map
 
 HEAD = (0.0, 0.0)
 
 
-def peg(name: str, x: float, y: float, radius_m: float = 0.05, sd_m: float = 0.01) -> Obstacle:
-    return Obstacle(name=name, shape="cylinder", position_w=(x, y, 0.1), radius_m=radius_m, position_sd_m=sd_m)
+def peg(name: str, x: float, y: float, radius_m: float = 0.05, sd_m: float = 0.01) -> KnownObstacle:
+    return KnownObstacle(name=name, shape="cylinder", position_w=(x, y, 0.1), radius_m=radius_m, position_sd_m=sd_m)
 
 
-def block(name: str, x: float, y: float, half: tuple[float, float], yaw: float = 0.0) -> Obstacle:
-    return Obstacle(name=name, shape="box", position_w=(x, y, 0.1), half_size_m=(*half, 0.1), yaw_rad=yaw)
+def block(name: str, x: float, y: float, half: tuple[float, float], yaw: float = 0.0) -> KnownObstacle:
+    return KnownObstacle(name=name, shape="box", position_w=(x, y, 0.1), half_size_m=(*half, 0.1), yaw_rad=yaw)
 
 
 def test_a_true_map_has_no_errors():

@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from snakesim_hal.model.scenario import write_config
-from snakesim_hal.network.streams import Arrival
-from snakesim_hal.run_log.black_box import Layout
+from snakesim_hal.network.streams import ReceivedSample
+from snakesim_hal.run_log.black_box import RowLayout
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding
@@ -29,7 +29,7 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import CONFIG_FILENAME
 from snakesim_operator.results.signals import get_recorded_signals
 from snakesim_operator.results.summary import RunSummary, summarize_run
-from snakesim_testing.operator.recorded_triplet import Reader, triplet
+from snakesim_testing.operator.recorded_triplet import ReportReader, triplet
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
 FIRST_TICK = 37 + FIRST
@@ -62,7 +62,7 @@ def write_record(folder: Path, record: RunRecord) -> None:
     messages = [(keys.CONTROL_STATE, state) for state in record.control_states] + [
         (keys.WORLD, world) for world in record.worlds
     ]
-    layout, count = Layout.for_robot(record.description), len(record.time_s)
+    layout, count = RowLayout.for_robot(record.description), len(record.time_s)
     encoded = [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in messages]
     record_messages(folder, encoded, count)
     rows = bytearray(count * layout.row_bytes)
@@ -80,7 +80,7 @@ def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int)
     for key, payload in [*payloads, *[(keys.APPLIED, b"")] * ticks]:
         message = keys.find_message(key)
         assert message is not None
-        recording.write_arrival(Arrival(key, payload, format_encoding(message), 0))
+        recording.write_arrival(ReceivedSample(key, payload, format_encoding(message), 0))
     recording.close({})
 
 
@@ -104,11 +104,11 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     return loaded
 
 
-def summary_and_page(record: RunRecord) -> tuple[RunSummary, Reader]:
+def summary_and_page(record: RunRecord) -> tuple[RunSummary, ReportReader]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         summary = summarize_run(record, "complete")
-        reader = Reader(render_report(record, summary))
+        reader = ReportReader(render_report(record, summary))
     numbers = [value for value in msgspec.structs.astuple(summary) if isinstance(value, float)]
     assert len(numbers) > 5
     assert all(map(math.isfinite, numbers))
@@ -123,7 +123,7 @@ def compared(a: RunRecord, b: RunRecord) -> str:
         warnings.simplefilter("error")
         difference = compute_difference(a, b)
         text = "\n".join(format_comparison(difference))
-        reader = Reader(compare_page.render_comparison_page(difference))
+        reader = ReportReader(compare_page.render_comparison_page(difference))
     assert not re.search(r"\b(nan|inf)\b", text + reader.text)
     for record in (a, b):
         for lack in record.missing:

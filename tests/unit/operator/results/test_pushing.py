@@ -10,7 +10,7 @@ from snakesim_operator.results.report.pushing import make_pushing_section
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import simulate
-from snakesim_testing.operator.recorded_triplet import Reader, changed
+from snakesim_testing.operator.recorded_triplet import ReportReader, changed
 
 SECONDS = 1.5
 MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
@@ -76,6 +76,6 @@ def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
 
 
 def test_the_page_has_the_section_only_for_such_a_controller(record: RunRecord) -> None:
-    assert "pushing" in Reader(render_report(record, summarize_run(record, "complete"))).ids
+    assert "pushing" in ReportReader(render_report(record, summarize_run(record, "complete"))).ids
     one_joint = [msgspec.structs.replace(one, propulsion_joint="joint_5") for one in record.control_states]
     assert make_pushing_section(changed(record, control_states=one_joint)) is None

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.page.charts import find_strongest_per_bucket, select_rows_to_draw
 from snakesim_operator.results.page.html import LIBRARY
@@ -24,7 +24,7 @@ from snakesim_operator.results.report.timeline import compute_reference_rad, fin
 from snakesim_operator.results.report.view import find_body_points_xy_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, summarize_run
-from snakesim_testing.operator.recorded_triplet import LOST, SECONDS, Reader, changed, read
+from snakesim_testing.operator.recorded_triplet import LOST, SECONDS, ReportReader, changed, read
 
 HAND_OVERS_S = (0.0, 0.28, 1.28, 2.42, 3.56, 4.72, 5.78, 6.1)
 INTERVALS_S = {9 - k: interval for k, interval in enumerate(itertools.pairwise(HAND_OVERS_S))}  # 9 is joint_10
@@ -32,14 +32,14 @@ DRAWING = r'<svg viewBox="[^"]*" class="figure" role.*?</svg>'
 
 
 @pytest.fixture(scope="module")
-def page(record: RunRecord) -> Reader:
+def page(record: RunRecord) -> ReportReader:
     return read(record)
 
 
 # --- a whole run -----------------------------------------------------------------------------------------------
 
 
-def test_report_verdict_states_distance_and_hand_overs(page: Reader) -> None:
+def test_report_verdict_states_distance_and_hand_overs(page: ReportReader) -> None:
     said = (
         "Moved 0.62 m along the path in 10.0 s; propulsion handed over joint_10 → joint_9 → joint_8 → joint_7 → "
         "joint_6 → joint_5 → joint_4; no fault, 2 commands refused (stale)."
@@ -69,7 +69,7 @@ def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
     )
 
 
-def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) -> None:
+def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: ReportReader) -> None:
     frames = page.film["frames"]
     assert frames[0][0] == 0
     assert frames[-1][0] == pytest.approx(SECONDS, abs=0.02)
@@ -86,7 +86,7 @@ def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) ->
     assert page.film["captions"][frames[-1][3]].startswith(f"not moving: {LOST}")
 
 
-def test_every_series_of_the_run_is_a_chart(page: Reader) -> None:
+def test_every_series_of_the_run_is_a_chart(page: ReportReader) -> None:
     assert list(page.charts) == [
         "Advance over time",
         "States and propulsion joint over time",
@@ -109,7 +109,7 @@ def test_every_series_of_the_run_is_a_chart(page: Reader) -> None:
     assert len(torques["z"][0]) == 480
 
 
-def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page: Reader) -> None:
+def test_instants_are_events_and_none_looks_like_another(record: RunRecord, page: ReportReader) -> None:
     found = find_events(record, summarize_run(record, "complete"))
     assert [one.joint_index for one in found if one.joint_index is not None] == list(INTERVALS_S)
     assert found[0].description == "Start"
@@ -136,7 +136,7 @@ def test_forces_balance_and_add_up_to_the_commanded_one(record: RunRecord) -> No
         assert np.allclose(one.force_balance.resultant_force_n, ahead, atol=1e-9)
 
 
-def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, record: RunRecord) -> None:
+def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: ReportReader, record: RunRecord) -> None:
     figure = r'<svg viewBox="[^"]*" class="figure" role="img" aria-label="Force polygon.*?</svg>'
     polygons = re.findall(figure, page.html)
     lengths = [math.dist(*edge) for svg in polygons for edge in drawn_edges(svg, "commanded")]
@@ -148,7 +148,7 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     assert math.dist(ring[0][0], ring[-1][1]) == pytest.approx(lengths[0], abs=0.5)
 
 
-def test_report_force_without_contact_is_drawn_as_requested(page: Reader, record: RunRecord) -> None:
+def test_report_force_without_contact_is_drawn_as_requested(page: ReportReader, record: RunRecord) -> None:
     clear = changed(record, worlds=[msgspec.structs.replace(one, contacts=[]) for one in record.worlds])
     pages = page, read(clear)
     kinds = [{kind for frame in one.film["frames"] for kind in frame[8]} for one in pages]
@@ -161,7 +161,7 @@ def test_report_force_without_contact_is_drawn_as_requested(page: Reader, record
     assert "desired, but no contact was measured there" in pages[1].text
 
 
-def test_report_drawing_texts_do_not_overlap_or_cut_obstacles(page: Reader) -> None:
+def test_report_drawing_texts_do_not_overlap_or_cut_obstacles(page: ReportReader) -> None:
     drawings = [ET.fromstring(found) for found in re.findall(DRAWING, page.html)]
     assert len(drawings) > 8
     for drawing in drawings:
@@ -199,7 +199,7 @@ def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
     assert "whose forces balance" in read(wrong).text
 
 
-def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page: Reader) -> None:
+def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page: ReportReader) -> None:
     for field in msgspec.structs.fields(RunSummary):
         if field.name not in ELSEWHERE:
             assert field.name in page.words, field.name
@@ -209,7 +209,7 @@ def test_report_table_has_every_summary_number_with_unit(record: RunRecord, page
     assert "stale" in page.words
 
 
-def test_report_contains_the_command_of_the_run(page: Reader, record: RunRecord) -> None:
+def test_report_contains_the_command_of_the_run(page: ReportReader, record: RunRecord) -> None:
     assert f"snakesim run {record.path}/config.json --backend sim --seed 1" in page.html
     assert "&#34;amplitude_m&#34;: 0.045" in page.html
 
@@ -230,7 +230,7 @@ def test_report_reference_depends_on_mode_of_joint(
     record: RunRecord,
 ) -> None:
     reference = compute_reference_rad(record, 6)
-    free = record.mode[:, 6] == Mode.TORQUE
+    free = record.mode[:, 6] == JointMode.TORQUE
     assert np.array_equal(reference[~free], record.target[~free, 6])
     assert np.abs(reference[free] - record.target[free, 6]).max() > 1  # no torque is taken for an angle
     steps = np.abs(np.diff(reference))[np.diff(free.astype(int)) == 0]
@@ -258,7 +258,7 @@ def test_the_plotting_library_is_the_one_that_its_note_names() -> None:
     assert (LIBRARY.parent / "LICENSE-plotly.txt").is_file()
 
 
-def test_report_yielding_obstacle_is_dashed_and_described(page: Reader, record: RunRecord) -> None:
+def test_report_yielding_obstacle_is_dashed_and_described(page: ReportReader, record: RunRecord) -> None:
     row = record.config.scene.pegs_along_route[0]
     made = msgspec.structs.replace(row, lean_rad=0.2, stiffness_n_per_m=800.0, mass_kg=2.0, base_friction=0.5)
     scene = msgspec.structs.replace(record.config.scene, pegs_along_route=[made])

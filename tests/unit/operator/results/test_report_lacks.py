@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.scenario import Start
-from snakesim_hal.safety.authority import Authority
+from snakesim_hal.model.scenario import StartPlacement
+from snakesim_hal.safety.authority import CommandAuthority
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Fault
+from snakesim_hal.wire.messages import Fault, RobotDescription
 from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.report import render_report as report_page
-from snakesim_operator.results.report.verdict import Verdict, make_verdict
+from snakesim_operator.results.report.verdict import RunVerdict, make_verdict
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.conclusion import add_end_causes
@@ -26,7 +26,7 @@ from snakesim_testing.operator.recorded_triplet import (
     LOST,
     RATE_HZ,
     SECONDS,
-    Reader,
+    ReportReader,
     changed,
     first_seconds,
     read,
@@ -86,7 +86,7 @@ def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
 
 def test_report_without_route_has_all_sections(short_record: RunRecord) -> None:
     scene = msgspec.structs.replace(short_record.config.scene, route=None, pegs_along_route=[])
-    start = Start(on_route=False, position_m=(-5.0, 0.0))
+    start = StartPlacement(on_route=False, position_m=(-5.0, 0.0))
     page = read(changed(short_record, config=msgspec.structs.replace(short_record.config, scene=scene, start=start)))
     assert "distance of the tail end" in page.text
     assert "net displacement" in page.text
@@ -134,7 +134,7 @@ def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
 @pytest.mark.parametrize("joint", [None, "joint_3"])
 def test_report_of_harmless_fault_says_run_continued(short_record: RunRecord, joint: str | None) -> None:
     """The host noted it before the first arming; the run was complete."""
-    noting = Authority(short_record.description)
+    noting = CommandAuthority(short_record.description)
     noting.log_fault(Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint))
     host = msgspec.structs.replace(short_record.host, faults=noting.faults, ended="complete")
     page = read(changed(short_record, host=host))
@@ -187,7 +187,7 @@ def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
     return changed(record, control_states=control, **held)
 
 
-def judged(record: RunRecord) -> Verdict:
+def judged(record: RunRecord) -> RunVerdict:
     return make_verdict(record, summarize_run(record, "complete"))
 
 
@@ -293,7 +293,7 @@ def test_report_escapes_text_of_the_run(short_record: RunRecord) -> None:
     page = report_page(hurt, summarize_run(hurt, nasty))
     assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert") >= 5
-    assert nasty in Reader(page).text
+    assert nasty in ReportReader(page).text
 
 
 def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> None:
@@ -312,7 +312,7 @@ def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> No
     config_ = msgspec.structs.replace(short_record.config, scene=scene)
     hurt = changed(
         short_record,
-        description=msgspec.json.decode(encoded, type=Description),
+        description=msgspec.json.decode(encoded, type=RobotDescription),
         control_states=reported,
         config=config_,
     )

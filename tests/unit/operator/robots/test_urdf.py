@@ -10,7 +10,7 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import Override, RunConfig, load_scenario, parse_set_option
+from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, parse_set_option
 from snakesim_operator.cli import main
 from snakesim_operator.features.robots.command import export_robot, import_robot
 from snakesim_operator.features.robots.exporting import format_urdf
@@ -30,7 +30,7 @@ READ_ALL = '<mujoco><compiler fusestatic="false" discardvisual="false" strippath
 
 
 def config(scenario: str, robot: Path, *sets: str) -> RunConfig:
-    return load_scenario(scenario, [Override("robot", str(robot), "--set"), *map(parse_set_option, sets)]).config
+    return load_scenario(scenario, [KeyOverride("robot", str(robot), "--set"), *map(parse_set_option, sets)]).config
 
 
 def robot_at(name: str | Path) -> RobotFile:

@@ -19,7 +19,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.joints import Limits, Motor
+from snakesim_hal.model.joints import JointMotor, MotionLimits
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.command import import_robot
 from snakesim_operator.features.robots.exporting import format_urdf
@@ -388,8 +388,8 @@ def test_bounds_are_those_of_a_robot_file() -> None:
     """`decode` would refuse the value too, without the line of the URDF."""
     motor = ("stiffness_nm_per_rad", "velocity_gain_nm_s_per_rad", "damping_nm_s_per_rad", "response_time_s")
     good: dict[str, tuple[type[msgspec.Struct], dict[str, float]]] = {
-        "limits": (Limits, dict.fromkeys(("angle_rad", "acceleration_rad_s2", "torque_rate_nm_s"), 1.0)),
-        "motor": (Motor, dict.fromkeys((*motor, "armature_kg_m2"), 0.5)),
+        "limits": (MotionLimits, dict.fromkeys(("angle_rad", "acceleration_rad_s2", "torque_rate_nm_s"), 1.0)),
+        "motor": (JointMotor, dict.fromkeys((*motor, "armature_kg_m2"), 0.5)),
     }
     for number in JOINT_NUMBERS:
         struct, values = good[number.section]

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion, yaw_from_rotation
-from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, Frames, make_ros_name
-from snakesim_operator.features.ros2.messages import Transform
+from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, RobotFrames, make_ros_name
+from snakesim_operator.features.ros2.messages import RosTransform
 from snakesim_operator.features.ros2.urdf import make_urdf
 from snakesim_testing.hal.small_robots import make_joint_state, make_pose
 from snakesim_testing.operator.ros2_rig import of_robot
@@ -14,7 +14,7 @@ from snakesim_testing.operator.ros2_rig import of_robot
 Pair = tuple[np.ndarray, np.ndarray]
 
 
-def walked(tree: list[Transform], to: str) -> Pair:
+def walked(tree: list[RosTransform], to: str) -> Pair:
     """Pose of a frame in the root: position and rotation."""
     above = {one.child: one for one in tree}
     position, rotation = np.zeros(3), np.eye(3)
@@ -30,7 +30,7 @@ def walked(tree: list[Transform], to: str) -> Pair:
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
 def test_ros_frame_tree_equals_kinematics(name: str) -> None:
     robot = of_robot(name)
-    frames = Frames(robot, "lab/")
+    frames = RobotFrames(robot, "lab/")
     random = np.random.default_rng(3)
     angles = random.uniform(-0.9, 0.9, len(robot.joints)).tolist()
     turned = (float(np.cos(0.3)), 0.0, 0.0, float(np.sin(0.3)))

@@ -4,7 +4,7 @@ import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_operator.features.ros2 import graph, messages
-from snakesim_operator.features.ros2.graph import NodeName, Topic, make_token, make_topic_key
+from snakesim_operator.features.ros2.graph import NodeName, RosTopic, make_token, make_topic_key
 
 # From docs/design.md of ros2/rmw_zenoh.
 LISTENER = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
@@ -12,7 +12,7 @@ TALKER = (
     "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
     "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18/::,7:,:,:,,"
 )
-CHATTER = Topic("/chatter", messages.STRING, depth=7)
+CHATTER = RosTopic("/chatter", messages.STRING, depth=7)
 
 
 def test_keys_and_tokens_of_the_design_document() -> None:
@@ -22,7 +22,7 @@ def test_keys_and_tokens_of_the_design_document() -> None:
 
 
 def test_namespaces_and_quality_of_service() -> None:
-    topic = Topic("/lab/planar13/tf", messages.TRANSFORMS, depth=1, best_effort=True, latched=True)
+    topic = RosTopic("/lab/planar13/tf", messages.TRANSFORMS, depth=1, best_effort=True, latched=True)
     token = make_token(0, "abc", 3, graph.SUBSCRIPTION, NodeName("snakesim", "/lab/planar13"), topic)
     assert "/MS/%/%lab%planar13/snakesim/%lab%planar13%tf/" in token
     assert token.endswith("/2:1:,1:,:,:,,")

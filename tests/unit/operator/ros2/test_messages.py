@@ -15,9 +15,9 @@ from snakesim_hal.wire.custom_sample import make_message_schema, parse_custom_me
 from snakesim_operator.features.ros2 import messages as ros
 from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
-from snakesim_operator.features.ros2.messages import Marker, Transform
+from snakesim_operator.features.ros2.messages import RosMarker, RosTransform
 from snakesim_operator.features.ros2.steering import CmdVelSteering
-from snakesim_testing.hal.custom_sample import GOOD, PLACE, Skin
+from snakesim_testing.hal.custom_sample import GOOD, PLACE, SkinSample
 from snakesim_testing.hal.strategies import make_strategy
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -65,8 +65,8 @@ def test_ros_joint_states_omit_invalid_joints(joints: m.JointState) -> None:
 
 def test_ros_transforms_match_kinematics() -> None:
     sent = [
-        Transform("odom", "base_link", (1, 2, 3), (0.5, 0.1, 0.2, 0.3)),
-        Transform("a", "bc", (4, 5, 6), (1, 0, 0, 0)),
+        RosTransform("odom", "base_link", (1, 2, 3), (0.5, 0.1, 0.2, 0.3)),
+        RosTransform("a", "bc", (4, 5, 6), (1, 0, 0, 0)),
     ]
     seen = read(ros.TRANSFORMS, ros.encode_transforms(STAMP_NS, sent)).transforms
     for one, other in zip(sent, seen, strict=True):
@@ -100,13 +100,15 @@ def read_obstacle_markers() -> list[Any]:
     """Return the ROS markers of a cylinder of confidence 0.5, a box turned by 90 degrees, and a touched sphere."""
     quarter_turn_rad = np.pi / 2
     obstacles = [
-        m.Obstacle(name="c", shape="cylinder", position_w=(1, 2, 0.1), radius_m=0.05, height_m=0.2, confidence=0.5),
-        m.Obstacle(
+        m.KnownObstacle(
+            name="c", shape="cylinder", position_w=(1, 2, 0.1), radius_m=0.05, height_m=0.2, confidence=0.5
+        ),
+        m.KnownObstacle(
             name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=quarter_turn_rad, half_size_m=(0.1, 0.2, 0.3)
         ),
-        m.Obstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, touched=True),
+        m.KnownObstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, touched=True),
     ]
-    world = m.World(
+    world = m.WorldModel(
         tick=1,
         timestamp_ns=1,
         base_position_w=(0, 0, 0),
@@ -230,8 +232,8 @@ def test_ros_imu_message_marks_orientation_as_missing() -> None:
 
 
 @FEW
-@given(make_strategy(m.Ranges))
-def test_ros_scan_contains_the_ranges(sent: m.Ranges) -> None:
+@given(make_strategy(m.RangeScan))
+def test_ros_scan_contains_the_ranges(sent: m.RangeScan) -> None:
     seen = read(ros.LASER_SCAN, robot_in_ros.encode_laser_scan(STAMP_NS, "f", sent))
     expected = [np.inf if range_m is None else np.float32(range_m) for range_m in sent.range_m]
     assert seen.ranges.tolist() == expected
@@ -244,7 +246,7 @@ def test_ros_scan_contains_the_ranges(sent: m.Ranges) -> None:
 
 
 def test_custom_sensor_numbers_have_field_and_unit() -> None:
-    kind = parse_custom_message(make_message_schema(Skin, "skin"))
+    kind = parse_custom_message(make_message_schema(SkinSample, "skin"))
     sample: Any = kind.message(**PLACE, **GOOD)
     seen = read(ros.FLOAT64_ARRAY, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
     assert seen.data.tolist() == pytest.approx([1.5, np.nan], nan_ok=True)
@@ -254,8 +256,8 @@ def test_custom_sensor_numbers_have_field_and_unit() -> None:
 
 
 @FEW
-@given(make_strategy(m.Status))
-def test_ros_diagnostics_contain_the_status(status: m.Status) -> None:
+@given(make_strategy(m.RobotStatus))
+def test_ros_diagnostics_contain_the_status(status: m.RobotStatus) -> None:
     (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(STAMP_NS, status)).status
     assert (seen.level == robot_in_ros.ERROR) == (status.lifecycle in ("fault", "estop"))
     assert seen.name == status.robot
@@ -272,7 +274,7 @@ def test_clock_of_any_robot_time(timestamp_ns: int) -> None:
 def test_text_and_marker_defaults() -> None:
     assert read(ros.STRING, ros.encode_string("<robot>ä</robot>")).data == "<robot>ä</robot>"
     (_, plain) = read(
-        ros.MARKERS, ros.encode_markers(0, "map", [Marker("n", ros.CUBE, (1, 2, 3), (1, 0, 0, 1))])
+        ros.MARKERS, ros.encode_markers(0, "map", [RosMarker("n", ros.CUBE, (1, 2, 3), (1, 0, 0, 1))])
     ).markers
     assert (plain.lifetime.sec, plain.frame_locked, plain.text, plain.mesh_resource) == (0, False, "", "")
 

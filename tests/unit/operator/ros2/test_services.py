@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from snakesim_hal.wire.messages import Clock, JointState, LifecycleState, Mode
+from snakesim_hal.wire.messages import Clock, JointMode, JointState, LifecycleState
 from snakesim_operator.features.ros2 import graph
 from snakesim_operator.features.ros2 import service_types as types
-from snakesim_operator.features.ros2.graph import NodeName, Topic, make_token
+from snakesim_operator.features.ros2.graph import NodeName, RosTopic, make_token
 from snakesim_operator.features.ros2.joint_commands import TARGET_LIFETIME_NS, RosJointTargets
 from snakesim_operator.features.ros2.parameters import NOT_SET, _encode_value, _make_descriptor
-from snakesim_operator.robot_commands.parameters import Parameter
+from snakesim_operator.robot_commands.parameters import RobotParameter
 from snakesim_testing.hal import small_robots as rig
 from snakesim_testing.operator.ros2_rig import SERVICE_HASHES, of_robot
 
@@ -28,7 +28,7 @@ ADDER = (
 
 def test_a_service_of_the_design_document() -> None:
     two_ints = types.define_service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b", "int64 sum")
-    topic = Topic("/add_two_ints", two_ints.type)
+    topic = RosTopic("/add_two_ints", two_ints.type)
     zenoh_id = ADDER.split("/")[2]
     assert make_token(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
 
@@ -56,7 +56,7 @@ def test_values_of_parameters_keep_their_type(value: Any) -> None:
 
 
 def test_a_parameter_is_described_with_unit_and_range() -> None:
-    lead = Parameter("speed_kp_s", 0.2, unit="s", description="how far ahead", minimum=0.0, maximum=1.0)
+    lead = RobotParameter("speed_kp_s", 0.2, unit="s", description="how far ahead", minimum=0.0, maximum=1.0)
     seen = _make_descriptor("control.speed_kp_s", lead)
     assert seen.description == "how far ahead [s]"
     assert seen.additional_constraints == ">= 0, <= 1"
@@ -91,10 +91,10 @@ class TestJointTargets:
         assert targets.accept_message(self.said(["joint_4"], effort=[-1.0]), 10)
         points = targets.make_setpoints(self.clock(20), self.joints(0.2))
         assert points.target[2] == 0.5
-        assert points.mode[3] == Mode.TORQUE
+        assert points.mode[3] == JointMode.TORQUE
         assert points.target[3] == -1.0
         assert set(points.target[4:]) == {0.1}
-        assert set(points.mode[4:]) == {Mode.POSITION}  # where arming found them
+        assert set(points.mode[4:]) == {JointMode.POSITION}  # where arming found them
 
     def test_ros_joint_commands_that_stop_hold_the_joint(self) -> None:
         targets = RosJointTargets(self.robot)
@@ -102,7 +102,7 @@ class TestJointTargets:
         targets.make_setpoints(self.clock(TARGET_LIFETIME_NS), self.joints(0.3))
         for angle_rad in (0.4, 0.45):
             points = targets.make_setpoints(self.clock(TARGET_LIFETIME_NS + 1), self.joints(angle_rad))
-        assert points.mode[2] == Mode.POSITION
+        assert points.mode[2] == JointMode.POSITION
         assert points.target[2] == 0.4
 
     @pytest.mark.parametrize(

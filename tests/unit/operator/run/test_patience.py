@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from snakesim_hal.wire.messages import Status
+from snakesim_hal.wire.messages import RobotStatus
 from snakesim_operator.run.patience import StartupTimeout
 from snakesim_testing.hal import small_robots as rig
 
@@ -11,7 +11,7 @@ ALL = ("guidance", "control")
 
 def status(
     tick: int = 0, *, alive: Sequence[str] = ALL, ready: bool = False, waiting_for: Sequence[str] = ("guidance",)
-) -> Status:
+) -> RobotStatus:
     return rig.make_status(
         tick=tick, timestamp_ns=tick * rig.PERIOD_NS, ready_to_arm=ready, alive=alive, waiting_for=waiting_for
     )

@@ -5,7 +5,7 @@ import pytest
 from snakesim_gnc.control.live_parameters import LiveParameters
 from snakesim_hal.base.errors import ControllerError, RefusedError
 from snakesim_hal.model.scenario import load_scenario
-from snakesim_hal.network.client import Client
+from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState
@@ -34,7 +34,7 @@ class Control:
         """reported: after a request; None: it is silent. gone: it publishes no parameters after it."""
         self._network = LocalNetwork()
         session = self._network.create_session()
-        self._settings = LiveParameters(Client(session, "control"), load_scenario("triplet", []).config)
+        self._settings = LiveParameters(HostClient(session, "control"), load_scenario("triplet", []).config)
         self._settings.configure(make_description())
         self._settings.answer_requests(CLOCK)
         self._states = session.declare_publisher(keys.CONTROL_STATE, ControlState)

@@ -16,7 +16,7 @@ from msgspec import inspect
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.model.files import list_shipped_names, read_table_with_base
 from snakesim_hal.model.scenario import load_scenario
-from snakesim_hal.wire.codec import Decoder, encode, format_encoding
+from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import VERSIONS, Message
 from snakesim_operator.this_computer.schemas import generate_contract_files, write_schemas
 from snakesim_testing.hal.strategies import (
@@ -110,7 +110,7 @@ def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> 
     for field in example:
         rest = {name: value for name, value in example.items() if name != field}
         try:
-            Decoder(message).decode(encode(rest), format_encoding(message))
+            MessageDecoder(message).decode(encode(rest), format_encoding(message))
             taken = True
         except WireError:
             taken = False

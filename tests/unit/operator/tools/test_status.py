@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.local_registry import LocalRobot
-from snakesim_hal.network.session import Link, Session
+from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S
 from snakesim_operator.robot_commands import status
@@ -26,7 +26,7 @@ def test_one_attempt_is_enough_on_loopback(
     tried: list[float] = []
 
     @contextmanager
-    def refuse(_link: Link, connect_timeout_s: float) -> Iterator[Session]:
+    def refuse(_link: ConnectionSettings, connect_timeout_s: float) -> Iterator[Session]:
         tried.append(connect_timeout_s)
         raise NotConnectedError("nothing listens")
         yield

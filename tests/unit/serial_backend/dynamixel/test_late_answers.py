@@ -13,9 +13,9 @@ from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend, make_servo
 from snakesim_serial_backend.dynamixel.bring_up import bring_up
-from snakesim_serial_backend.dynamixel.port import Port
+from snakesim_serial_backend.dynamixel.port import DynamixelPort
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from snakesim_serial_backend.wire import Pty, SerialWire
+from snakesim_serial_backend.wire import PseudoTerminal, SerialWire
 from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
@@ -24,7 +24,7 @@ GAP_S = 0.1
 SETTINGS = DynamixelSettings(physics_model="inertia", bring_up_limit_s=5.0)
 
 
-class SlowPty(Pty):
+class SlowPty(PseudoTerminal):
     """A pseudo terminal that passes answers on with a delay."""
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class SlowBench:
             self._config, SETTINGS, [self.pty], DriverClock(self._config), None
         )
         self._wire = SerialWire(self.pty.path, 1_000_000)
-        self.port = Port(self._wire, GAP_S)
+        self.port = DynamixelPort(self._wire, GAP_S)
         self.servos = [make_servo(joint, self.port, SETTINGS) for joint in self._config.robot.joint_table]
         self._runs = True
         self._thread = threading.Thread(target=self._serve)

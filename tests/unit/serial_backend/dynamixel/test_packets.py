@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from snakesim_serial_backend.dynamixel.packets import (
     ALERT,
     BROADCAST_ID,
-    Decoder,
-    Instruction,
+    DynamixelDecoder,
+    DynamixelInstruction,
     encode_fast_status,
     encode_packet,
     encode_sync_read_request,
@@ -53,14 +53,14 @@ class Line:
 
 @given(id_=st.integers(0, 252), address=st.integers(0, 600), data=near_header.filter(bool))
 def test_packet_written_is_stuffed_and_checksummed_as_by_sdk(id_: int, address: int, data: bytes) -> None:
-    inside = [Instruction.WRITE, *address.to_bytes(2, "little"), *data]
+    inside = [DynamixelInstruction.WRITE, *address.to_bytes(2, "little"), *data]
     plain = [0xFF, 0xFF, 0xFD, 0, id_, len(inside) + 2, 0, *inside, 0, 0]
     # Its `txPacket` sends unstuffed what stuffing would make longer; so `addStuffing` itself is asked.
     stuffed = SDK.addStuffing(plain)
     crc = SDK.updateCRC(0, stuffed, len(stuffed) - 2)
-    ours = encode_packet(id_, Instruction.WRITE, bytes(inside[1:]))
+    ours = encode_packet(id_, DynamixelInstruction.WRITE, bytes(inside[1:]))
     assert ours == bytes(stuffed[:-2]) + crc.to_bytes(2, "little")
-    assert next(iter(Decoder().feed(ours))).parameters[2:] == data
+    assert next(iter(DynamixelDecoder().feed(ours))).parameters[2:] == data
 
 
 @given(ids=st.lists(st.integers(0, 252), min_size=1, max_size=20, unique=True), fast=st.booleans())
@@ -77,12 +77,12 @@ def test_questions_and_goals_of_several_are_those_of_the_sdk(ids: list[int], fas
 
 @given(id_=st.integers(0, 252), data=near_header, noise=st.binary(max_size=8), cut=st.integers(1, 30))
 def test_packet_answers_are_read_by_sdk_and_by_us(id_: int, data: bytes, noise: bytes, cut: int) -> None:
-    status = encode_packet(id_, Instruction.STATUS, bytes([ALERT]) + data)
+    status = encode_packet(id_, DynamixelInstruction.STATUS, bytes([ALERT]) + data)
     said, result = SDK.rxPacket(Line(status), False)
     assert result == COMM_SUCCESS
     assert bytes(said[9 : 9 + len(data)]) == data
     assert said[8] == ALERT
-    decoder, stream = Decoder(), noise + status
+    decoder, stream = DynamixelDecoder(), noise + status
     found = [packet for at in range(0, len(stream), cut) for packet in decoder.feed(stream[at : at + cut])]
     assert [(one.id, one.data, one.alert) for one in found] == [(id_, data, True)]
 
@@ -99,11 +99,11 @@ def test_fast_answer_is_read_by_sdk_and_to_its_end(parts: list[Any]) -> None:
         group.addParam(id_)
     assert group.fastSyncReadRxPacket() == COMM_SUCCESS
     assert [bytes(group.data_dict[id_]) for _, id_, _ in parts] == [data for _, _, data in parts]
-    (packet,) = Decoder().feed(answer)
+    (packet,) = DynamixelDecoder().feed(answer)
     assert packet.id == BROADCAST_ID
     assert [(one.id, one.data) for one in split_fast_status(packet, size)] == [(id_, data) for _, id_, data in parts]
     ends_early = encode_fast_status(parts, len(parts) + 1) + b"\x00"
-    assert list(Decoder().feed(ends_early)) == []
+    assert list(DynamixelDecoder().feed(ends_early)) == []
     intact = [(id_, data) for _, id_, data in parts]
     assert [(one.id, one.data) for one in split_damaged_fast_status(ends_early, size)] == intact
     last_is_garbled = answer[:-1] + bytes([answer[-1] ^ 0x10])
@@ -112,6 +112,6 @@ def test_fast_answer_is_read_by_sdk_and_to_its_end(parts: list[Any]) -> None:
 
 @pytest.mark.parametrize("at", [4, 5, 8, 10, 12])
 def test_a_changed_byte_is_noticed(at: int) -> None:
-    packet = bytearray(encode_packet(7, Instruction.WRITE, b"\x74\x00\x10\x20\x30\x40"))
+    packet = bytearray(encode_packet(7, DynamixelInstruction.WRITE, b"\x74\x00\x10\x20\x30\x40"))
     packet[at] ^= 0x04
-    assert list(Decoder().feed(bytes(packet))) == []
+    assert list(DynamixelDecoder().feed(bytes(packet))) == []

@@ -17,9 +17,9 @@ from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.emulator import FIRMWARE, MODEL, EmulatedDynamixel
-from snakesim_serial_backend.dynamixel.packets import ALERT, Refusal
+from snakesim_serial_backend.dynamixel.packets import ALERT, DynamixelErrorCode
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
-from snakesim_serial_backend.wire import Pty
+from snakesim_serial_backend.wire import PseudoTerminal
 from snakesim_testing.hal.small_robots import make_run_config
 
 SDK = Protocol2PacketHandler()
@@ -30,7 +30,7 @@ STEP_S = 0.01
 class Port(PortHandler):
     """The SDK's port; nothing more comes when all is read that the servos have said, however busy the computer is."""
 
-    def __init__(self, pty: Pty, emulator: EmulatedDynamixel) -> None:
+    def __init__(self, pty: PseudoTerminal, emulator: EmulatedDynamixel) -> None:
         super().__init__(pty.path)
         self._pty, self._emulator, self._read = pty, emulator, 0
         assert self.setBaudRate(1_000_000)
@@ -59,7 +59,7 @@ class Bench:
 
     def __init__(self) -> None:
         config = make_run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100)
-        self.clock, self.pty = DriverClock(config), Pty()
+        self.clock, self.pty = DriverClock(config), PseudoTerminal()
         self.emulator: EmulatedDynamixel = DynamixelBackend.make_robot_emulator(
             config, DynamixelSettings(physics_model="inertia"), [self.pty], self.clock, None
         )
@@ -131,11 +131,13 @@ def test_sdk_fast_read_ends_at_a_silent_servo(bench: Bench) -> None:
 
 def test_sdk_and_servo_refuse_the_same_writes(bench: Bench) -> None:
     port = bench.port
-    assert SDK.write2ByteTxRx(port, 1, at.MODEL, 7) == (COMM_SUCCESS, Refusal.ACCESS)
-    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 9) == (COMM_SUCCESS, Refusal.RANGE)
-    assert SDK.write2ByteTxRx(port, 1, at.GOALS, 3000) == (COMM_SUCCESS, Refusal.LIMIT)
+    assert SDK.write2ByteTxRx(port, 1, at.MODEL, 7) == (COMM_SUCCESS, DynamixelErrorCode.ACCESS)
+    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 9) == (COMM_SUCCESS, DynamixelErrorCode.RANGE)
+    assert SDK.write2ByteTxRx(port, 1, at.GOALS, 3000) == (COMM_SUCCESS, DynamixelErrorCode.LIMIT)
     bench.enable()
-    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 3) == (COMM_SUCCESS, Refusal.ACCESS), "torque is on"
+    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 3) == (COMM_SUCCESS, DynamixelErrorCode.ACCESS), (
+        "torque is on"
+    )
 
 
 def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
@@ -149,7 +151,7 @@ def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
     bench.pass_time(0.2)
     assert SDK.read1ByteTxRx(port, 1, at.WATCHDOG)[0] == at.TRIPPED
     stopped = bench.position(1)
-    assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start) == (COMM_SUCCESS, Refusal.RANGE)
+    assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start) == (COMM_SUCCESS, DynamixelErrorCode.RANGE)
     bench.pass_time(1.0)
     assert abs(bench.position(1) - stopped) < 200
     assert SDK.write1ByteTxRx(port, 1, at.WATCHDOG, 0) == (COMM_SUCCESS, 0)
@@ -166,7 +168,7 @@ def test_sdk_alert_stays_in_answers_until_a_restart(bench: Bench) -> None:
     assert result == COMM_SUCCESS
     assert said & ALERT == ALERT
     assert SDK.read1ByteTxRx(port, 1, at.TORQUE_ENABLE)[0] == 0
-    assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == Refusal.FAILED
+    assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == DynamixelErrorCode.FAILED
     bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=False)
     bench.emulator.body.thermal.winding_temperature_c[:] = 20.0
     assert SDK.reboot(port, 1)[0] == COMM_SUCCESS

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from snakesim_drivers.emulation.mounted import Mounted
+from snakesim_drivers.emulation.mounted import MountedDrive
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
@@ -47,7 +47,7 @@ def robot() -> Iterator[Robot]:
 
 def test_servos_stop_by_watchdog_when_driver_is_gone(robot: Robot) -> None:
     robot.run(40, "armed")
-    robot.mode, robot.target = Mode.TORQUE, 0.5
+    robot.mode, robot.target = JointMode.TORQUE, 0.5
     robot.run(2, "armed")
     robot.backend._clock.robot_time_ns += 190_000_000
     robot.emulator()
@@ -56,7 +56,7 @@ def test_servos_stop_by_watchdog_when_driver_is_gone(robot: Robot) -> None:
     assert {fault.what for fault in found} == {"drive_fault"}
     assert "watchdog" in found[0].cause
     robot.run(5, "fault")
-    robot.mode, robot.target = Mode.POSITION, 0.1
+    robot.mode, robot.target = JointMode.POSITION, 0.1
     assert robot.run(10, "disarmed") == []
     assert robot.run(60, "armed") == []
 
@@ -65,7 +65,7 @@ def test_servo_in_torque_mode_stops_just_beyond_its_travel(
     robot: Robot,
 ) -> None:
     robot.run(40, "armed")
-    robot.mode, robot.target = Mode.TORQUE, -0.05
+    robot.mode, robot.target = JointMode.TORQUE, -0.05
     robot.run(8, "armed")
     assert robot.joints is not None
     assert robot.joints.torque_nm == pytest.approx([-0.05] * JOINTS, abs=0.004)
@@ -131,7 +131,7 @@ def test_servo_with_settings_that_would_move_it_is_refused(robot: Robot, registe
 
 
 def test_a_servo_outside_of_its_travel_is_refused() -> None:
-    elsewhere = DynamixelSettings(physics_model="inertia", mounted={"joint_1": Mounted(zero_rad=2.5)})
+    elsewhere = DynamixelSettings(physics_model="inertia", mounted={"joint_1": MountedDrive(zero_rad=2.5)})
     with raises_error(BackendError, code="drive/unsupported-setting", field="joint_1"):
         Robot(elsewhere)
 

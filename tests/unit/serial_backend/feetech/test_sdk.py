@@ -15,7 +15,7 @@ from snakesim_serial_backend.feetech.backend import FeetechBackend
 from snakesim_serial_backend.feetech.emulator import MODEL
 from snakesim_serial_backend.feetech.packets import ServoError
 from snakesim_serial_backend.feetech.settings import FeetechSettings
-from snakesim_serial_backend.wire import Pty
+from snakesim_serial_backend.wire import PseudoTerminal
 from snakesim_testing.hal.small_robots import make_run_config
 
 sdk: Any = pytest.importorskip("scservo_sdk", reason="PyPI `feetech-servo-sdk` is not installed")
@@ -29,7 +29,7 @@ class Bench:
     def __init__(self) -> None:
         config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100)
         self.clock = DriverClock(config)
-        self.pty = Pty()
+        self.pty = PseudoTerminal()
         settings = FeetechSettings(physics_model="inertia")
         self.emulator = FeetechBackend.make_robot_emulator(config, settings, [self.pty], self.clock, None)
         self.port = self._make_port()

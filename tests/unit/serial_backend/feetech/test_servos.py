@@ -12,10 +12,10 @@ from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.programs.preflight import apply_backend_modes
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.wire.messages import JointMode
 from snakesim_serial_backend.feetech import registers as at
 from snakesim_serial_backend.feetech.backend import FeetechBackend
-from snakesim_serial_backend.feetech.emulator import EmulatedFeetech, EmulatedServo
+from snakesim_serial_backend.feetech.emulator import EmulatedFeetech, EmulatedFeetechServo
 from snakesim_serial_backend.feetech.settings import FeetechSettings
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.hal.small_robots import make_run_config
@@ -51,10 +51,10 @@ def robot() -> Iterator[Robot]:
 
 
 @pytest.fixture
-def delivered(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[list[EmulatedServo]], None]], None]:
+def delivered(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[list[EmulatedFeetechServo]], None]], None]:
     """Change servos before the driver finds them."""
 
-    def change(servos: Callable[[list[EmulatedServo]], None]) -> None:
+    def change(servos: Callable[[list[EmulatedFeetechServo]], None]) -> None:
         made = EmulatedFeetech.__init__
 
         def otherwise(emulator: EmulatedFeetech, *rest: Any) -> None:
@@ -84,7 +84,7 @@ def test_every_joint_is_described_without_watchdog_and_without_torque(robot: Rob
     description = robot.backend.describe()
     assert [joint.watchdog for joint in description.joints] == [False] * JOINTS
     assert all("torque" not in joint.measures for joint in description.joints)
-    assert all(joint.modes == [Mode.PASSIVE, Mode.POSITION] for joint in description.joints)
+    assert all(joint.modes == [JointMode.PASSIVE, JointMode.POSITION] for joint in description.joints)
     assert "no joint has a watchdog: it holds its last angle if the host dies" in describe_what_moves(description)
 
 
@@ -158,10 +158,10 @@ def test_closing_switches_the_torque_off() -> None:
 
 def test_joint_that_becomes_passive_has_no_torque(robot: Robot) -> None:
     robot.run(20, "armed")
-    robot.mode = Mode.PASSIVE
+    robot.mode = JointMode.PASSIVE
     robot.run(3, "armed")
     assert robot.torques_on() == [False] * JOINTS
-    robot.mode = Mode.POSITION
+    robot.mode = JointMode.POSITION
     assert robot.run(30, "armed") == []
     assert robot.torques_on() == [True] * JOINTS
 
@@ -211,7 +211,7 @@ def test_registers_are_written_only_where_they_differ(robot: Robot, delivered: A
     ],
 )
 def test_unsafe_register_is_named_at_start(delivered: Any, address: int, value: int, reason: str) -> None:
-    def change(servos: list[EmulatedServo]) -> None:
+    def change(servos: list[EmulatedFeetechServo]) -> None:
         servos[1].table[address] = value
         if address == at.MAX_POSITION:
             servos[1].write_word(address, at.MIDDLE + value)

@@ -16,8 +16,8 @@ from snakesim_operator.robot_commands.teleop.joystick import (
     EVENT,
     STICK_AGE_S,
     SYN_DROPPED,
-    Axis,
     Joystick,
+    JoystickAxis,
     open_joystick,
 )
 from snakesim_testing.messages import raises_error
@@ -29,7 +29,7 @@ class Device:
     def __init__(self) -> None:
         handle, self._write = os.pipe()
         os.set_blocking(handle, False)
-        self.stick = Joystick(handle, Axis(-32768, 32767), Axis(0, 255))
+        self.stick = Joystick(handle, JoystickAxis(-32768, 32767), JoystickAxis(0, 255))
 
     def sends(self, kind: int, code: int, value: int, at_s: float = 1.000002) -> bool:
         seconds, microseconds = divmod(round(1e6 * at_s), 1_000_000)

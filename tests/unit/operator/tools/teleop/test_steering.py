@@ -6,11 +6,11 @@ import pytest
 
 from snakesim_operator.cli import main
 from snakesim_operator.robot_commands.teleop.keyboard import _split_keys  # pyright: ignore[reportPrivateUsage]
-from snakesim_operator.robot_commands.teleop.steering import INTENT_VALIDITY_NS, MAX_HEADING_OFFSET_RAD, Steering
+from snakesim_operator.robot_commands.teleop.steering import INTENT_VALIDITY_NS, MAX_HEADING_OFFSET_RAD, SteeringState
 
 
 def test_speed_goes_by_steps_and_never_beyond_the_fastest() -> None:
-    steering = Steering("anna", 0.12)
+    steering = SteeringState("anna", 0.12)
     for _ in range(5):
         steering.change_speed(1, 0.0)
     assert steering.make_intent(7).speed_m_s == 0.12
@@ -28,7 +28,7 @@ def test_speed_goes_by_steps_and_never_beyond_the_fastest() -> None:
 
 
 def test_the_direction_begins_at_the_bodys_and_stays_near_it() -> None:
-    steering = Steering("anna", 0.3)
+    steering = SteeringState("anna", 0.3)
     assert steering.make_intent(0).heading_w_rad is None, "the mission's own goal"
     steering.rotate_heading(0.2, 3.1, 0.0)
     assert steering.make_intent(0).heading_w_rad == pytest.approx(3.3 - 2 * math.pi)
