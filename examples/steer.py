@@ -22,5 +22,5 @@ with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
             "heading_w_rad": 0.3,
             "valid_for_ns": 500000000,
         }
-        session.put("operator/intent", msgpack.packb(wish), encoding="application/msgpack;snakesim.Intent/1")
+        session.put("operator/intent", msgpack.packb(wish), encoding="application/msgpack;snakesim.LocomotionIntent/1")
         time.sleep(0.1)

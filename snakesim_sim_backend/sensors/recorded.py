@@ -26,7 +26,7 @@ class RecordedLine(msgspec.Struct, frozen=True):
 class RecordedDepth(SensorModel):
     """Plays a recording by the robot's time, and begins again at its end."""
 
-    class RecordingSettings(FileStruct, frozen=True):
+    class Settings(FileStruct, frozen=True):
         """The recording."""
 
         file: Annotated[str, Meta(min_length=1)]
@@ -34,7 +34,7 @@ class RecordedDepth(SensorModel):
 
     message = DepthImage
 
-    def __init__(self, camera: DepthCamera, scope: SensorScope, settings: RecordingSettings) -> None:
+    def __init__(self, camera: DepthCamera, scope: SensorScope, settings: Settings) -> None:
         """Read the recording.
 
         Raises:

@@ -73,7 +73,7 @@ def connected_sessions(*namespaces: str | None) -> Iterator[list[Session]]:
 class LagBackend(Backend):
     """Joints that follow their setpoints with a first-order lag. Neither mass nor contacts."""
 
-    class FollowerSettings(msgspec.Struct):
+    class Settings(msgspec.Struct):
         """None."""
 
     def __init__(self, config: RunConfig, settings: Any = None) -> None:

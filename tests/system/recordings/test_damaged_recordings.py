@@ -307,9 +307,9 @@ def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
 
 NAVIGATION = "services.navigation.plugin="
 NAMED = {  # the class that is made another; how a run names that one, how the refusal calls it, and what stands for it
-    "controller": ("control.hold import Hold", ("--controller", "./mine.py:Mine"), ("--controller", "hold")),
+    "controller": ("control.hold import HoldPose", ("--controller", "./mine.py:Mine"), ("--controller", "hold")),
     "service navigation": (
-        "navigation.service import Navigation",
+        "navigation.service import NavigationService",
         ("--set", f"{NAVIGATION}./mine.py:Mine"),
         ("--set", f"{NAVIGATION}navigation"),
     ),
