@@ -7,8 +7,9 @@ from pathlib import Path
 RATIO_HEADER = (
     "| what | against | ours, µs | theirs, µs | ratio (median) | goal | result |\n|---|---|---|---|---|---|---|"
 )
-GOAL_HEADER = "| what | median | goal | result |\n|---|---|---|---|"
+GOAL_HEADER = "| what | median (range) | goal | result |\n|---|---|---|---|"
 HEADING = "## "
+MIN_INTEGER = 100  # numbers from here on are written without decimals
 
 
 def format_row(
@@ -29,16 +30,29 @@ def format_row(
     return f"| {subject} | {reference} | {medians} | {ratio:.2f} | {verdict}"
 
 
+def format_interval(values: Sequence[float]) -> str:
+    """Return the median of some values with their range, such as `10.6 (10.5 to 10.7)`."""
+    median = statistics.median(values)
+    return f"{_format_number(median)} ({_format_number(min(values))} to {_format_number(max(values))})"
+
+
+def _format_number(value: float) -> str:
+    """Format a number with three digits, or with all its digits before the decimal point."""
+    if abs(value) >= MIN_INTEGER:
+        return f"{value:.0f}"
+    return f"{value:.3g}"
+
+
 def format_maximum_row(subject: str, values: Sequence[float], maximum: float, unit: str) -> str:
     """Return one row of a table of goals, for a quantity that should be small."""
-    median = statistics.median(values)
-    return f"| {subject} | {median:.0f} {unit} | <= {maximum:g} {unit} | {_judge(median <= maximum)} |"
+    is_met = statistics.median(values) <= maximum
+    return f"| {subject} | {format_interval(values)} {unit} | <= {maximum:g} {unit} | {_judge(is_met)} |"
 
 
 def format_minimum_row(subject: str, values: Sequence[float], minimum: float, unit: str) -> str:
     """Return one row of a table of goals, for a quantity that should be large."""
-    median = statistics.median(values)
-    return f"| {subject} | {median:.1f} {unit} | >= {minimum:g} {unit} | {_judge(median >= minimum)} |"
+    is_met = statistics.median(values) >= minimum
+    return f"| {subject} | {format_interval(values)} {unit} | >= {minimum:g} {unit} | {_judge(is_met)} |"
 
 
 def _judge(is_met: bool) -> str:

@@ -40,6 +40,7 @@ from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.joints import DriveMode
 from snakesim_hal.model.robot import RobotFile, restrict_drive_modes
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.codec import EncodedMessage
 from snakesim_hal.wire.messages import (
     ClockMode,
     Fault,
@@ -71,8 +72,8 @@ class Samples:
 
     joints: JointState  # in every tick
     by_key: Mapping[str, Message] = field(default_factory=dict[str, Message])  # of the other sensors, by key
-    encoded_by_key: Mapping[str, bytes] = field(
-        default_factory=dict[str, bytes]
+    encoded_by_key: Mapping[str, EncodedMessage] = field(
+        default_factory=dict[str, EncodedMessage]
     )  # encoded `by_key`, filled in by the host
 
 

@@ -18,6 +18,7 @@ from snakesim_hal.base.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.base.step_limit import StepTooLongError, describe_interrupted_line
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import EncodedMessage
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import Fault, LifecycleState, RobotDescription
 from snakesim_hal.wire.outgoing import encode_checked, encode_unchecked
@@ -66,9 +67,9 @@ class GuardedBackend(Backend):
 
     @_convert_exceptions
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """Return the backend's samples, with the bytes of every message except the joint state."""
+        """Return the backend's samples, with every message encoded except the joint state."""
         samples = self._inner.sample(tick, timestamp_ns)
-        encoded: dict[str, bytes] = {}
+        encoded: dict[str, EncodedMessage] = {}
         key = keys.JOINTS  # key of the message that is being encoded, for the error
         try:
             # Only that it can be encoded: the safety core checks joint by joint whether the values are plausible.

@@ -18,14 +18,14 @@ from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import IncomingQuery, Publisher
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES
+from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, EncodedMessage
 from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Message, RobotDescription, RobotStatus, RunConfiguration
 
 MAX_QUEUED_ACTIONS = 64  # queued actions; each sends one message, or all messages of a tick; the oldest are dropped
 MAX_QUEUED_IMAGES = 8
 FLUSH_S = 1.0  # how long queued actions still run at the end: a network or a disk may hang
 
-Outgoing = tuple[str, Message, bytes | None]  # key, message, and its bytes if it has been encoded already
+Outgoing = tuple[str, Message, EncodedMessage | None]  # key and message; None: it has not been encoded yet
 
 
 class SerialWorker:

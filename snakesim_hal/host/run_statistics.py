@@ -28,13 +28,13 @@ class DurationHistogram:
         """
         self.count = 0
         self._step = math.log1p(bin_width_ratio)
-        self._bins = [0] * (1 + math.ceil(math.log(MAX_DURATION_US) / self._step))
+        self._last_index = math.ceil(math.log(MAX_DURATION_US) / self._step)
+        self._bins = [0] * (self._last_index + 1)
 
     def add(self, duration_us: float) -> None:
         """Add a duration to the histogram."""
-        index = round(math.log(max(duration_us, 1.0)) / self._step)
-        last_index = len(self._bins) - 1
-        self._bins[min(max(index, 0), last_index)] += 1
+        index = round(math.log(max(duration_us, 1.0)) / self._step)  # from 0 on, because the logarithm is not negative
+        self._bins[min(index, self._last_index)] += 1
         self.count += 1
 
     def percentile_us(self, percent: float) -> float | None:

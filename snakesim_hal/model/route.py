@@ -20,8 +20,9 @@ def is_polyline(points_w: Floats) -> bool:
     """Return whether (n, 2) points are a line: at least two, and no two neighbors coincide."""
     if len(points_w) < 2:
         return False
-    differs = (points_w[1:] != points_w[:-1]).any(axis=1)
-    return bool(differs.all())
+    differs = points_w[1:] != points_w[:-1]  # (n - 1, 2)
+    differs_in_x, differs_in_y = differs.T
+    return bool((differs_in_x | differs_in_y).all())
 
 
 class Route:

@@ -20,7 +20,7 @@ from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import Publisher, ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MessageDecoder, MessageT
+from snakesim_hal.wire.codec import EncodedMessage, MessageDecoder, MessageT
 from snakesim_hal.wire.custom_sample import find_custom_message
 from snakesim_hal.wire.messages import (
     Answer,
@@ -318,22 +318,22 @@ class HostClient:
             WireError: No reader would accept the message. Nothing is sent.
         """
         try:
-            payload = self._encode_for_robot(key, message)
+            encoded = self._encode_for_robot(key, message)
         except WireError as error:
             output = _describe_output(key, message)
             raise WireError(error.reason, f"{output} cannot be published: {error.detail}") from None
-        self._get_publisher(key, type(message)).put(message, payload)
+        self._get_publisher(key, type(message)).put(message, encoded)
 
-    def _encode_for_robot(self, key: str, message: Message) -> bytes:
+    def _encode_for_robot(self, key: str, message: Message) -> EncodedMessage:
         """Return the encoded message. Raises WireError if it is not valid, or does not fit a known robot."""
         robot = self._filter.robot
         if robot is None:
             return encode_checked(key, message, None)
-        payload = encode_checked(key, message, find_custom_message(key, robot))
-        mismatch = find_mismatch(message, robot)
+        encoded = encode_checked(key, message, find_custom_message(key, robot))
+        mismatch = find_mismatch(encoded.decoded, robot)  # the message that readers in this process check, too
         if mismatch is not None:
             raise mismatch
-        return payload
+        return encoded
 
     def report_done(self, tick: int) -> None:
         """Report that all output for a tick is published. A command that answers the tick implies it."""

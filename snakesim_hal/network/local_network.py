@@ -27,15 +27,16 @@ from snakesim_hal.network.streams import (
     get_reader_depth,
 )
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MessageDecoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import EncodedMessage, MessageDecoder, MessageT, encode, format_encoding
 from snakesim_hal.wire.messages import Answer, Message
 
 SampleHandler = Callable[[ReceivedSample], None]
 
 
 class LocalArrival(ReceivedSample, frozen=True):
-    """A sample that stays within this process. Its first reader decodes it, and the other readers get that message.
+    """A sample that stays within this process, so that it is decoded once.
 
+    Its readers share the message that the publisher's check has decoded, or else the one that the first reader decodes.
     So no reader may change a message. The host decodes commands anew: what moves motors is shared with no service.
     """
 
@@ -110,6 +111,34 @@ class ZenohDeclaration:
     undeclare: Callable[[], None]
 
 
+class LocalPublisher(Publisher[MessageT]):
+    """Passes a checked message to the readers, besides its bytes, unless a fault is injected into its key."""
+
+    def __init__(
+        self,
+        message: type[MessageT],
+        send: Callable[[bytes], None],
+        send_encoded: Callable[[EncodedMessage], None],
+        has_subscriber: Callable[[], bool],
+    ) -> None:
+        """Wrap the functions of the network.
+
+        Args:
+            message: The type of its messages.
+            send: Sends bytes as they are, bypassing any reroute.
+            send_encoded: Sends bytes, together with the message that was decoded from them.
+            has_subscriber: Returns whether the key has a subscriber now.
+        """
+        super().__init__(message, send, has_subscriber)
+        self._send_encoded = send_encoded
+
+    def put(self, message: MessageT, encoded: EncodedMessage | None = None) -> None:
+        if encoded is None or self.is_rerouted:
+            super().put(message, encoded)
+        else:
+            self._send_encoded(encoded)
+
+
 class LocalReader(SampleReader[MessageT]):
     """Reads the newest samples of one key from a queue that its subscription fills."""
 
@@ -170,17 +199,23 @@ class LocalSession(Session):
         network = self._network
         encoding = format_encoding(message)
 
-        def send(payload: bytes) -> None:
-            arrival = LocalArrival(key, payload, encoding, time.monotonic_ns())
+        def deliver(arrival: LocalArrival) -> None:
             if latched:
                 network.latched[key] = arrival
             for handler in network.find_handlers(key):
                 handler(arrival)
 
+        def send(payload: bytes) -> None:
+            deliver(LocalArrival(key, payload, encoding, time.monotonic_ns()))
+
+        def send_encoded(encoded: EncodedMessage) -> None:
+            decoded: dict[type[Message], Any] = {type(encoded.decoded): encoded.decoded}
+            deliver(LocalArrival(key, encoded.payload, encoding, time.monotonic_ns(), decoded))
+
         def has_subscribers() -> bool:
             return bool(network.find_handlers(key))
 
-        return self._register_publisher(key, Publisher(message, send, has_subscribers))
+        return self._register_publisher(key, LocalPublisher(message, send, send_encoded, has_subscribers))
 
     def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> SampleReader[MessageT]:
         arrivals: deque[ReceivedSample] = deque(maxlen=depth or get_reader_depth(message))

@@ -8,7 +8,14 @@ from typing import Any, Generic
 import msgspec
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, MessageDecoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import (
+    IMAGE_MESSAGE_TYPES,
+    EncodedMessage,
+    MessageDecoder,
+    MessageT,
+    encode,
+    format_encoding,
+)
 from snakesim_hal.wire.messages import Answer, Message
 
 READER_DEPTH = 256  # samples; a burst of noise on a key must not displace the valid sample
@@ -46,16 +53,20 @@ class Publisher(Generic[MessageT]):
         self.has_subscriber = has_subscriber
         self._put = send
 
-    def put(self, message: MessageT, encoded: bytes | None = None) -> None:
+    def put(self, message: MessageT, encoded: EncodedMessage | None = None) -> None:
         """Send a message. Only a publisher that was declared lossless waits for slow subscribers.
 
         Args:
             message: Message to send.
-            encoded: Bytes of the message. None if the publisher has to encode it.
+            encoded: The same message, encoded and checked. None if the publisher has to encode it.
         """
-        if encoded is None:
-            encoded = encode(message)
-        self._put(encoded)
+        payload = encode(message) if encoded is None else encoded.payload
+        self._put(payload)
+
+    @property
+    def is_rerouted(self) -> bool:
+        """Whether payloads are passed to another function instead of being sent."""
+        return self._put is not self.send
 
     def reroute(self, put: Callable[[bytes], None] | None) -> None:
         """Pass payloads to `put` instead of sending them; None: send directly again."""

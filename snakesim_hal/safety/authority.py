@@ -406,7 +406,8 @@ class CommandAuthority:
                 command, applied, measured=self._measured_state, limits=self.limits, torque_fraction=torque_fraction
             )
         limit_by_joint |= self._isolation.find_overruled_joints(command)
-        self.limited_counts.update(limit_by_joint.values())
+        if limit_by_joint:
+            self.limited_counts.update(limit_by_joint.values())
         return limit_by_joint
 
     def _compute_derated_torque_nm(self) -> Floats:

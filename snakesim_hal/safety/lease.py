@@ -1,6 +1,6 @@
 """The lease: the right to command. One holder at a time; every accepted command renews it. Pure; time is passed in."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from snakesim_hal.wire.messages import LeaseRequest
 
@@ -75,7 +75,7 @@ def _make_not_holder_refusal(lease: CommandLease, request: LeaseRequest, advice:
 
 def renew_lease(lease: CommandLease, now_ns: int, lease_duration_ns: int) -> CommandLease:
     """Return the lease with an expiry time one lease duration from now."""
-    return replace(lease, expires_ns=now_ns + lease_duration_ns)
+    return CommandLease(lease.holder, lease.epoch, lease.priority, now_ns + lease_duration_ns)
 
 
 def free_lease(lease: CommandLease) -> CommandLease:

@@ -132,9 +132,6 @@ def limit_command(
         measured.torque_nm.tolist(),
         strict=True,
     ):
-        if mode is JointMode.PASSIVE:
-            targets.append(0.0)
-            continue
         start = last_target
         if mode != last_mode:
             start = compute_bumpless_target(joint, mode, angle, velocity, torque)
@@ -143,8 +140,10 @@ def limit_command(
                 target = _limit_angle_target(joint, requested, start, angle, limits)
             case JointMode.VELOCITY:
                 target = _limit_velocity_target(joint, requested, start, angle, limits.period_s)
-            case _:  # torque: passive joints have been handled above
+            case JointMode.TORQUE:
                 target = _limit_torque_target(joint, requested, start, torque_limit, angle, velocity, limits.period_s)
+            case _:  # passive
+                target = 0.0
         targets.append(target)
     return AppliedSetpoints(np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits))
 

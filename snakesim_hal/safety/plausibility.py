@@ -12,6 +12,7 @@ frozen    angle, velocity and torque stay bit-identical for more than a lease af
 
 import math
 from dataclasses import dataclass
+from itertools import chain
 
 import msgspec
 import numpy as np
@@ -237,7 +238,7 @@ def replace_non_finite_values(joints: JointState, last_good: MeasuredState) -> J
         The joint state, unchanged if all its values are finite or if it has a wrong number of joints.
     """
     columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
-    all_finite = all(all(map(math.isfinite, column)) for column in columns)
+    all_finite = all(map(math.isfinite, chain(*columns)))
     if all_finite or not joints.has_joint_count(len(last_good.angle_rad)):
         return joints
     angle_rad = list(joints.angle_rad)

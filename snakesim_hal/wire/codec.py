@@ -25,6 +25,16 @@ _encoder = msgspec.msgpack.Encoder()
 encode = _encoder.encode
 
 
+class EncodedMessage(msgspec.Struct, frozen=True):
+    """A message that has been encoded, and decoded again to check that readers accept it.
+
+    A reader in the same process may use `decoded`: it is what the reader would get from the bytes.
+    """
+
+    payload: bytes  # as it is sent
+    decoded: Message  # of its own, not the message that was encoded, which its author might still change
+
+
 def format_encoding(message: type[Message]) -> str:
     """Return the Zenoh encoding of a message type, such as `application/msgpack;snakesim.Clock/1`."""
     known = message

@@ -12,7 +12,7 @@ import msgspec
 
 from snakesim_hal.base.errors import WireError, shorten, suggest_word
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MessageDecoder, encode
+from snakesim_hal.wire.codec import EncodedMessage, MessageDecoder, encode
 from snakesim_hal.wire.custom_sample import CustomMessage
 from snakesim_hal.wire.messages import VERSIONS, CustomSample, Message
 
@@ -25,7 +25,7 @@ ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
 _make_decoder = cache(MessageDecoder[Any])
 
 
-def encode_checked(key: str, message: Message, custom: CustomMessage | None = None) -> bytes:
+def encode_checked(key: str, message: Message, custom: CustomMessage | None = None) -> EncodedMessage:
     """Encode a message, and check that readers of its key accept it.
 
     Args:
@@ -34,7 +34,7 @@ def encode_checked(key: str, message: Message, custom: CustomMessage | None = No
         custom: Message of a custom sensor as the robot describes it. None if the class of the message describes it.
 
     Returns:
-        The bytes to send.
+        The bytes to send, and the message that readers decode from them.
 
     Raises:
         WireError: Readers would reject the message. The error names the field, its value, and what is allowed.
@@ -42,10 +42,10 @@ def encode_checked(key: str, message: Message, custom: CustomMessage | None = No
     expected_type = _find_message_type(key, message, custom)
     payload = encode_unchecked(message)
     try:
-        _make_decoder(expected_type).decode_payload(payload)
+        decoded = _make_decoder(expected_type).decode_payload(payload)
     except WireError as error:
         raise WireError(error.reason, describe_invalid_field(message) or error.detail) from None
-    return payload
+    return EncodedMessage(payload, decoded)
 
 
 def _find_message_type(key: str, message: Message, custom: CustomMessage | None) -> type[Message]:

@@ -52,7 +52,7 @@ class JointDescription(Message, frozen=True, kw_only=True):
 
     def supports_mode(self, mode: JointMode) -> bool:
         """Return whether the joint may be commanded in a mode. It can always be passive."""
-        return mode is JointMode.PASSIVE or mode in self.modes
+        return mode in self.modes or mode is JointMode.PASSIVE
 
 
 class LinkDescription(Message, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Answer, JointCommand, LeaseRequest, TickDone
+from snakesim_hal.wire.outgoing import encode_checked
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 from snakesim_testing.messages import raises_error
 
@@ -74,6 +75,38 @@ def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -
     assert first is not sent  # the sender's own message is encoded, and never handed to a reader
 
 
+def test_readers_of_one_process_share_the_message_that_the_check_of_the_sender_has_decoded() -> None:
+    network = LocalNetwork()
+    sender, one, other = network.create_session(), network.create_session(), network.create_session()
+    key = keys.done_key("control")
+    readers = [
+        one.declare_reader(key, TickDone),
+        other.declare_reader(key, TickDone),
+        other.declare_reader(key, Answer),
+    ]
+    encoded = encode_checked(key, TickDone(tick=4))
+    sender.declare_publisher(key, TickDone).put(TickDone(tick=4), encoded)
+    first, second, of_wrong_type = (reader.drain() for reader in readers)
+    assert first[0] is encoded.decoded
+    assert second[0] is encoded.decoded
+    assert of_wrong_type == []
+    assert other.rejected == {"unknown_message": 1}
+
+
+def test_reader_decodes_the_bytes_of_a_message_that_a_fault_has_changed() -> None:
+    network = LocalNetwork()
+    sender, reading = network.create_session(), network.create_session()
+    key = keys.done_key("control")
+    reader = reading.declare_reader(key, TickDone)
+    publisher = sender.declare_publisher(key, TickDone)
+    sender.reroute(key, lambda _payload: sender.send(key, encode(TickDone(tick=5))))
+    publisher.put(TickDone(tick=4), encode_checked(key, TickDone(tick=4)))
+    assert reader.drain() == [TickDone(tick=5)]
+    sender.reroute(key, None)
+    publisher.put(TickDone(tick=6), encode_checked(key, TickDone(tick=6)))
+    assert reader.drain() == [TickDone(tick=6)]
+
+
 def test_each_reader_checks_what_no_reader_could_decode() -> None:
     network = LocalNetwork()
     sender, one, other = network.create_session(), network.create_session(), network.create_session()
@@ -84,7 +117,7 @@ def test_each_reader_checks_what_no_reader_could_decode() -> None:
         other.declare_reader(key, Answer),
     ]
     publisher = sender.declare_publisher(key, TickDone)
-    publisher.put(TickDone(tick=4), encode(TickDone(tick=-4)))
+    publisher.send(encode(TickDone(tick=-4)))
     assert [reader.drain() for reader in readers] == [[], [], []]
     assert one.rejected == {"malformed": 1}
     assert other.rejected == {"malformed": 1, "unknown_message": 1}
@@ -96,7 +129,9 @@ def test_host_shares_no_command_with_the_readers_of_its_process() -> None:
     reader = reading.declare_reader(keys.JOINT_COMMAND, JointCommand)
     receiver = mock.Mock()
     inbox = HostInbox(host, receiver, [], lambda _query, _answer: None)
-    sender.declare_publisher(keys.JOINT_COMMAND, JointCommand).put(make_joint_command(make_description(), 0.1))
+    command = make_joint_command(make_description(), 0.1)
+    encoded = encode_checked(keys.JOINT_COMMAND, command)
+    sender.declare_publisher(keys.JOINT_COMMAND, JointCommand).put(command, encoded)
     (read,) = reader.drain()
     read.target[0] = 3.0  # as a careless service might
     inbox.handle_queued(math.inf)

@@ -2,6 +2,7 @@
 
 import time
 from typing import Any
+from unittest import mock
 
 import msgspec
 import pytest
@@ -11,6 +12,7 @@ from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.route import Route
+from snakesim_hal.network import robot_mismatch
 from snakesim_hal.network.client import Commander, HostClient
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
@@ -112,6 +114,15 @@ def test_what_passes_as_a_path_makes_a_route() -> None:
     for path in ([(0.0, 0.0), (tiny, 0.0)], [(1e6, 0.0), (-1e6, 0.0)]):
         if find_mismatch(trajectory(*path), ROBOT) is None:
             assert Route(path).length_m > 0
+
+
+def test_check_of_a_trajectory_is_not_repeated_for_other_readers_of_the_same_message() -> None:
+    path = trajectory((0.0, 0.0), (1.0, 0.0))
+    no_path = trajectory((0.0, 0.0), (0.0, 0.0))
+    with mock.patch.object(robot_mismatch, "is_polyline", wraps=robot_mismatch.is_polyline) as is_polyline:
+        errors = [find_mismatch(message, ROBOT) for message in (no_path, no_path, path, path, no_path)]
+    assert [error is None for error in errors] == [False, False, True, True, False]
+    assert is_polyline.call_count == 3  # once for each message that differs from the one before
 
 
 def served(hal: Session) -> None:
