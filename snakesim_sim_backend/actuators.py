@@ -9,6 +9,9 @@ Each joint has a `dcmotor` with motor constant 1, so that its current is its tor
 
 The torque is the motor's state; a change of mode changes only the demand. So torque never jumps on a change of mode:
 it follows the new demand with the motor's response time, also to zero in passive mode.
+
+A motor with a latency follows the targets of that time ago, which MuJoCo keeps as the history of its inputs. A change
+of mode is not delayed: the history then starts anew with the target of the new mode.
 """
 
 import math
@@ -55,6 +58,11 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: ModuleBody, step_s: flo
         saturation=[limits.torque_nm, 0.0, 0.0],
         ctrlspec=int(inputs.mjINPUT_POS | inputs.mjINPUT_VEL | inputs.mjINPUT_FF),
     )
+    if joint.motor.latency_s > 0:
+        motor.delay = joint.motor.latency_s
+        motor.nsample = (
+            math.ceil(joint.motor.latency_s / step_s) + 1
+        )  # one sample for each physics step, and the newest
 
 
 def _make_gains_by_mode(joint: Joint, scale: float) -> dict[JointMode, tuple[float, float, float]]:
@@ -85,6 +93,36 @@ class MotorData(Protocol):
     def actuator_force(self) -> Floats: ...
     @property
     def ctrl(self) -> Floats: ...
+    @property
+    def history(self) -> Floats: ...
+
+
+class _InputHistory:
+    """The latest inputs of one motor with a latency, in MuJoCo's `history`.
+
+    Its numbers are one of the user, the index of the newest sample, the times of all samples, and their inputs.
+    """
+
+    HEADER_NUMBERS = 2
+
+    def __init__(self, model: mujoco.MjModel, motor: int) -> None:
+        """Find the history of a motor in a compiled model."""
+        self._motor = motor
+        self._sample_count = int(model.actuator_history[motor, 0])
+        self._step_s = float(model.opt.timestep)
+        self._start = int(model.actuator_historyadr[motor])
+
+    def forget(self, history: Floats, inputs: Floats) -> None:
+        """Let the present inputs of a motor be those of all samples, so that they count at once."""
+        first = self._start + self.HEADER_NUMBERS + self._sample_count
+        samples = history[first : first + INPUTS_PER_MOTOR * self._sample_count].reshape(-1, INPUTS_PER_MOTOR)
+        samples[:] = inputs[INPUTS_PER_MOTOR * self._motor : INPUTS_PER_MOTOR * (self._motor + 1)]
+
+    def restart_at_time_0(self, history: Floats) -> None:
+        """Let the samples be those of the steps before time 0, as at the start of a simulation."""
+        history[self._start + 1] = self._sample_count - 1
+        first = self._start + self.HEADER_NUMBERS
+        history[first : first + self._sample_count] = self._step_s * np.arange(-self._sample_count, 0)
 
 
 class ModelMotors:
@@ -116,6 +154,7 @@ class ModelMotors:
         ]
         self._names = [joint.name for joint in joints]
         self._gains_by_mode = [_make_gains_by_mode(joint, gain_scale) for joint in joints]
+        self._input_histories = [_InputHistory(model, i) for i, joint in enumerate(joints) if joint.motor.latency_s > 0]
 
         # Views of MuJoCo's arrays.
         self._gains = model.actuator_gainprm[: self.count]
@@ -147,6 +186,7 @@ class ModelMotors:
         self._torque_state = data.act  # empty when the motors have no lag
         self._applied_nm = data.actuator_force[: self.count]
         self._inputs = data.ctrl[: INPUTS_PER_MOTOR * self.count]
+        self._history = data.history
 
     def enact(self, setpoints: SafeSetpoints) -> None:
         """Apply setpoints, tail to head; they hold until the next call.
@@ -158,11 +198,15 @@ class ModelMotors:
 
     def set_inputs(self, modes: list[JointMode], targets: list[float], limits_nm: list[float]) -> None:
         """Drive the simulated motors, as `enact` does; also before a run begins, when no limiter is there yet."""
-        if modes != self._modes:
+        has_new_modes = modes != self._modes
+        if has_new_modes:
             self._change_modes(modes)
         self._inputs[self._input_indices] = targets
         if self._passive_indices:
             self._inputs[self._passive_indices] = 0.0
+        if has_new_modes:
+            for input_history in self._input_histories:
+                input_history.forget(self._history, self._inputs)
         if limits_nm != self._commanded_limit_nm:
             self._commanded_limit_nm = list(limits_nm)
             self._update_limit()
@@ -176,6 +220,12 @@ class ModelMotors:
         """Make all joints passive."""
         zeros = [0.0] * self.count
         self.set_inputs([JointMode.PASSIVE] * self.count, zeros, self._full_limit_nm.tolist())
+
+    def restart_at_time_0(self) -> None:
+        """Forget the targets of the time before the simulation is set to time 0, for motors with a latency."""
+        for input_history in self._input_histories:
+            input_history.restart_at_time_0(self._history)
+            input_history.forget(self._history, self._inputs)
 
     def apply_pending_torque_limits(self) -> None:
         """Lower the torque limits as fast as the motors can follow, and end wind-up above them.

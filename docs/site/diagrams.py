@@ -6,6 +6,7 @@ from pathlib import Path
 
 from docs.site.drawing import Drawing, spread
 from docs.site.gait_curves import draw_gait_curves
+from docs.site.shape_template import make_shape_template
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 
@@ -322,7 +323,8 @@ def make_diagrams() -> dict[Path, str]:
     """Return every diagram as it should be, by its path."""
     drawings = {name: draw() for name, draw in DIAGRAMS.items()}
     drawings |= {name: draw_wiring(wiring) for name, wiring in WIRINGS.items()}
-    return {FOLDER / name: drawing.to_svg() for name, drawing in drawings.items()}
+    texts = {FOLDER / name: drawing.to_svg() for name, drawing in drawings.items()}
+    return texts | {FOLDER / "shape-template.svg": make_shape_template()}
 
 
 if __name__ == "__main__":

@@ -5,4 +5,5 @@
 `drive_emulator`   base class of the emulated drives of a driver type
 `mounted`          how the emulated drives are really mounted, which a robot file may state wrongly
 `inertia`          the simplest physics model: every joint rotates an inertia of its own
+`bending_hand`     a hand that bends joints of that model whose motors are off
 """

@@ -9,11 +9,13 @@ In each step of length h, with torque τ, inertia J, viscous friction b, dry fri
 End stops absorb all motion. The model does *not* simulate gravity, ground, obstacles, or coupling between joints.
 """
 
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
 
+from snakesim_drivers.emulation.bending_hand import BendingHand
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.files import FileStruct
@@ -33,6 +35,11 @@ class InertiaSettings(FileStruct, frozen=True, kw_only=True):
 
     drag_nm: Annotated[float, from_zero(100, "N·m")] = 0.1
     """Dry friction of every joint, in addition to the robot file's, so that a released joint comes to rest."""
+
+    hand_file: str = ""
+    """File with the angle of every joint in rad, tail to head, separated by spaces. When it changes, a hand bends the
+    joints whose motors are off to these angles. Empty: there is no hand.
+    """
 
 
 class InertiaModel(PhysicsModel):
@@ -79,6 +86,9 @@ class InertiaModel(PhysicsModel):
         self._velocity_rad_s = np.zeros(count)
         self._torque_nm = np.zeros(count)
         self._buffer = np.zeros(count)  # of intermediate results, so that a step allocates no memory
+        self._hand: BendingHand | None = None
+        if settings.hand_file:
+            self._hand = BendingHand(Path(settings.hand_file), count)
 
     def advance(self, torque_nm: Floats) -> None:
         """Advance by one step of semi-implicit Euler integration, without allocating memory.
@@ -100,6 +110,9 @@ class InertiaModel(PhysicsModel):
         velocity_rad_s *= self._viscous_damping_factor
         np.clip(velocity_rad_s, -self._dry_friction_step_rad_s, self._dry_friction_step_rad_s, out=buffer)
         velocity_rad_s -= buffer
+
+        if self._hand is not None:
+            self._hand.bend(angle_rad, velocity_rad_s, torque_nm, self.step_s)
 
         # Angle.
         np.multiply(velocity_rad_s, self.step_s, out=buffer)

@@ -24,6 +24,8 @@ JointProperty = Literal["drive", "order", "sign", "gear", "zero"]
 PROPERTIES: tuple[JointProperty, ...] = get_args(JointProperty)  # those that a start check confirms for every joint
 JointNames = Annotated[list[ShortText], Meta(max_length=MAX_JOINTS)]
 
+REMEDY = "check it again (docs/hardware/calibration.md)"
+
 
 class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
     """The section [checked], which `snakesim robot check` writes."""
@@ -51,6 +53,9 @@ class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
 
     by_hand: Annotated[dict[JointProperty, JointNames], Meta(max_length=len(PROPERTIES))] = {}
     """For each property, the joints for which a person confirmed it. For the others the check did."""
+
+    by_shape: Annotated[list[JointProperty], Meta(max_length=len(PROPERTIES))] = []
+    """Properties that drawn shapes confirmed for every joint (`snakesim robot shape check`)."""
 
     straight: bool = False
     """True: a person laid the robot straight, and the zeros were judged from that pose."""
@@ -87,27 +92,57 @@ def find_unchecked_reason(checked: StartCheckRecord | None, joints: Sequence[Joi
         return ""
     if checked is None:
         return "its joints have not been checked against its file: check them (docs/hardware/calibration.md)"
-    remedy = "check it again (docs/hardware/calibration.md)"
-    since = f"since {checked.by} checked it on {checked.on}"
-    if checked.joints != compute_mounting_digest(joints):
-        return f"how its joints are mounted was changed in its file {since}: {remedy}"
+    changed_mounting = _describe_changed_mounting(checked, joints)
+    if changed_mounting:
+        return changed_mounting
     unconfirmed = [name for name in PROPERTIES if name not in checked.confirmed]
     if unconfirmed:
         return (
             f"the check by {checked.by} on {checked.on} did not confirm of every joint: {', '.join(unconfirmed)}: "
-            f"{remedy}"
+            f"{REMEDY}"
         )
+    return _describe_changed_drives(checked, robot)
+
+
+def find_change_since_check(checked: StartCheckRecord, joints: Sequence[Joint], robot: RobotDescription) -> str:
+    """Find what has changed since a check, so that what it confirmed is not valid any more.
+
+    Args:
+        checked: Record of the check.
+        joints: Joints as the robot file describes them now.
+        robot: Description from the host, with the serial numbers that the drives report now.
+
+    Returns:
+        The change as a clause that follows the robot's name, or an empty text if the check is still valid.
+    """
+    return _describe_changed_mounting(checked, joints) or _describe_changed_drives(checked, robot)
+
+
+def _describe_changed_mounting(checked: StartCheckRecord, joints: Sequence[Joint]) -> str:
+    """Return that the file describes joints as mounted in another way than at the check; otherwise an empty text."""
+    if checked.joints == compute_mounting_digest(joints):
+        return ""
+    return f"how its joints are mounted was changed in its file {_format_since(checked)}: {REMEDY}"
+
+
+def _describe_changed_drives(checked: StartCheckRecord, robot: RobotDescription) -> str:
+    """Return which drives are others than at the check; an empty text if none is."""
+    since = _format_since(checked)
     drives_report_serials = any(joint.serial for joint in robot.joints)
     if drives_report_serials or any(checked.serials):
         replaced = _describe_replaced_drives(checked, robot)
         if not replaced:
             return ""
-        return f"{'; '.join(replaced)}: changed {since}: {remedy}"
+        return f"{'; '.join(replaced)}: changed {since}: {REMEDY}"
     if (checked.backend, checked.hardware) != (robot.backend, robot.hardware):
         checked_on = f"{checked.backend} {checked.hardware}"
         now_on = f"{robot.backend} {robot.hardware}"
-        return f"its drives do not report an identity, and it is on {now_on} now, {checked_on} {since}: {remedy}"
+        return f"its drives do not report an identity, and it is on {now_on} now, {checked_on} {since}: {REMEDY}"
     return ""
+
+
+def _format_since(checked: StartCheckRecord) -> str:
+    return f"since {checked.by} checked it on {checked.on}"
 
 
 def _describe_replaced_drives(checked: StartCheckRecord, robot: RobotDescription) -> list[str]:

@@ -128,6 +128,11 @@ class JointMotor(FileStruct, frozen=True, kw_only=True):
     response_time_s: Lag
     """Time constant with which the torque follows its command. 0: at once."""
 
+    latency_s: Lag = 0.0
+    """Time from the tick of a target until the motor follows it. The simulator delays targets by it; emulated drives
+    have the latency of their bus instead. `snakesim robot identify` writes it.
+    """
+
     armature_kg_m2: RotorInertia
     """Inertia of the rotor, as seen at the joint."""
 

@@ -232,6 +232,12 @@ def describe_joints(robot: RobotFile) -> list[JointDescription]:
     return [_describe_joint(joint) for joint in robot.joint_table]
 
 
+def list_serial_numbers(robot: RobotDescription) -> list[str]:
+    """Return the serial number of every drive, tail to head; none if no drive reports one."""
+    serials = [joint.serial for joint in robot.joints]
+    return serials if any(serials) else []
+
+
 def _describe_joint(joint: Joint) -> JointDescription:
     """Return the description of one joint that the HAL publishes."""
     limits = joint.limits

@@ -62,7 +62,7 @@ class BatchedSimulations(SimulationBatch):
         self.torque_nm[robot] = data.actuator_force[: self._joints]
         self._start_rotations[robot] = view_link_rotations(placed)
         self._is_at_start[robot] = True
-        placed.motors.bind_state(MotorArrays(self, robot))
+        placed.motors.bind_state(MotorArrays(self, robot, batch.bind("history")[robot]))
         return True
 
     def _allocate_batch(self, placed: PlacedRobot) -> None:

@@ -101,7 +101,8 @@ class SimulationBatch(ABC):
 class MotorArrays:
     """The arrays of one robot that its motors read and write, with the names that MjData gives them."""
 
-    def __init__(self, simulations: SimulationBatch, robot: int) -> None:
+    def __init__(self, simulations: SimulationBatch, robot: int, history: Floats) -> None:
+        self.history = history
         self.act = simulations.motor_state[robot]
         self.actuator_force = simulations.torque_nm[robot]
         self.ctrl = simulations.motor_inputs[robot]
@@ -141,7 +142,7 @@ class LoopedSimulations(SimulationBatch):
         if len(self._placed) == 1:
             self._bind_views(data)
             return True
-        placed.motors.bind_state(MotorArrays(self, robot))
+        placed.motors.bind_state(MotorArrays(self, robot, data.history))
         self.motor_state[robot] = data.act
         self._copy_state(data, robot)
         return True

@@ -64,6 +64,7 @@ def place_and_settle_robot(
     data.time = 0.0
     data.warning.number[:] = 0
     motors.switch_off()
+    motors.restart_at_time_0()
     physics.reset()
 
 

@@ -7,6 +7,10 @@ By hand, or with one joint at a time:
 `jog`          moves one joint by its motor while a key is held
 `robot_edit`   changes single values of a robot file
 
+With drawn shapes:
+
+`shape`        the person bends the robot into shapes on paper, which decide sign, order, gear and zero of every joint
+
 Joint check, from a run in which each joint moved by its motor:
 
 `check`        prints whether each joint matches its file, and records the check in that file

@@ -13,6 +13,8 @@ from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
+DEFAULT_DRAWING = "shapes.pdf"
+PAPER_NAMES = ("a4", "a3", "letter")
 ROBOT_FILE_HELP = "the robot file that the host was started with, into which the values are written"
 
 
@@ -51,6 +53,12 @@ def _add_calibrate_gear_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DEGREES",
         help="by which you turn each joint, along a template or a set square (default: 45)",
     )
+
+
+def _add_shape_draw_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", metavar="FILE", help="robot file, or name of a shipped one")
+    add_output_argument(parser, f"a .pdf for a printer, or an .svg for a plotter (default: {DEFAULT_DRAWING})")
+    parser.add_argument("--sheet-size", choices=PAPER_NAMES, default="a4", help="size of the sheets (default: a4)")
 
 
 def _add_jog_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,6 +116,18 @@ def _run_calibrate_zero(arguments: argparse.Namespace) -> int:
     return calibrate_zeros(arguments.file, select_robots(arguments), wait_for_enter=not arguments.now)
 
 
+def _run_shape_draw(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.features.commissioning.shape.draw import draw_shapes
+
+    return draw_shapes(arguments.file, arguments.out or Path(DEFAULT_DRAWING), arguments.sheet_size)
+
+
+def _run_shape_check(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.features.commissioning.shape.check import check_shapes
+
+    return check_shapes(arguments.file, select_robots(arguments))
+
+
 def _run_jog(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.jog import JogRequest, jog_joint
 
@@ -115,7 +135,7 @@ def _run_jog(arguments: argparse.Namespace) -> int:
         joint=arguments.joint,
         speed_rad_s=arguments.joint_speed,
         travel_rad=arguments.travel,
-        torque_fraction=arguments.torque_fraction,
+        torque_fraction=arguments.torque,
     )
     return jog_joint(arguments.file, select_robots(arguments), request)
 
@@ -188,6 +208,28 @@ COMMANDS: Commands = (
         add=_add_calibrate_gear_arguments,
         run=_run_calibrate_gear,
         examples=("robot calibrate gear snake.toml", "robot calibrate gear snake.toml joint_3 --degrees 90"),
+    ),
+    CommandGroup(
+        name="robot shape",
+        help="Check signs, ids, gears and zeros of robots without IMUs: bend them into shapes on paper. The motors "
+        "stay off.",
+    ),
+    Command(
+        name="robot shape draw",
+        help="Draw the shapes of a robot in true scale, on sheets of paper or for a plotter.",
+        add=_add_shape_draw_arguments,
+        run=_run_shape_draw,
+        details="No robot has to run.",
+        examples=("robot shape draw snake.toml", "robot shape draw snake.toml --out shapes.svg"),
+    ),
+    Command(
+        name="robot shape check",
+        help="Judge order, sign, gear and zero of every joint while you lay the robot into its shapes.",
+        add=_add_robot_file_argument,
+        run=_run_shape_check,
+        details="Exit code 0: all were confirmed, and recorded in the robot file. 1: one is wrong or unknown. 2: wrong "
+        "input.",
+        examples=("robot shape check snake.toml", "robot shape check snake.toml --namespace snake_2"),
     ),
     Command(
         name="robot jog",

@@ -193,7 +193,7 @@ def calibrate_zeros(path: Path, selection: RobotSelection, *, wait_for_enter: bo
     with _connect_to_disarmed_robot(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
             print_line("Lay the robot straight on a flat floor, take your hands off it, then press Enter.")
-            for _ in robot.read_angles_rad(_is_enter_pressed):
+            for _ in robot.read_angles_rad(is_enter_pressed):
                 pass  # reading continues until Enter is pressed; these samples are not needed
         start_s = time.monotonic()
         samples = list(robot.read_angles_rad(lambda: time.monotonic() - start_s > ZERO_SAMPLING_S))
@@ -309,7 +309,7 @@ def _wait_for_hand_turn(robot: HandMovedRobot, joint: Joint, instruction: str) -
     detector = HandTurnDetector()
     is_instruction_printed = False
     turn: HandTurn | None = None
-    for time_s, angle_rad in robot.read_samples(_is_enter_pressed):
+    for time_s, angle_rad in robot.read_samples(is_enter_pressed):
         turn = detector.add_sample(time_s, angle_rad)
         if turn is not None:
             break
@@ -383,7 +383,7 @@ def _record_travel(robot: HandMovedRobot) -> TravelRange | None:
     travel: TravelRange | None = None
     drawn_line_count = 0
     next_drawing_s = 0.0
-    for angles_rad in robot.read_angles_rad(_is_enter_pressed):
+    for angles_rad in robot.read_angles_rad(is_enter_pressed):
         if travel is None:
             travel = TravelRange(angles_rad)
         travel.add_sample(angles_rad)
@@ -412,7 +412,7 @@ def select_joints(joints: Sequence[Joint], names: Sequence[str], path: Path) -> 
     return [joint_by_name[name] for name in names]
 
 
-def _is_enter_pressed() -> bool:
+def is_enter_pressed() -> bool:
     """Return whether the person has pressed Enter. Raises RefusedError if the terminal is gone."""
     if not select.select([sys.stdin], [], [], 0.0)[0]:
         return False

@@ -16,7 +16,7 @@ from snakesim_hal.model.checked import (
     StartCheckRecord,
     compute_mounting_digest,
 )
-from snakesim_hal.wire.messages import RobotDescription
+from snakesim_hal.model.robot import list_serial_numbers
 from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import (
     SIGNAL_NAMES,
@@ -29,6 +29,7 @@ from snakesim_operator.features.commissioning.robot_edit import (
     require_own_robot_file,
     write_check_record,
 )
+from snakesim_operator.features.commissioning.shape.record import read_shape_properties
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 from snakesim_operator.results.run_log import RunRecord
 
@@ -83,6 +84,10 @@ def report_joint_check(run: Path, robot_file: Path | None, statement: CheckState
         measurements, was_laid_straight=statement.straight, allowed_backlash_rad=statement.allowed_backlash_rad
     )
     verdicts = [verdict.confirm_by_hand(statement.by_hand) for verdict in verdicts]
+    if robot_file is not None:
+        # What drawn shapes confirmed needs no IMU. It counts as long as neither file nor drives have changed.
+        by_shape = read_shape_properties(robot_file, record.config.robot.joint_table, record.description)
+        verdicts = [verdict.confirm_by_shape(by_shape) for verdict in verdicts]
     if as_json:
         print_json({"joints": verdicts})
     else:
@@ -135,6 +140,9 @@ def _format_counts(verdicts: Sequence[JointVerdict]) -> str:
         counts.append(f"{unknown} unknown")
     if by_hand:
         counts.append(f"{by_hand} with properties that you confirmed by hand")
+    by_shape = sum(any(finding.by_shape for finding in verdict.findings.values()) for verdict in verdicts)
+    if by_shape:
+        counts.append(f"{by_shape} with properties that drawn shapes confirmed")
     return "; ".join(counts)
 
 
@@ -195,9 +203,10 @@ def _write_check_record(
         joints=compute_mounting_digest(joints),
         backend=robot.backend,
         hardware=robot.hardware,
-        serials=_list_serial_numbers(robot),
+        serials=list_serial_numbers(robot),
         confirmed=list(PROPERTIES),
         by_hand=_group_joints_confirmed_by_hand(verdicts),
+        by_shape=_list_properties_confirmed_by_shape(verdicts),
         straight=statement.straight,
         allowed_backlash_rad=statement.allowed_backlash_rad,
     )
@@ -207,10 +216,9 @@ def _write_check_record(
     )
 
 
-def _list_serial_numbers(robot: RobotDescription) -> list[str]:
-    """Return the serial number of every drive; none if no drive has one."""
-    serials = [joint.serial for joint in robot.joints]
-    return serials if any(serials) else []
+def _list_properties_confirmed_by_shape(verdicts: Sequence[JointVerdict]) -> list[JointProperty]:
+    """Return the properties that drawn shapes confirmed, of any joint: they have confirmed them of every joint."""
+    return [name for name in PROPERTIES if any(verdict.findings[name].by_shape for verdict in verdicts)]
 
 
 def _group_joints_confirmed_by_hand(verdicts: Sequence[JointVerdict]) -> dict[JointProperty, list[str]]:

@@ -36,7 +36,6 @@ class JointIdentification:
     joint: str
     fields: Mapping[str, IntervalEstimate]  # fields of the robot file; those that could not be identified are missing
     unknown: Sequence[str]  # why fields are missing
-    latency_s: IntervalEstimate | None = None
     bandwidth_hz: float | None = None
     balance: TorqueBalance | None = None
     servo: ServoResponse | None = None
@@ -201,7 +200,6 @@ def _identify_joint(
         joint=name,
         fields=fields,
         unknown=unknown,
-        latency_s=servo.latency_s,
         bandwidth_hz=estimate_bandwidth_hz(record),
         balance=balance,
         servo=servo,
@@ -221,6 +219,7 @@ def _collect_robot_file_fields(
         "stiffness_nm_per_rad": servo.stiffness_nm_per_rad.multiply_by(scale),
         "damping_nm_s_per_rad": servo.damping_nm_s_per_rad.multiply_by(scale),
         "response_time_s": servo.response_time_s,
+        "latency_s": servo.latency_s,
     }
     if torque_constant_nm_per_a is not None:
         fields["torque_constant_nm_per_a"] = scale.scale_by(torque_constant_nm_per_a)

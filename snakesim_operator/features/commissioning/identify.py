@@ -32,6 +32,7 @@ LABEL_AND_UNIT_BY_FIELD = {  # fields of the robot file -> name and unit
     "stiffness_nm_per_rad": ("servo stiffness", "N·m/rad"),
     "damping_nm_s_per_rad": ("servo damping", "N·m·s/rad"),
     "response_time_s": ("response time", "s"),
+    "latency_s": ("latency", "s"),
 }
 
 
@@ -124,8 +125,6 @@ def _print_joint(result: JointIdentification) -> None:
     for field, estimate in result.fields.items():
         name, unit = LABEL_AND_UNIT_BY_FIELD[field]
         print_line(f"  {name:<17} {_format_interval(estimate)} {unit}")
-    if result.latency_s is not None:
-        print_line(f"  {'latency':<17} {_format_interval(result.latency_s)} s")
     if result.bandwidth_hz is not None:
         print_line(f"  {'servo bandwidth':<17} {result.bandwidth_hz:.3g} Hz, of this joint with what it carries")
     for reason in result.unknown:
@@ -147,7 +146,7 @@ def _write_robot_file(path: Path, record: RunRecord, results: Sequence[JointIden
     values: dict[str, dict[str, Any]] = {}
     for result in results:
         if result.fields and not result.fails:
-            # An estimate of a small friction may be below zero, which no robot file may hold.
+            # An estimate of a small friction or latency may be below zero, which no robot file may hold.
             values[result.joint] = {field: max(estimate.value, 0.0) for field, estimate in result.fields.items()}
     unchanged = [result.joint for result in results if result.joint not in values]
     if not values:

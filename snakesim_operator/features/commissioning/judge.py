@@ -49,13 +49,17 @@ class PropertyFinding:
     state: PropertyState
     reason: str = ""  # what is wrong and what to write, or why it is unknown and how it could be confirmed
     by_hand: bool = False  # confirmed by a person
+    by_shape: bool = False  # confirmed by drawn shapes
 
 
 CONFIRMED = PropertyFinding("confirmed")
 NO_MOTION = "it did not move; correct its drive, and run the check again"
 NO_END = "its motion did not come: the run ended before; run the check again with a longer --duration"
 NO_LINK_TURNS = "no link turns with it; correct its gear, and run the check again"
-NO_LINK = "the links on both sides need an IMU or motion capture, at 30 Hz or more; or "
+NO_LINK = (
+    "the links on both sides need an IMU or motion capture, at 30 Hz or more; or check the robot with "
+    "`snakesim robot shape check`; or "
+)
 CONFIRM_DIRECTION_BY_HAND = NO_LINK + "turn it with `snakesim robot calibrate direction`, then add --by-hand"
 CONFIRM_GEAR_BY_HAND = NO_LINK + "measure it with `snakesim robot calibrate gear`, then add --gear-by-hand"
 NO_REST = "the robot did not rest before the first motion; run the check again"
@@ -98,10 +102,17 @@ class JointVerdict:
         Args:
             properties: The properties that the person confirms; a property that was judged wrong stays wrong.
         """
+        return self._confirm_unknown(properties, PropertyFinding("confirmed", by_hand=True))
+
+    def confirm_by_shape(self, properties: Iterable[JointProperty]) -> "JointVerdict":
+        """Return a copy in which drawn shapes have confirmed those of the properties that were unknown."""
+        return self._confirm_unknown(properties, PropertyFinding("confirmed", by_shape=True))
+
+    def _confirm_unknown(self, properties: Iterable[JointProperty], finding: PropertyFinding) -> "JointVerdict":
         findings = dict(self.findings)
         for name in properties:
             if findings[name].state == "unknown":
-                findings[name] = PropertyFinding("confirmed", by_hand=True)
+                findings[name] = finding
         return replace(self, findings=findings)
 
 

@@ -30,11 +30,11 @@ def require_own_robot_file(path: Path) -> None:
 
 
 def read_joints_with_drive_modes(path: Path, running: Sequence[Joint]) -> list[Joint]:
-    """Read the joints of a robot file, without the control modes that the drives of the running host do not have.
+    """Read the joints of a robot file, without the modes and measurements that the drives of the host do not have.
 
     Args:
         path: Path of the robot file.
-        running: Joints of the running host; its backend leaves out the modes that its drives do not have.
+        running: Joints of the running host; its backend leaves out what its drives do not have.
 
     Returns:
         The joints of the file, tail to head.
@@ -45,7 +45,8 @@ def read_joints_with_drive_modes(path: Path, running: Sequence[Joint]) -> list[J
     joints = decode_table(read_table_with_base(str(path), "robots"), RobotFile).joint_table
     for i, (in_file, on_host) in enumerate(zip(joints, running, strict=False)):
         modes = [mode for mode in in_file.drive.modes if mode in on_host.drive.modes]
-        drive = msgspec.structs.replace(in_file.drive, modes=modes or in_file.drive.modes)
+        measures = [quantity for quantity in in_file.drive.measures if quantity in on_host.drive.measures]
+        drive = msgspec.structs.replace(in_file.drive, modes=modes or in_file.drive.modes, measures=measures)
         joints[i] = dataclasses.replace(in_file, drive=drive)
     return joints
 

@@ -9,6 +9,7 @@ import pytest
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 FIELDS = {"friction_nm": 0.15, "viscous_nm_s_per_rad": 0.1, "armature_kg_m2": 0.005, "response_time_s": 0.01}
+PERIOD_S = 0.005  # of the shipped scenario
 WITHIN = {"viscous_nm_s_per_rad": 0.2}  # of the truth; the others 0.1
 ROBOT = """extends = "planar13"
 name = "suspended"
@@ -43,6 +44,7 @@ def test_hidden_parameters_are_found_and_written_down(tmp_path: Path) -> None:
     for name, of in truth.items():
         for field, value in of.items():
             assert abs(found[name][field] / value - 1) < WITHIN.get(field, 0.1), f"{name} {field}: {found[name]}, {of}"
+        assert abs(found[name]["latency_s"] - PERIOD_S) < 0.2 * PERIOD_S  # modules follow a target at the next Sync
     assert "Torque of joint_3, measured" in (tmp_path / "run" / "identified.html").read_text()
 
 

@@ -101,8 +101,13 @@ def test_every_number_has_a_name_a_unit_and_bounds() -> None:
 
 @pytest.mark.parametrize(
     "more",
-    [{}, {"set": {"backend": "can"}}, pytest.param({"set": {"robot": "planar13_camera"}}, marks=pytest.mark.slow)],
-    ids=["simulator", "emulated modules", "with a camera"],
+    [
+        {},
+        {"set": {"robot.motor.latency_s": 0.007}},
+        {"set": {"backend": "can"}},
+        pytest.param({"set": {"robot": "planar13_camera"}}, marks=pytest.mark.slow),
+    ],
+    ids=["simulator", "motors with a latency", "emulated modules", "with a camera"],
 )
 def test_an_episode_is_the_run_of_its_actions(more: dict[str, Any]) -> None:
     """To the bit, behind the same limiter and with the same latency."""
@@ -242,6 +247,26 @@ def test_many_at_once_are_what_each_is_alone(mode: str | None) -> None:
     assert not nothing.any()
     assert not after["time_s"].any()  # reset, as by Gymnasium's own
     assert again.shape == seen.shape
+
+
+def test_many_with_a_latency_of_motors_are_what_each_is_alone() -> None:
+    late = {"duration": 0.3, "set": {"robot.motor.latency_s": 0.007}}
+    envs = gymnasium.make_vec("SnakeSIM/Scenario-v0", num_envs=2, scenario="triplet", **late)
+    envs.reset(seed=1)
+    truncated = np.zeros(2, dtype=bool)
+    infos: dict[str, Any] = {}
+    step = 0
+    while not truncated.all():
+        step += 1
+        _, _, _, truncated, infos = envs.step(np.full((2, 13), 0.2 * (-1) ** step))
+    envs.close()
+    for seed in (1, 2):
+        alone = made(**late)
+        alone.reset(seed=seed)
+        info: dict[str, Any] = {}
+        for number in range(1, step + 1):
+            _, _, _, _, info = alone.step(np.full(13, 0.2 * (-1) ** number))
+        assert info["digest"] == infos["digest"][seed - 1]
 
 
 def test_many_say_what_is_wrong() -> None:

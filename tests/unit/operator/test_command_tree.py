@@ -18,6 +18,7 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
     *("start host", "start service", "start preview", "start ros2", "start router"),
     *("robot arm", "robot disarm", "robot reset", "robot export", "robot jog"),
     *("robot calibrate zero", "robot calibrate direction", "robot calibrate limits", "robot calibrate gear"),
+    *("robot shape draw", "robot shape check"),
     *("param set", "fault inject", "sim pause", "sim resume", "sim step", "sim speed", "sim reset"),
     *(
         "drive emulate can",

@@ -147,3 +147,53 @@ def test_a_body_that_is_not_as_its_file_says():
         build_sim_model(make_config(), SimSettings(mass_scale=scale)).model.body_mass.sum() for scale in (1.0, 2.0)
     )
     assert heavy == pytest.approx(2 * light)
+
+
+LATENCY_S = 0.005
+LATE = {**HEAVY_ROTOR, "motor": {**HEAVY_ROTOR["motor"], "latency_s": LATENCY_S}}
+
+
+def test_a_motor_with_latency_follows_a_target_that_much_later():
+    prompt = fast_run(HEAVY_ROTOR)
+    late = fast_run(LATE)
+    for run in (prompt, late):
+        run.command(JointMode.POSITION, 0.0)
+        run.advance(0.02)
+        run.command(JointMode.POSITION, 0.1)
+    torques = {"prompt": [], "late": []}
+    for _ in range(20):
+        prompt.advance()
+        late.advance()
+        torques["prompt"].append(torque(prompt))
+        torques["late"].append(torque(late))
+    steps = round(LATENCY_S / 0.001)
+    assert torques["late"][:steps] == pytest.approx([0.0] * steps, abs=1e-6)
+    assert torques["late"][steps:] == pytest.approx(torques["prompt"][:-steps], rel=1e-3)
+
+
+def test_a_motor_with_latency_changes_its_mode_at_once_and_never_follows_an_older_target():
+    run = fast_run(LATE)
+    run.command(JointMode.TORQUE, 2.0)
+    run.advance()
+    assert torque(run) > 0.1
+    run.command(JointMode.POSITION, 0.0)
+    run.advance(0.1)
+    assert torque(run) == pytest.approx(0.0, abs=0.05)
+    run.command(JointMode.TORQUE, 2.0)
+    run.advance(0.1)
+    run.command(JointMode.PASSIVE)
+    run.advance()
+    assert torque(run) == pytest.approx(2.0 * np.exp(-0.001 / RESPONSE_S), rel=1e-3)
+
+
+def test_latency_of_single_joints_may_differ():
+    joints = {"joint_2": {"latency_s": 0.003}}
+    run = fast_run({"chain": {"modules": 2}, "motor": {"response_time_s": RESPONSE_S}, "joints": joints})
+    run.command(JointMode.TORQUE, 0.0)
+    run.advance(0.01)
+    run.command(JointMode.TORQUE, 0.5)
+    for step in range(4):
+        run.advance()
+        torques_nm = run.sim.true_state().torques_nm
+        assert torques_nm[0] > 0.01
+        assert bool(torques_nm[1] > 0.01) is (step >= 3)

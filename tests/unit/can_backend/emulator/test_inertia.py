@@ -1,5 +1,7 @@
 """The physics model without a world."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from snakesim_testing.can.driver_loop import config
 INERTIA = 0.005 + 0.2 * 0.1**2 / 12  # of the middle joints of the test robot
 
 
-def physics_model(**settings: float) -> InertiaModel:
+def physics_model(**settings: Any) -> InertiaModel:
     return InertiaModel(config(3), InertiaSettings(**{"drag_nm": 0.0, **settings}))
 
 

@@ -1,0 +1,87 @@
+"""Writes the properties that drawn shapes confirmed into the robot file, and reads which of them are still valid."""
+
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+
+from snakesim_hal.base.process import get_user_name
+from snakesim_hal.base.terminal import print_line
+from snakesim_hal.model.checked import (
+    PROPERTIES,
+    JointProperty,
+    StartCheckRecord,
+    compute_mounting_digest,
+    find_change_since_check,
+)
+from snakesim_hal.model.files import decode_table, read_table_with_base
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot import RobotFile, list_serial_numbers
+from snakesim_hal.wire.messages import RobotDescription
+from snakesim_operator.features.commissioning.robot_edit import write_check_record
+from snakesim_operator.features.commissioning.shape.decide import SHAPE_PROPERTIES
+
+
+def write_shape_record(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> None:
+    """Write into a robot file that drawn shapes confirmed order, sign, gear and zero of every joint.
+
+    A robot whose drives are emulated gets no record. Properties of an earlier check that is still valid stay.
+
+    Args:
+        path: Path of the robot file.
+        joints: Joints of the file, with the modes that their drives have.
+        robot: Description of the robot, with the serial numbers of its drives.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    if robot.emulated:
+        print_line(f"{path}: nothing was written: the drives are emulated, and need no check")
+        return
+    confirmed: set[JointProperty] = {*SHAPE_PROPERTIES, *_read_confirmed_properties(path, joints, robot)}
+    record = StartCheckRecord(
+        by=get_user_name(),
+        on=date.today().isoformat(),
+        joints=compute_mounting_digest(joints),
+        backend=robot.backend,
+        hardware=robot.hardware,
+        serials=list_serial_numbers(robot),
+        confirmed=[name for name in PROPERTIES if name in confirmed],
+        by_shape=list(SHAPE_PROPERTIES),
+    )
+    write_check_record(path, record)
+    missing = [name for name in PROPERTIES if name not in confirmed]
+    if missing:
+        print_line(
+            f"{path}: {', '.join(SHAPE_PROPERTIES)} recorded. To confirm {', '.join(missing)}, restart the host, make "
+            f"a run with `snakesim run joint_check`, and judge it with `snakesim robot check RUN --write {path}`"
+        )
+    else:
+        print_line(f"{path}: checked by {record.by} on {record.on}; restart the host with it")
+
+
+def read_shape_properties(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> list[JointProperty]:
+    """Return the properties that drawn shapes confirmed, if neither the mounting nor a drive has changed since.
+
+    Args:
+        path: Path of the robot file.
+        joints: Joints of the robot now.
+        robot: Description of the robot, with the serial numbers of its drives now.
+
+    Raises:
+        ConfigError: The file cannot be read.
+    """
+    record = _read_valid_record(path, joints, robot)
+    return list(record.by_shape) if record is not None else []
+
+
+def _read_confirmed_properties(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> list[JointProperty]:
+    record = _read_valid_record(path, joints, robot)
+    return list(record.confirmed) if record is not None else []
+
+
+def _read_valid_record(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> StartCheckRecord | None:
+    """Return the record of the last check, unless the mounting of a joint or a drive has changed since."""
+    record = decode_table(read_table_with_base(str(path), "robots"), RobotFile).checked
+    if record is None or find_change_since_check(record, joints, robot):
+        return None
+    return record

@@ -1,0 +1,97 @@
+"""A robot whose emulated drives a scripted operator bends into drawn shapes, and `snakesim robot shape check` asks for.
+
+The drives are emulated in the process of the host. A file has the pose into which a hand bends them.
+"""
+
+import re
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.files import decode_table, read_table_with_base
+from snakesim_hal.model.robot import RobotFile
+from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD, design_poses
+from snakesim_testing.runs.bench import lab_folder
+from snakesim_testing.runs.command import run_in_background
+
+JOINTS = 4
+POSE_FILE = "pose.txt"
+SCENARIO = """
+robot = "./snake.toml"
+scene = "flat"
+controller = "hold"
+clock_mode = "realtime"
+rate_hz = 50
+seed = 1
+
+[start]
+on_route = false
+
+[services.control]
+latency_ticks = 2
+
+[backends."{backend}"]
+physics_model = "inertia"
+physics_model_settings = {{ hand_file = "pose.txt" }}
+"""
+REAL = '''
+import msgspec
+
+from snakesim_serial_backend.feetech.backend import FeetechBackend
+
+
+class Real(FeetechBackend):
+    """Emulated servos, described as real ones. They have no IMU and report no serial numbers."""
+
+    def describe(self):
+        described = super().describe()
+        return msgspec.structs.replace(described, emulated=False, hardware="/dev/ttyACM0")
+'''
+
+
+def make_bent_folder(folder: Path, backend: str) -> Path:
+    """A lab's folder: a robot without IMUs, its scenario, and a backend whose emulated servos look real."""
+    return lab_folder(folder, JOINTS, SCENARIO.format(backend=backend), {"real.py": REAL})
+
+
+class ScriptedOperator:
+    """Bends the emulated robot as `snakesim robot shape check` asks, within the tolerance of a person."""
+
+    def __init__(self, home: Path, endpoint: str, drive_order: Sequence[int] = range(JOINTS)) -> None:
+        """Prepare to check the robot of a folder.
+
+        Args:
+            home: The folder.
+            endpoint: Endpoint of the robot's host.
+            drive_order: For each drive, the index of the joint on which it really is.
+        """
+        self._home = home
+        self._endpoint = endpoint
+        self._drive_order = list(drive_order)
+        robot = decode_table(read_table_with_base(str(home / "snake.toml"), "robots"), RobotFile)
+        self._poses = {pose.name: pose for pose in design_poses(robot.joint_table)}
+        self._rng = np.random.default_rng(1)
+
+    def check(self) -> tuple[int, str]:
+        """Answer every request of the check; return its exit code, and all that it printed."""
+        arguments = ("robot", "shape", "check", "snake.toml", "--endpoint", self._endpoint)
+        with run_in_background(self._home, *arguments, stdin=subprocess.PIPE) as process:
+            assert process.stdout is not None and process.stdin is not None
+            printed: list[str] = []
+            for line in process.stdout:
+                printed.append(line)
+                if "Then press Enter" in line:
+                    found = re.search(r"into shape (\w)", line)
+                    self._bend(self._poses["straight" if found is None else found[1]].angle_rad)
+                    process.stdin.write("\n")
+                    process.stdin.flush()
+            return process.wait(20), "".join(printed)
+
+    def _bend(self, drawn_rad: Floats) -> None:
+        placed_rad = drawn_rad + self._rng.uniform(-1.0, 1.0, len(drawn_rad)) * 0.9 * PLACEMENT_TOLERANCE_RAD
+        text = " ".join(f"{placed_rad[joint]:.4f}" for joint in self._drive_order)
+        (self._home / "new.txt").write_text(text)
+        (self._home / "new.txt").replace(self._home / POSE_FILE)

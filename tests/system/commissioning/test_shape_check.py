@@ -1,0 +1,92 @@
+"""`snakesim robot shape draw` and `check`: robots without IMUs, whose emulated drives an operator bends into shapes."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD
+from snakesim_testing.harness.endpoint import find_free_endpoint
+from snakesim_testing.runs.bench import host
+from snakesim_testing.runs.bent_robot import JOINTS, ScriptedOperator, make_bent_folder
+from snakesim_testing.runs.command import CompletedRun
+from snakesim_testing.runs.command import snakesim as run_snakesim
+from snakesim_testing.runs.in_process_command import snakesim
+
+DRIVE_TYPES = [
+    "feetech",
+    "odrive",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("can", "cia402", "dynamixel", "moteus")),
+]
+MOUNTED = """
+[backends.{backend}.mounted.joint_1]
+sign = -1
+
+[backends.{backend}.mounted.joint_2]
+zero_rad = 0.2
+"""
+REAL = ("--backend", "./real.py:Real")
+
+
+@pytest.mark.parametrize("backend", DRIVE_TYPES)
+def test_faults_of_robot_without_imus_are_named_on_every_drive_type(tmp_path: Path, backend: str) -> None:
+    home = make_bent_folder(tmp_path, backend)
+    with (home / "bench.toml").open("a") as scenario:
+        scenario.write(MOUNTED.format(backend=backend))
+    with host(home, backend) as endpoint:
+        code, printed = ScriptedOperator(home, endpoint, drive_order=(0, 1, 3, 2)).check()
+    assert code == 1, printed
+    lines = {line.split()[0]: line for line in printed.splitlines() if line.startswith("joint_")}
+    assert "sign wrong: turns the other way: sign = -1" in lines["joint_1"]
+    off_by_rad = re.search(r"zero wrong: its zero is off by ([+-]\d.\d+) rad", lines["joint_2"])
+    assert off_by_rad is not None
+    assert abs(float(off_by_rad[1]) - 0.2) < PLACEMENT_TOLERANCE_RAD
+    assert "order wrong: exchanged with joint_4: id = 4" in lines["joint_3"]
+    assert "order wrong: exchanged with joint_3: id = 3" in lines["joint_4"]
+    assert "0 of 4 joints match the robot file; 4 wrong; 0 unknown" in printed
+    assert "[checked]" not in (home / "snake.toml").read_text()
+
+
+def start(home: Path, out: str, *words: str) -> CompletedRun:
+    flags = (*REAL, "--out", out, "--endpoint", find_free_endpoint(), "--set", "clock_mode=lockstep")
+    return run_snakesim("run", "bench.toml", *flags, *words, cwd=home)
+
+
+def test_robot_without_imus_can_be_armed_after_shapes_and_start_check(tmp_path: Path) -> None:
+    home = make_bent_folder(tmp_path, "Real")
+    with host(home, "./real.py:Real") as endpoint:
+        code, printed = ScriptedOperator(home, endpoint).check()
+    assert code == 0, printed
+    assert f"{JOINTS} of {JOINTS} joints match the robot file; 0 wrong; 0 unknown" in printed
+    assert 'by_shape = ["order", "sign", "gear", "zero"]' in (home / "snake.toml").read_text()
+    refused = start(home, "never", "--duration", "0.1")
+    assert refused.code == 1
+    assert "did not confirm of every joint: drive" in refused.out
+
+    checking = start(home, "check", "--controller", "joint_check", "--duration", "6")
+    assert checking.code == 0, checking.out
+    judged = snakesim("robot", "check", "check", "--write", "snake.toml", cwd=home)
+    assert judged.code == 0, judged.out
+    assert f"{JOINTS} with properties that drawn shapes confirmed" in judged.out
+    assert start(home, "moves", "--duration", "0.1").code == 0
+
+    # The shapes count for the mounting that was checked.
+    text = (home / "snake.toml").read_text()
+    (home / "snake.toml").write_text(f"{text}\n[joints.joint_2]\nsign = -1\n")
+    assert "was changed in its file since" in start(home, "changed", "--duration", "0.1").out
+
+
+def test_drawing_of_shapes_is_printable_and_names_what_stays_unknown(tmp_path: Path) -> None:
+    drawn = snakesim("robot", "shape", "draw", "planar13", "--out", "shapes.pdf", cwd=tmp_path)
+    assert drawn.code == 0, drawn.err
+    assert "shapes A, B, C, drawing " in drawn.out
+    assert (tmp_path / "shapes.pdf").read_bytes().startswith(b"%PDF-1.4")
+    stiff = '\nextends = "planar13"\n[joints.joint_2]\nangle_rad = 0.05\n[joints.joint_3]\nangle_rad = 0.3\n'
+    (tmp_path / "stiff.toml").write_text(stiff)
+    drawn = snakesim("robot", "shape", "draw", "stiff.toml", "--out", "shapes.svg", cwd=tmp_path)
+    assert drawn.code == 0, drawn.err
+    assert "joint_2: order, sign, gear, zero will stay unknown: its limits let the shapes bend it by" in drawn.out
+    assert "joint_3: gear will stay unknown" in drawn.out
+    refused = snakesim("robot", "shape", "draw", "planar13", "--out", "shapes.txt", cwd=tmp_path)
+    assert refused.code == 2
+    assert ".pdf" in refused.err
