@@ -15,6 +15,7 @@ from snakesim_hal.model.plugins import decode_plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_sim_backend.model.build import FOOT_GROUP, build_sim_model, view_joint_states
 from snakesim_sim_backend.model.ground import GROUND, HILLS, PLANE_GROUP
+from snakesim_sim_backend.model.pipes import is_roof
 from snakesim_sim_backend.sensors.rendered import open_gl_context
 from snakesim_sim_backend.settings import SimSettings
 
@@ -31,6 +32,7 @@ EVEN_LINK_COLOR = (0.20, 0.36, 0.54, 1.0)
 ODD_LINK_COLOR = (0.30, 0.48, 0.68, 1.0)
 HEAD_COLOR = (0.09, 0.18, 0.33, 1.0)
 OBSTACLE_COLOR = (0.80, 0.67, 0.47, 1.0)
+ROOF_COLOR = (0.80, 0.67, 0.47, 0.15)  # of a pipe, so that the snake is seen in it
 FLOOR_COLOR = (0.90, 0.91, 0.93, 1.0)
 GRID_COLOR = (0.62, 0.66, 0.72, 1.0)
 BACKGROUND = (236, 240, 244)  # beyond the scene, as bytes
@@ -92,10 +94,10 @@ class FollowCamera:
         first_joint_body = self._sim.first_link_body + 1
         joint_bodies = slice(first_joint_body, first_joint_body + config.robot.chain.modules)
         length_m = float(self._model.body_pos[joint_bodies, 0].sum())  # of all links but the head
-        self._camera = mujoco.MjvCamera()
-        self._camera.azimuth = AZIMUTH_DEG
-        self._camera.elevation = ELEVATION_DEG
-        self._camera.distance = CAMERA_DISTANCE_RATIO * length_m
+        self.camera = mujoco.MjvCamera()
+        self.camera.azimuth = AZIMUTH_DEG
+        self.camera.elevation = ELEVATION_DEG
+        self.camera.distance = CAMERA_DISTANCE_RATIO * length_m
 
         # Buffers.
         self._frame = mujoco.MjrRect(0, 0, width, height)
@@ -123,11 +125,11 @@ class FollowCamera:
         joint_angles_rad[:] = angles_rad
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
-        self._camera.lookat[:] = look_at_w
+        self.camera.lookat[:] = look_at_w
 
         self._gl.make_current()
         categories = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, categories, self._scene)
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self.camera, categories, self._scene)
         self._add_sunlight(look_at_w)
         if self._is_flat:
             self._add_grid(look_at_w)
@@ -152,6 +154,9 @@ class FollowCamera:
         """Set the colors of robot, obstacles and ground, which differ from those that the robot's cameras see."""
         colors = self._model.geom_rgba
         colors[:] = OBSTACLE_COLOR
+        for geom in range(self._model.ngeom):
+            if is_roof(self._model.geom(geom).name, int(self._model.geom_group[geom])):
+                colors[geom] = ROOF_COLOR
         tail_body = self._sim.first_link_body
         head_body = tail_body + joints
         for body in range(tail_body, head_body + 1):

@@ -115,6 +115,11 @@ class PassiveWheels(FileStruct, frozen=True, kw_only=True):
     tire_friction: Friction | None = None
     """Coulomb friction of the tires when they slide sideways; none: the `friction` of the surface."""
 
+    separate_limits: bool = False
+    """True: rolling does not reduce the friction of the tires sideways, as of wheels that really turn. False: wheels
+    slide by the law of scales.
+    """
+
     def __post_init__(self) -> None:
         """Check that the bearing fits into the wheel. Raises ValueError, which the file reader explains."""
         if self.bearing_radius_m >= self.radius_m:

@@ -12,6 +12,8 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.outlines import CapsuleOutline, ObstacleOutlines
+from snakesim_hal.model.pipes import get_pipe_name, make_pipe_block, validate_pipes
+from snakesim_hal.model.platforms import Platform, count_platforms, make_platforms
 from snakesim_hal.model.random_field import (
     MAX_RANDOM_OBSTACLES,
     RandomField,
@@ -19,7 +21,7 @@ from snakesim_hal.model.random_field import (
     sample_materials_and_leans,
 )
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scene import Box, Cylinder, PegsAlongRoute, SceneFile, Sphere, Step, Wall, make_route
+from snakesim_hal.model.scene import Box, Cylinder, PegsAlongRoute, SceneFile, Sphere, Wall, make_route
 from snakesim_hal.model.solids import SolidObstacle, UprightSolid, get_material_fields, make_block, make_peg
 from snakesim_hal.wire.messages import KnownObstacle
 
@@ -32,7 +34,7 @@ class PlacedObstacle(UprightSolid, frozen=True, kw_only=True):
     """A placed obstacle, with parameters that only the simulator needs."""
 
     obstacle: KnownObstacle
-    walkable: bool = False  # a step: part of the ground, so the snake does not push off from it
+    walkable: bool = False  # a step or platform: part of the ground, so the snake does not push off from it
 
 
 def place_scene_obstacles(scene: SceneFile, keep_clear: list[CapsuleOutline] | None = None) -> list[PlacedObstacle]:
@@ -52,7 +54,7 @@ def place_scene_obstacles(scene: SceneFile, keep_clear: list[CapsuleOutline] | N
         *(_place_box(i, box) for i, box in enumerate(scene.box)),
         *(_place_sphere(i, sphere) for i, sphere in enumerate(scene.sphere)),
         *(_place_wall(scene, i, wall) for i, wall in enumerate(scene.wall)),
-        *(_place_step(i, step) for i, step in enumerate(scene.step)),
+        *(_place_platform(platform) for platform in make_platforms(scene)),
     ]
     route = make_route(scene)
     for i, row in enumerate(scene.pegs_along_route):
@@ -63,10 +65,16 @@ def place_scene_obstacles(scene: SceneFile, keep_clear: list[CapsuleOutline] | N
     return placed
 
 
+def outline_pipes(scene: SceneFile) -> list[PlacedObstacle]:
+    """Return the pipes of a scene as blocks with their outlines from above, for drawings."""
+    return [PlacedObstacle(obstacle=make_pipe_block(i, pipe), walkable=True) for i, pipe in enumerate(scene.pipe)]
+
+
 def _validate_obstacle_count(scene: SceneFile) -> None:
     """Raise ConfigError if the scene has more obstacles than a message can hold."""
-    single_obstacles = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
+    single_obstacles = (scene.cylinder, scene.box, scene.sphere, scene.wall)
     count = sum(len(obstacles) for obstacles in single_obstacles)
+    count += count_platforms(scene)
     count += sum(row.count for row in scene.pegs_along_route)
     count += sum(min(field.target_count, MAX_RANDOM_OBSTACLES) for field in scene.random_field)
     if count > MAX_OBSTACLES:
@@ -76,8 +84,9 @@ def _validate_obstacle_count(scene: SceneFile) -> None:
 
 
 def _validate_unique_names(scene: SceneFile, placed: list[PlacedObstacle]) -> None:
-    """Raise ConfigError if two obstacles have the same name."""
+    """Raise ConfigError if two obstacles or pipes have the same name."""
     counts = Counter(item.obstacle.name for item in placed)
+    counts.update(get_pipe_name(i, pipe) for i, pipe in enumerate(scene.pipe))
     duplicates = sorted(name for name, count in counts.items() if count > 1)
     if duplicates:
         raise ConfigError(
@@ -132,15 +141,13 @@ def _place_wall(scene: SceneFile, index: int, wall: Wall) -> PlacedObstacle:
     return _add_material(obstacle, wall)
 
 
-def _place_step(index: int, step: Step) -> PlacedObstacle:
-    name = step.name or f"step_{index}"
-    size_m = (*step.size_m, step.height_m)
-    platform = make_block(name, step.position_m, size_m, step.yaw_rad)
+def _place_platform(platform: Platform) -> PlacedObstacle:
+    surface = platform.surface
     return PlacedObstacle(
-        obstacle=platform,
-        friction=step.friction,
-        forward_friction=step.forward_friction,
-        backward_friction=step.backward_friction,
+        obstacle=platform.block,
+        friction=surface.friction,
+        forward_friction=surface.forward_friction,
+        backward_friction=surface.backward_friction,
         walkable=True,
     )
 
@@ -214,6 +221,7 @@ def validate_start_clearance(scene: SceneFile, placed: list[PlacedObstacle], sna
     Raises:
         ConfigError: An obstacle overlaps a link. The error names both, and how far they overlap.
     """
+    validate_pipes(scene, snake)
     height_m = max(link.radius_m for link in snake)
     obstacles = [_move_to_height(item, height_m) for item in placed if not item.walkable]
     overlaps_m = _compute_overlaps_m(snake, obstacles)

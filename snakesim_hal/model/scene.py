@@ -11,11 +11,13 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.fluid import Fluid
 from snakesim_hal.model.friction import Surface, ViscousFriction
 from snakesim_hal.model.outlines import Coordinate, Friction, Heading, Point, Size
 from snakesim_hal.model.random_field import RandomField
 from snakesim_hal.model.route import Route, sample_sine_curve
 from snakesim_hal.model.solids import GRAVITY_M_S2, SolidObstacle, UprightSolid
+from snakesim_hal.model.terrain import Gaps, Pipe, Stairs
 from snakesim_hal.wire.quantities import Name, Vector, above, from_zero
 
 MAX_SLOPE_RAD = 0.7854  # 45 degrees
@@ -215,6 +217,9 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     gravity_m_s2: Annotated[float, above(30, "m/s²")] = GRAVITY_M_S2
     """Acceleration of gravity, such as 1.62 on the Moon."""
 
+    fluid: Fluid | None = None
+    """Fluid in which the snake swims. None: there is none."""
+
     reference_robot: ReferenceRobot | None = None
     """Body that the scene was laid out for, and in proportion to which it is scaled. None: it is the same for every
     robot.
@@ -238,6 +243,15 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
 
     step: list[Step] = []
     """Low platforms that the snake may lie on or climb, each an entry `[[step]]`."""
+
+    stairs: list[Stairs] = []
+    """Flights of stairs, each an entry `[[stairs]]`."""
+
+    gaps: list[Gaps] = []
+    """Rows of platforms with gaps between them, each an entry `[[gaps]]`."""
+
+    pipe: list[Pipe] = []
+    """Pipes, each an entry `[[pipe]]`."""
 
     pegs_along_route: list[PegsAlongRoute] = []
     """Rows of pegs beside the route, each an entry `[[pegs_along_route]]`."""

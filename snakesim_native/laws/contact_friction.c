@@ -94,6 +94,8 @@ static Rubbing rub(const mjModel* m, const mjData* d, const Chain* chain, const 
     rubbing.stretch[i] = contact->stretch[i] + slip[i];
   }
   project_to_tangent(rubbing.stretch, contact->normal);
+  mjtNum stretch[3];
+  mju_copy3(stretch, rubbing.stretch);
 
   // s, and k s + d ds
   mjtNum scale = limit_scale(contact->max_friction, k * compute_length(rubbing.stretch));
@@ -108,12 +110,19 @@ static Rubbing rub(const mjModel* m, const mjData* d, const Chain* chain, const 
     rubbing.force[i] = scale * rubbing.force[i];
   }
   Coefficients coefficients = {contact->max_friction, contact->forward,       contact->backward,
-                               contact->sideways,     contact->viscous_along, contact->viscous_across};
+                               contact->sideways,     contact->viscous_along, contact->viscous_across,
+                               contact->separate_limits};
   if (is_directional(&coefficients)) {
     int body = (int)contact->link_body;
     mjtNum axis[3];
     find_axis(d, body, find_neighbor(m, chain, body, contact->link_point[0]), contact->normal, axis);
-    direct_force(rubbing.force, slip, axis, &coefficients, 1.0 / step);
+    if (coefficients.separate_limits != 0.0) {
+      limit_separately(stretch, slip, axis, &coefficients, contact->max_friction, k, damping, 1.0 / step,
+                       rubbing.force);
+      mju_copy3(rubbing.stretch, stretch);
+    } else {
+      direct_force(rubbing.force, slip, axis, &coefficients, 1.0 / step);
+    }
   }
   return rubbing;
 }
@@ -180,17 +189,17 @@ static Coefficients find_coefficients(const mjModel* m, const mjData* d, const C
                                       mjtNum along, const mjtNum normal[3], mjtNum min_friction) {
   mjtNum mu = m->geom_friction[3 * pressing->other_geom];
   if (is_link(chain, m->geom_bodyid[pressing->other_geom]) || !has_directions(m)) {
-    return combine_coefficients(mu, mu, mu, 0.0, 0.0, min_friction);
+    return combine_coefficients(mu, mu, mu, 0.0, 0.0, min_friction, 0.0);
   }
   const mjtNum* surface = find_directions(m, pressing->other_geom);
   const mjtNum* factors = find_directions(m, pressing->link_geom);
   int body = m->geom_bodyid[pressing->link_geom];
   if (!faces_underside(d, body, find_neighbor(m, chain, body, along), normal)) {
-    return combine_coefficients(mu, mu, mu, surface[VISCOUS_ACROSS], surface[VISCOUS_ACROSS], min_friction);
+    return combine_coefficients(mu, mu, mu, surface[VISCOUS_ACROSS], surface[VISCOUS_ACROSS], min_friction, 0.0);
   }
   return combine_coefficients(surface[FORWARD] * factors[FORWARD], surface[BACKWARD] * factors[BACKWARD],
                               surface[SIDEWAYS] * factors[SIDEWAYS], surface[VISCOUS_ALONG], surface[VISCOUS_ACROSS],
-                              min_friction);
+                              min_friction, factors[SEPARATE_LIMITS]);
 }
 
 // Write what is remembered of a contact.
@@ -227,6 +236,7 @@ static RoughContact describe_contact(const mjModel* m, const mjData* d, const Ch
   result.sideways = coefficients.sideways;
   result.viscous_along = coefficients.viscous_along * pressing->normal_force;
   result.viscous_across = coefficients.viscous_across * pressing->normal_force;
+  result.separate_limits = coefficients.separate_limits;
   return result;
 }
 

@@ -21,16 +21,16 @@ int is_directional(const Coefficients* c) {
 static mjtNum maximum(mjtNum a, mjtNum b) { return b > a ? b : a; }
 
 Coefficients combine_coefficients(mjtNum forward, mjtNum backward, mjtNum sideways, mjtNum viscous_along,
-                                  mjtNum viscous_across, mjtNum min_friction) {
+                                  mjtNum viscous_across, mjtNum min_friction, mjtNum separate_limits) {
   forward = maximum(forward, min_friction);
   backward = maximum(backward, min_friction);
   sideways = maximum(sideways, min_friction);
   mjtNum largest = maximum(maximum(forward, backward), sideways);
   if (largest == 0.0) {
-    return (Coefficients){0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across};
+    return (Coefficients){0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across, separate_limits};
   }
   return (Coefficients){largest,       forward / largest, backward / largest, sideways / largest,
-                        viscous_along, viscous_across};
+                        viscous_along, viscous_across,    separate_limits};
 }
 
 // Return the length of a link, whose first geom is its capsule.
@@ -87,5 +87,46 @@ void direct_force(mjtNum force[3], const mjtNum slip[3], const mjtNum axis[3], c
   for (int i = 0; i < 3; i++) {
     mjtNum across = c->sideways * (force[i] - along * axis[i]);
     force[i] = result_along * axis[i] + across - damping_across * (slip[i] - slip_along * axis[i]);
+  }
+}
+
+static mjtNum compute_length(const mjtNum v[3]) { return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
+
+// Return the factor that brings a number of this size down to the limit; 1 if it is within.
+static mjtNum limit_scale(mjtNum limit, mjtNum size) { return size > limit ? limit / size : 1.0; }
+
+//   s_i = s_i min(1, L_i / (k |s_i|))         along the link and across it, with the limit L_i = mu_i N
+//   F_i = -(k s_i + d ds_i), limited to |F_i| <= L_i, and viscous friction
+void limit_separately(mjtNum stretch[3], const mjtNum slip[3], const mjtNum axis[3], const Coefficients* c,
+                      mjtNum max_friction, mjtNum k, mjtNum damping, mjtNum damping_per_viscous, mjtNum force[3]) {
+  mjtNum stretch_along = stretch[0] * axis[0] + stretch[1] * axis[1] + stretch[2] * axis[2];
+  mjtNum slip_along = slip[0] * axis[0] + slip[1] * axis[1] + slip[2] * axis[2];
+
+  // Along the link. A stretch or a force forward belongs to a link that slides forward.
+  mjtNum ratio = stretch_along > 0.0 ? c->forward : c->backward;
+  mjtNum stretch_across[3];
+  for (int i = 0; i < 3; i++) {
+    stretch_across[i] = stretch[i] - stretch_along * axis[i];
+  }
+  stretch_along = limit_scale(ratio * max_friction, k * fabs(stretch_along)) * stretch_along;
+  mjtNum force_along = k * stretch_along + damping * slip_along;
+  ratio = force_along > 0.0 ? c->forward : c->backward;
+  force_along = -limit_scale(ratio * max_friction, fabs(force_along)) * force_along;
+  force_along = force_along - damping_per_viscous * c->viscous_along * slip_along;
+
+  // Across it.
+  mjtNum limit = c->sideways * max_friction;
+  mjtNum scale = limit_scale(limit, k * compute_length(stretch_across));
+  mjtNum slip_across[3];
+  for (int i = 0; i < 3; i++) {
+    stretch_across[i] = scale * stretch_across[i];
+    slip_across[i] = slip[i] - slip_along * axis[i];
+    force[i] = k * stretch_across[i] + damping * slip_across[i];
+  }
+  scale = -limit_scale(limit, compute_length(force));
+  mjtNum damping_across = damping_per_viscous * c->viscous_across;
+  for (int i = 0; i < 3; i++) {
+    force[i] = force_along * axis[i] + (scale * force[i] - damping_across * slip_across[i]);
+    stretch[i] = stretch_along * axis[i] + stretch_across[i];
   }
 }

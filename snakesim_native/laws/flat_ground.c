@@ -74,14 +74,15 @@ static Coefficients find_foot_coefficients(const mjModel* m, const mjData* d, co
                                            Neighbor neighbor) {
   mjtNum mu = m->geom_friction[3 * geom];
   if (!has_directions(m)) {
-    return combine_coefficients(mu, mu, mu, 0.0, 0.0, ground->min_friction);
+    return combine_coefficients(mu, mu, mu, 0.0, 0.0, ground->min_friction, 0.0);
   }
   const mjtNum* numbers = find_directions(m, geom);
   if (!faces_underside(d, m->geom_bodyid[geom], neighbor, UP)) {
-    return combine_coefficients(mu, mu, mu, numbers[VISCOUS_ACROSS], numbers[VISCOUS_ACROSS], ground->min_friction);
+    return combine_coefficients(mu, mu, mu, numbers[VISCOUS_ACROSS], numbers[VISCOUS_ACROSS], ground->min_friction,
+                                0.0);
   }
   return combine_coefficients(numbers[FORWARD], numbers[BACKWARD], numbers[SIDEWAYS], numbers[VISCOUS_ALONG],
-                              numbers[VISCOUS_ACROSS], ground->min_friction);
+                              numbers[VISCOUS_ACROSS], ground->min_friction, numbers[SEPARATE_LIMITS]);
 }
 
 // Compute one foot in one step:
@@ -119,6 +120,8 @@ static FootStep compute_foot(const mjModel* m, const mjData* d, const Ground* gr
   mjtNum stretch_x = (placed ? before->stretch[0] : ground->start_stretch[0]) + slip_x;
   mjtNum stretch_y = (placed ? before->stretch[1] : ground->start_stretch[1]) + slip_y;
 
+  mjtNum stretch[3] = {stretch_x, stretch_y, 0.0};
+
   // s
   mjtNum scale = max_friction / maximum(k * compute_length(stretch_x, stretch_y), divisor);
   stretch_x *= scale;
@@ -135,7 +138,14 @@ static FootStep compute_foot(const mjModel* m, const mjData* d, const Ground* gr
     mjtNum slip[3] = {slip_x, slip_y, 0.0};
     mjtNum axis[3];
     find_axis(d, body, neighbor, UP, axis);
-    direct_force(foot.force, slip, axis, &coefficients, normal_force / ground->step);
+    if (coefficients.separate_limits != 0.0) {
+      limit_separately(stretch, slip, axis, &coefficients, max_friction, k, damping, normal_force / ground->step,
+                       foot.force);
+      stretch_x = stretch[0];
+      stretch_y = stretch[1];
+    } else {
+      direct_force(foot.force, slip, axis, &coefficients, normal_force / ground->step);
+    }
   }
   foot.force[2] = normal_force;
 

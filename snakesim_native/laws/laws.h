@@ -43,7 +43,7 @@ void apply_wrenches(const mjModel* m, mjData* d, const Chain* chain, const mjtNu
 
 // Numbers of a geom in its user data. For a foot and a surface they are coefficients with the underside of a link, for
 // a link they are factors on the coefficients of a surface.
-enum { FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS, USER_NUMBERS };
+enum { FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS, SEPARATE_LIMITS, USER_NUMBERS };
 
 // Coefficients of one contact or foot.
 typedef struct {
@@ -51,8 +51,9 @@ typedef struct {
   mjtNum forward;  // divided by the largest; likewise the next two
   mjtNum backward;
   mjtNum sideways;
-  mjtNum viscous_along;   // s/m
-  mjtNum viscous_across;  // s/m
+  mjtNum viscous_along;    // s/m
+  mjtNum viscous_across;   // s/m
+  mjtNum separate_limits;  // 1: friction along the link and across it do not limit each other
 } Coefficients;
 
 // The link that a point of a link is nearest to besides its own, and the weight of its direction.
@@ -72,7 +73,7 @@ int is_directional(const Coefficients* coefficients);
 
 // Return the coefficients of a contact, none of which is lower than `min_friction`.
 Coefficients combine_coefficients(mjtNum forward, mjtNum backward, mjtNum sideways, mjtNum viscous_along,
-                                  mjtNum viscous_across, mjtNum min_friction);
+                                  mjtNum viscous_across, mjtNum min_friction, mjtNum separate_limits);
 
 // Return the neighbor at a distance from the link's rear joint.
 Neighbor find_neighbor(const mjModel* m, const Chain* chain, int body, mjtNum along);
@@ -88,6 +89,16 @@ void find_axis(const mjData* d, int body, Neighbor neighbor, const mjtNum normal
 //   damping_per_viscous   normal force divided by the time step
 void direct_force(mjtNum force[3], const mjtNum slip[3], const mjtNum axis[3], const Coefficients* coefficients,
                   mjtNum damping_per_viscous);
+
+// Limit the spring of a contact along the link and across it, each by its own coefficient.
+//   stretch               in: with the slip of this step; out: after this step
+//   slip                  of the link in the last step
+//   force                 friction force on the link, which is written
+//   max_friction          normal force times the largest coefficient
+//   k, damping            stiffness and damping of the spring
+//   damping_per_viscous   normal force divided by the time step
+void limit_separately(mjtNum stretch[3], const mjtNum slip[3], const mjtNum axis[3], const Coefficients* coefficients,
+                      mjtNum max_friction, mjtNum k, mjtNum damping, mjtNum damping_per_viscous, mjtNum force[3]);
 
 //---------------------------------- Flat ground -----------------------------------------------------------------------
 
@@ -128,6 +139,7 @@ typedef struct {
   mjtNum sideways;
   mjtNum viscous_along;   // N·s/m
   mjtNum viscous_across;  // N·s/m
+  mjtNum separate_limits;  // 1: friction along the link and across it do not limit each other
 } RoughContact;
 
 // Add the friction forces to the wrenches of the links, and the opposite forces to the bodies that they touch.

@@ -28,21 +28,23 @@ from snakesim_sim_backend.laws.chain import LinkChain
 from snakesim_sim_backend.laws.directional import (
     BACKWARD,
     FORWARD,
+    SEPARATE_LIMITS,
     SIDEWAYS,
     VISCOUS_ACROSS,
     VISCOUS_ALONG,
     DirectionalCoefficients,
     LinkUndersides,
     apply_directional_friction,
+    apply_separate_limits,
     combine_coefficients,
 )
 from snakesim_sim_backend.laws.laws import find_normal_forces_n
 
 # Numbers per contact in `userdata`: its key, the link's body, the other body, the mass that the spring has to follow in
 # kg, mu N in N, the normal (3) and the stretch in m (3) in the world frame, the contact point in the frame of the link
-# (3) and of the other body (3), the coefficients forward, backward and sideways divided by mu, and viscous friction
-# along and across the link in N·s/m.
-VALUES_PER_CONTACT = 22
+# (3) and of the other body (3), the coefficients forward, backward and sideways divided by mu, viscous friction along
+# and across the link in N·s/m, and 1 if friction along the link and across it do not limit each other.
+VALUES_PER_CONTACT = 23
 CONTACTS_PER_LINK = 16  # on average; the contacts beyond that number have no friction
 CONTACTS_PER_PAIR = 64  # of two geoms: more than MuJoCo makes, so that keys are unique
 END_MOBILITY = 4.0  # how many times as easily a rod moves at its end as in its middle
@@ -151,7 +153,7 @@ class ContactFriction:
         points_w: list[Vector] = []
         link_bodies: list[int] = []
         for start in range(0, VALUES_PER_CONTACT * count, VALUES_PER_CONTACT):
-            # `remaining` has the contact point in both bodies (6 values) and the coefficients (5 values).
+            # `remaining` has the contact point in both bodies (6 values) and the coefficients (6 values).
             key, link_body, other_body, m, mu_n, nx, ny, nz, sx, sy, sz, *remaining = values[
                 start : start + VALUES_PER_CONTACT
             ]
@@ -164,6 +166,8 @@ class ContactFriction:
             # ds, and s + ds
             dx, dy, dz = _project_to_tangent(x - ox, y - oy, z - oz, nx, ny, nz)
             sx, sy, sz = _project_to_tangent(sx + dx, sy + dy, sz + dz, nx, ny, nz)
+
+            stretch_w = (sx, sy, sz)
 
             # s = (s + ds) min(1, mu N / (k |s + ds|))
             k = self._stiffness_per_kg * m
@@ -181,9 +185,14 @@ class ContactFriction:
             if coefficients.is_directional:
                 neighbor, weight = self._underside.find_neighbor(link_body, remaining[0])
                 axis_w = self._underside.find_axis(link_body, neighbor, weight, (nx, ny, nz))
-                force_w = apply_directional_friction(
-                    force_w, (dx, dy, dz), axis_w, coefficients, self._damping_per_viscous
-                )
+                if coefficients.separate_limits:
+                    (sx, sy, sz), force_w = apply_separate_limits(
+                        stretch_w, (dx, dy, dz), axis_w, coefficients, mu_n, k, d, self._damping_per_viscous
+                    )
+                else:
+                    force_w = apply_directional_friction(
+                        force_w, (dx, dy, dz), axis_w, coefficients, self._damping_per_viscous
+                    )
 
             self._stretch_and_force[key] = (sx, sy, sz), force_w
             forces_w.append(force_w)
@@ -274,6 +283,7 @@ class ContactFriction:
             values += (
                 coefficients.viscous_along * normal_force_n,
                 coefficients.viscous_across * normal_force_n,
+                coefficients.separate_limits,
             )
         self._memory[1 : 1 + len(values)] = values
         self._memory[0] = len(friction_contacts)
@@ -293,7 +303,7 @@ class ContactFriction:
         """
         friction = self._friction[other_geom]
         forward = backward = sideways = friction
-        viscous_along = viscous_across = 0.0
+        viscous_along = viscous_across = separate_limits = 0.0
         if other_geom not in self._link_geoms:
             surface = self._directions[other_geom]
             factors = self._directions[link_geom]
@@ -305,9 +315,12 @@ class ContactFriction:
                 backward = surface[BACKWARD] * factors[BACKWARD]
                 sideways = surface[SIDEWAYS] * factors[SIDEWAYS]
                 viscous_along = surface[VISCOUS_ALONG]
+                separate_limits = factors[SEPARATE_LIMITS]
             else:
                 viscous_along = viscous_across
-        return combine_coefficients(forward, backward, sideways, viscous_along, viscous_across, self.min_friction)
+        return combine_coefficients(
+            forward, backward, sideways, viscous_along, viscous_across, self.min_friction, separate_limits
+        )
 
     def _to_world(self, body: int, x: float, y: float, z: float) -> Vector:
         """Return the world coordinates of a point that is given in a body's frame, in m."""

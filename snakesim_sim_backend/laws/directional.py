@@ -20,6 +20,10 @@ a joint the mean direction of both links. A straight piece of each link would ru
 
 Sides and back of a link have no scales or wheels. They rub with one coefficient in all directions.
 
+- **Wheels with separate limits.** A wheel rolls, so its tire slips sideways only, and its whole friction acts sideways,
+  also while the link moves forward. There the spring has two parts, along the link and across it, and each has a limit
+  of its own: see `apply_separate_limits`.
+
 Source: D. L. Hu, J. Nirody, T. Scott and M. J. Shelley, "The mechanics of slithering locomotion", PNAS 106, 2009.
 """
 
@@ -33,8 +37,9 @@ from snakesim_hal.wire.quantities import Vector
 
 # Numbers of a geom in its user data, after the mark of a foot. For a foot and a surface they are coefficients with the
 # underside of a link, and viscous ones in s/m; for a link they are factors on the coefficients of a surface.
-FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS = range(6)
-USER_VALUES_PER_GEOM = 6
+# The last one is 1 for feet and links on which friction along the link and across it do not limit each other.
+FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS, SEPARATE_LIMITS = range(7)
+USER_VALUES_PER_GEOM = 7
 
 UNDERSIDE_COSINE = 0.7  # of the angle between a surface's normal and a link's z axis: within 45 degrees
 MIN_AXIS = 0.1  # length of the mean of two directions; below it the body is folded, and has none
@@ -50,6 +55,7 @@ class DirectionalCoefficients(NamedTuple):
     sideways: float
     viscous_along: float  # s/m
     viscous_across: float  # s/m
+    separate_limits: float = 0.0  # 1: friction along the link and across it do not limit each other
 
     @property
     def is_directional(self) -> bool:
@@ -64,7 +70,13 @@ class DirectionalCoefficients(NamedTuple):
 
 
 def combine_coefficients(
-    forward: float, backward: float, sideways: float, viscous_along: float, viscous_across: float, min_friction: float
+    forward: float,
+    backward: float,
+    sideways: float,
+    viscous_along: float,
+    viscous_across: float,
+    min_friction: float,
+    separate_limits: float = 0.0,
 ) -> DirectionalCoefficients:
     """Return the coefficients of a contact, none of which is lower than `min_friction`."""
     forward = max(forward, min_friction)
@@ -72,9 +84,15 @@ def combine_coefficients(
     sideways = max(sideways, min_friction)
     largest = max(forward, backward, sideways)
     if largest == 0.0:
-        return DirectionalCoefficients(0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across)
+        return DirectionalCoefficients(0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across, separate_limits)
     return DirectionalCoefficients(
-        largest, forward / largest, backward / largest, sideways / largest, viscous_along, viscous_across
+        largest,
+        forward / largest,
+        backward / largest,
+        sideways / largest,
+        viscous_along,
+        viscous_across,
+        separate_limits,
     )
 
 
@@ -172,6 +190,75 @@ def apply_directional_friction(
         result_along * ay + sideways * (fy - force_along * ay) - damping_across * (sy - slip_along * ay),
         result_along * az + sideways * (fz - force_along * az) - damping_across * (sz - slip_along * az),
     )
+
+
+def apply_separate_limits(
+    stretch_w: Vector,
+    slip_w: Vector,
+    axis_w: Vector,
+    coefficients: DirectionalCoefficients,
+    max_friction_n: float,
+    stiffness: float,
+    damping: float,
+    damping_per_viscous: float,
+) -> tuple[Vector, Vector]:
+    """Limit the spring of a contact along the link and across it, each by its own coefficient.
+
+    With the stretch s after the slip ds, its part s_i in one of both directions, and the limit L_i = mu_i N:
+
+        s_i = s_i min(1, L_i / (k |s_i|))
+        F_i = -(k s_i + d ds_i), limited to |F_i| <= L_i, and viscous friction
+
+    Args:
+        stretch_w: Stretch of the spring with the slip of this step, s + ds, in m.
+        slip_w: Slip of the link in the last step, ds, in m.
+        axis_w: Direction of the link in the plane of contact. `NO_AXIS` applies the sideways coefficient in all
+            directions.
+        coefficients: Friction coefficients of this contact.
+        max_friction_n: Normal force times the largest coefficient.
+        stiffness: Stiffness of the spring, k, in N/m.
+        damping: Damping of the spring, d, in N per m of slip in one step.
+        damping_per_viscous: Normal force divided by the time step, in N/s.
+
+    Returns:
+        The stretch of the spring after this step in m, and the friction force on the link in N, in the world frame.
+    """
+    ax, ay, az = axis_w
+    sx, sy, sz = stretch_w
+    dx, dy, dz = slip_w
+    stretch_along = sx * ax + sy * ay + sz * az
+    slip_along = dx * ax + dy * ay + dz * az
+
+    # Along the link. A stretch or a force forward belongs to a link that slides forward.
+    ratio = coefficients.forward if stretch_along > 0.0 else coefficients.backward
+    sx, sy, sz = sx - stretch_along * ax, sy - stretch_along * ay, sz - stretch_along * az
+    stretch_along = _compute_limit_scale(ratio * max_friction_n, stiffness * abs(stretch_along)) * stretch_along
+    force_along = stiffness * stretch_along + damping * slip_along
+    ratio = coefficients.forward if force_along > 0.0 else coefficients.backward
+    force_along = -_compute_limit_scale(ratio * max_friction_n, abs(force_along)) * force_along
+    force_along = force_along - damping_per_viscous * coefficients.viscous_along * slip_along
+
+    # Across it.
+    limit_n = coefficients.sideways * max_friction_n
+    scale = _compute_limit_scale(limit_n, stiffness * math.sqrt(sx * sx + sy * sy + sz * sz))
+    sx, sy, sz = scale * sx, scale * sy, scale * sz
+    dx, dy, dz = dx - slip_along * ax, dy - slip_along * ay, dz - slip_along * az
+    fx, fy, fz = stiffness * sx + damping * dx, stiffness * sy + damping * dy, stiffness * sz + damping * dz
+    scale = -_compute_limit_scale(limit_n, math.sqrt(fx * fx + fy * fy + fz * fz))
+    damping_across = damping_per_viscous * coefficients.viscous_across
+    force_w = (
+        force_along * ax + (scale * fx - damping_across * dx),
+        force_along * ay + (scale * fy - damping_across * dy),
+        force_along * az + (scale * fz - damping_across * dz),
+    )
+    return (stretch_along * ax + sx, stretch_along * ay + sy, stretch_along * az + sz), force_w
+
+
+def _compute_limit_scale(limit: float, size: float) -> float:
+    """Return the factor that brings a number of this size down to the limit; 1 if it is within."""
+    if size > limit:
+        return limit / size
+    return 1.0
 
 
 def _read_axis(rotations: Floats, body: int, column: int) -> Vector:

@@ -27,12 +27,14 @@ from snakesim_sim_backend.laws.chain import LinkChain
 from snakesim_sim_backend.laws.directional import (
     BACKWARD,
     FORWARD,
+    SEPARATE_LIMITS,
     SIDEWAYS,
     VISCOUS_ACROSS,
     VISCOUS_ALONG,
     DirectionalCoefficients,
     LinkUndersides,
     apply_directional_friction,
+    apply_separate_limits,
     combine_coefficients,
 )
 
@@ -59,7 +61,7 @@ class GroundFeet:
     @property
     def are_directional(self) -> bool:
         """Return whether the ground has viscous friction, or rubs otherwise than equally in all directions."""
-        same = [self.friction] * 3 + [0.0] * 2
+        same = [self.friction] * 3 + [0.0] * 3
         return any(numbers[FORWARD:] != same for numbers in self.directions)
 
 
@@ -249,6 +251,9 @@ class FlatGround:
 
         # s = (s + ds) min(1, mu N / (k |s + ds|))
         self._bristle_deflection_xy += slip_xy
+        stretches: list[list[float]] = []
+        if self._is_directional:
+            stretches = self._bristle_deflection_xy.reshape(-1, 2).tolist()
         self._bristle_deflection_xy *= (
             max_friction_n / np.maximum(self._stiffness * np.abs(self._bristle_deflection_complex), divisor)
         ).repeat(2)
@@ -260,7 +265,7 @@ class FlatGround:
         forces = self._forces
         np.multiply(self._pull_by_axis, max_friction_n / np.maximum(np.abs(self._pull), divisor), forces[:2])
         if self._is_directional:
-            self._apply_directional_friction(coefficients, slips)
+            self._apply_directional_friction(coefficients, slips, stretches)
         forces[2] = self.normal_force_n
         forces[3:] = forces[:2]
         self._add_link_wrenches()
@@ -280,12 +285,19 @@ class FlatGround:
             numbers[VISCOUS_ALONG],
             viscous_across,
             self.min_friction,
+            numbers[SEPARATE_LIMITS],
         )
 
     def _apply_directional_friction(
-        self, coefficients: list[DirectionalCoefficients], slips: list[list[float]]
+        self, coefficients: list[DirectionalCoefficients], slips: list[list[float]], stretches: list[list[float]]
     ) -> None:
-        """Change the friction forces of the feet by the direction in which they slide."""
+        """Change the friction forces of the feet by the direction in which they slide.
+
+        Args:
+            coefficients: Coefficients of each foot.
+            slips: Slip of each foot since the last step, x and y.
+            stretches: Stretch of the spring of each foot before it is limited, x and y.
+        """
         for foot, of_foot in enumerate(coefficients):
             if of_foot.is_directional:
                 neighbor, weight = self._neighbors[foot]
@@ -293,6 +305,21 @@ class FlatGround:
                 force_x, force_y = self._forces[:2, foot].tolist()
                 slip_x, slip_y = slips[foot]
                 damping_per_viscous = float(self.normal_force_n[foot]) / self._step_s
+                if of_foot.separate_limits:
+                    stretch_x, stretch_y = stretches[foot]
+                    (stretch_x, stretch_y, _), (force_x, force_y, _) = apply_separate_limits(
+                        (stretch_x, stretch_y, 0.0),
+                        (slip_x, slip_y, 0.0),
+                        axis_w,
+                        of_foot,
+                        of_foot.largest * float(self.normal_force_n[foot]),
+                        float(self._stiffness[foot]),
+                        float(-self._minus_damping[foot]),
+                        damping_per_viscous,
+                    )
+                    self._bristle_deflection_by_axis[:, foot] = stretch_x, stretch_y
+                    self._forces[:2, foot] = force_x, force_y
+                    continue
                 force_x, force_y, _ = apply_directional_friction(
                     (force_x, force_y, 0.0), (slip_x, slip_y, 0.0), axis_w, of_foot, damping_per_viscous
                 )

@@ -32,7 +32,7 @@ FOOT_NUMBERS = 6
 CONTACT_FORCE = slice(17, 20)
 CONTACT_INDEX = 20
 CONTACT_IS_NEW = 21
-CONTACT_NUMBERS = 27
+CONTACT_NUMBERS = 28
 # Numbers in the memory of the measured force.
 MAX_MEAN_FORCE = 0
 

@@ -28,10 +28,12 @@ from snakesim_sim_backend.laws.chain import FREE_DOFS
 from snakesim_sim_backend.laws.flat_ground import FOOT, GroundFeet, find_feet
 from snakesim_sim_backend.laws.version import LawsVersion, add_laws, choose_laws
 from snakesim_sim_backend.laws.yielding import validate_yielding_obstacles
+from snakesim_sim_backend.model.fluid import add_fluid
 from snakesim_sim_backend.model.friction import set_friction
 from snakesim_sim_backend.model.ground import add_ground
 from snakesim_sim_backend.model.imu import add_imus
 from snakesim_sim_backend.model.obstacles import OBSTACLE, add_obstacle, make_geom_name
+from snakesim_sim_backend.model.pipes import add_pipes
 from snakesim_sim_backend.model.surface import ContactParameters, make_contact_parameters
 from snakesim_sim_backend.model.tether import add_tether
 from snakesim_sim_backend.settings import SimSettings
@@ -169,6 +171,7 @@ def assemble_model_blueprint(
     _set_options(spec, step_s, compute_gravity_w(config.scene))
     contact = make_contact_parameters(settings)
     rough_ground_geoms = add_ground(spec, config.scene.ground, contact)
+    add_pipes(spec, config.scene.pipe, contact)
     fixed = [item for item in placed if not item.can_move]
     _add_obstacles(spec, fixed, config, contact, collide=bool(yielding), step_s=step_s)
     _add_snake(spec, config, settings, contact)
@@ -177,6 +180,7 @@ def assemble_model_blueprint(
 
     # Friction and the other laws.
     links = config.robot.chain.modules + 1
+    add_fluid(spec, config.scene.fluid, links)
     set_friction(spec, config, placed, rough_ground_geoms, settings.self_friction)
     yielding_bodies = [make_geom_name(item) for item in yielding]
     add_laws(spec, laws, links, yielding_bodies, keeps_touches=keeps_touches, measures_force=measures_force)

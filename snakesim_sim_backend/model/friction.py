@@ -7,6 +7,7 @@ from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_sim_backend.model.obstacles import make_geom_name
+from snakesim_sim_backend.model.pipes import get_pipe_geom_names
 
 
 def set_friction(
@@ -45,15 +46,21 @@ def set_friction(
     for item in placed:
         friction_by_geom[make_geom_name(item)] = item.friction
         directions_by_geom[make_geom_name(item)] = [*_find_coefficients(robot, item.friction, item), 0.0, 0.0]
+    for index, pipe in enumerate(config.scene.pipe):
+        for name in get_pipe_geom_names(index, pipe):
+            friction_by_geom[name] = pipe.friction
+            directions_by_geom[name] = [*_find_coefficients(robot, pipe.friction, pipe), 0.0, 0.0]
     for i, one_link_factors in enumerate(factors):
         friction_by_geom[f"link_{i}"] = self_friction
         directions_by_geom[f"link_{i}"] = [*one_link_factors, 0.0, 0.0]
 
+    has_separate_limits = robot.wheels is not None and robot.wheels.separate_limits
     for geom in spec.geoms:
         geom.friction[0] = friction_by_geom.get(geom.name, 0.0)
         if geom.name in directions_by_geom:
             foot_mark = geom.userdata[0] if len(geom.userdata) else 0.0
-            geom.userdata = [foot_mark, *directions_by_geom[geom.name]]
+            separate_limits = float(has_separate_limits and geom.name.startswith(("foot_", "link_")))
+            geom.userdata = [foot_mark, *directions_by_geom[geom.name], separate_limits]
 
 
 def _find_coefficients(robot: RobotFile, friction: float, surface: Surface) -> DirectionalFriction:

@@ -29,8 +29,9 @@ def place_and_settle_robot(
     """Place the robot at its start pose, let it come to rest, and set the time to 0 with the motors off.
 
     The robot is placed above the highest ground under it and falls, while the motors hold its start angles. If it has
-    not come to rest after `settle_s`, it is stopped. A suspended robot hangs with its head below its tail. On a slope,
-    only gravity normal to the ground acts until the run begins, so that nothing slides or rolls down before.
+    not come to rest after `settle_s`, it is stopped. In a fluid that carries it, it stays at `start.height_m` above the
+    ground. A suspended robot hangs with its head below its tail. On a slope, only gravity normal to the ground acts
+    until the run begins, so that nothing slides or rolls down before.
 
     Args:
         sim: Compiled model.
@@ -47,6 +48,7 @@ def place_and_settle_robot(
     angles_rad, _ = view_joint_states(data, motors.count)
     angles_rad[:] = pose.angles_rad
     data.qpos[2] = find_highest_ground_m(model, data, config, pose) + config.robot.module.radius_m
+    data.qpos[2] += config.start.height_m
     if sim.suspended:
         data.qpos[2] += config.robot.length_m + CLEARANCE_M
         yaw = np.array(quaternion_from_yaw(pose.yaw_rad))

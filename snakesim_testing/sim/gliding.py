@@ -1,13 +1,15 @@
 """A straight, stiff snake that glides over level ground of every kind, and an integrator of the same without MuJoCo."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body
+from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body, merge_tables
 
 FRICTION = 0.19
 HEIGHT_M = 0.1  # of a step, and of an obstacle with a flat top
@@ -16,6 +18,7 @@ STIFF_NM_PER_RAD = 200.0
 ROLL_AND_YAW_DOFS = [3, 5]
 LOCKED_KG_M2 = 1e4  # inertia about these axes, so that the round body does not roll or turn
 TOLERANCE_M_S = 1e-9
+LEVEL_GRAVITY: Vector = (0.0, 0.0, -G)
 
 LEVEL_HILLS = {"height_m": 1e-5, "wavelength_m": 0.8, "area_m": 40.0}
 SURFACES: dict[str, dict[str, Any]] = {
@@ -35,8 +38,11 @@ SURFACES: dict[str, dict[str, Any]] = {
 class GlidingSnake:
     """A straight snake of 8 modules at rest on one of `SURFACES`, which does not bend, roll or turn."""
 
-    def __init__(self, surface: str, robot: dict[str, Any], step_s: float = 0.002) -> None:
-        config = make_config({"chain": {"modules": 8}} | robot, SURFACES[surface])
+    def __init__(
+        self, surface: str, robot: dict[str, Any], step_s: float = 0.002, slope: dict[str, float] | None = None
+    ) -> None:
+        scene = merge_tables(SURFACES[surface], {"ground": slope or {}})
+        config = make_config({"chain": {"modules": 8}} | robot, scene)
         self.sim, self.data, self.physics = make_resting_body(config, SimSettings(timestep_s=step_s))
         self.model = self.sim.model
         first = self.sim.first_link_body
@@ -85,9 +91,15 @@ class GlidingSnake:
 
 
 def glide_without_mujoco(
-    velocity_m_s: Floats, coefficients: DirectionalFriction, duration_s: float, step_s: float = 1e-4
+    velocity_m_s: Floats,
+    coefficients: DirectionalFriction,
+    duration_s: float,
+    step_s: float = 1e-4,
+    gravity_w: Vector = LEVEL_GRAVITY,
 ) -> Floats:
     """Integrate the motion of a body that glides over ground without turning, until it stops.
+
+    On a slope on which friction does not hold it, it does not stop.
 
     The integrator is the classical Runge-Kutta method.
 
@@ -96,31 +108,48 @@ def glide_without_mujoco(
         coefficients: Coefficients of friction, by the direction of sliding.
         duration_s: Maximum time to integrate.
         step_s: Step of the integrator.
+        gravity_w: Acceleration of gravity along the body, across it, and normal to the ground, m/s².
 
     Returns:
         (2,) displacement along the body and across it, m.
     """
     displacement_m = np.zeros(2)
     velocity_m_s = np.array(velocity_m_s, dtype=np.float64)
+    along_ground_m_s2 = np.array(gravity_w[:2])
+    normal_m_s2 = -gravity_w[2]
+    is_held = np.linalg.norm(along_ground_m_s2) < normal_m_s2 * min(coefficients)
+
+    def accelerate(velocity_m_s: Floats) -> Floats:
+        return along_ground_m_s2 + normal_m_s2 * _compute_friction_per_weight(velocity_m_s, coefficients)
+
     for _ in range(round(duration_s / step_s)):
-        if np.linalg.norm(velocity_m_s) < 2.0 * G * max(coefficients) * step_s:
+        if is_held and np.linalg.norm(velocity_m_s) < 2.0 * normal_m_s2 * max(coefficients) * step_s:
             break
-        first = _compute_friction_acceleration(velocity_m_s, coefficients)
-        second = _compute_friction_acceleration(velocity_m_s + 0.5 * step_s * first, coefficients)
-        third = _compute_friction_acceleration(velocity_m_s + 0.5 * step_s * second, coefficients)
-        fourth = _compute_friction_acceleration(velocity_m_s + step_s * third, coefficients)
+        first = accelerate(velocity_m_s)
+        second = accelerate(velocity_m_s + 0.5 * step_s * first)
+        third = accelerate(velocity_m_s + 0.5 * step_s * second)
+        fourth = accelerate(velocity_m_s + step_s * third)
         velocity_change_m_s = step_s / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
         displacement_m += step_s * (velocity_m_s + 0.5 * velocity_change_m_s)
         velocity_m_s += velocity_change_m_s
     return displacement_m
 
 
-def _compute_friction_acceleration(velocity_m_s: Floats, coefficients: DirectionalFriction) -> Floats:
-    """Return the acceleration by friction, along the body and across it, (2,) in m/s²."""
+def make_tilted_gravity(slope_rad: float, towards_rad: float) -> Vector:
+    """Return the acceleration of gravity along a body that lies along x, across it, and normal to sloping ground."""
+    along_ground_m_s2 = G * math.sin(slope_rad)
+    return (
+        along_ground_m_s2 * math.cos(towards_rad),
+        along_ground_m_s2 * math.sin(towards_rad),
+        -G * math.cos(slope_rad),
+    )
+
+
+def _compute_friction_per_weight(velocity_m_s: Floats, coefficients: DirectionalFriction) -> Floats:
+    """Return the friction over the normal force, along the body and across it, (2,)."""
     longitudinal_coefficient = coefficients.forward if velocity_m_s[0] > 0 else coefficients.backward
     return (
-        -G
-        * np.array([longitudinal_coefficient, coefficients.sideways])
+        -np.array([longitudinal_coefficient, coefficients.sideways])
         * velocity_m_s
         / max(float(np.linalg.norm(velocity_m_s)), TOLERANCE_M_S)
     )

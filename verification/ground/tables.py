@@ -17,6 +17,7 @@ NO_FRICTION = DirectionalFriction(0.0, 0.0, 0.0)
 ROLLING = DirectionalFriction(ROLLING_FRICTION, ROLLING_FRICTION, TIRE_FRICTION)
 SKIN = {"skin": {"forward": HU.forward, "backward": HU.backward, "sideways": HU.sideways}}
 ON_WHEELS = {"wheels": WHEELS}
+ON_TURNING_WHEELS = {"wheels": WHEELS | {"separate_limits": True}}
 CLOTH = {"friction": FRICTION}
 MUD = {"friction": 0.0, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 3.0}}
 MUD_S_PER_M = 0.5 + 3.0j
@@ -34,6 +35,12 @@ PEGS = {
     "ground": CLOTH,
     "cylinder": [{"position_m": [0.25 * i, 0.1 * (-1) ** i], "radius_m": 0.05, "friction": 0.2} for i in range(6)],
 }
+PIPE = {
+    "ground": CLOTH,
+    "pipe": [
+        {"position_m": [2.0, 0.0], "length_m": 8.0, "radius_m": 0.21, "inner_radius_m": 0.2, "friction": FRICTION}
+    ],
+}
 POSTS = {
     "ground": CLOTH,
     "cylinder": [peg | {"stiffness_n_per_m": 300.0} for peg in PEGS["cylinder"]],  # pyright: ignore
@@ -47,6 +54,8 @@ COST_CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "hills, scales": (SKIN, HILLS),
     "flat ground and six rough pegs": ({}, PEGS),
     "flat ground and six rough posts on springs": ({}, POSTS),
+    "hollow pipe": ({}, PIPE),
+    "water": ({}, {"ground": CLOTH, "fluid": {"density_kg_m3": 1000.0, "viscosity_pa_s": 0.001}}),
 }
 
 
@@ -105,28 +114,41 @@ def compare_wheels() -> list[str]:
     bodies = WheeledSnake()
     glider = GlidingSnake("flat ground", ON_WHEELS)
     rolling_m_s2 = np.linalg.norm(glider.drag(np.array([0.5, 0.0]), 0.4)) / glider.mass_kg
-    creep = GlidingSnake("flat ground", ON_WHEELS)
-    creep.push(np.array([0.0, 0.8 * TIRE_FRICTION]))
-    creep.go(0.5)
-    before = creep.position_w
-    creep.go(1.0)
-    creep_mm_s = 1e3 * (creep.position_w - before)[1]
+    creep_mm_s = _measure_creep_mm_s(ON_WHEELS)
+    turning = GlidingSnake("flat ground", ON_TURNING_WHEELS)
+    turning_m_s2 = np.linalg.norm(turning.drag(np.array([0.5, 0.0]), 0.4)) / turning.mass_kg
+    turning_creep_mm_s = _measure_creep_mm_s(ON_TURNING_WHEELS)
     rows = [
         "| Quantity | Wheels as bodies | Wheels as friction | The same law in the middle of the links | "
-        "Separate limits in the middle |",
-        "|---|---|---|---|---|",
+        "`separate_limits` | Balance with separate limits | Separate limits in the middle |",
+        "|---|---|---|---|---|---|---|",
         f"| deceleration of a straight snake, m/s² | {bodies.coast(0.5, 0.4):.4f} | {rolling_m_s2:.4f} | "
-        f"{ROLLING_FRICTION * G:.4f} | {ROLLING_FRICTION * G:.4f} |",
+        f"{ROLLING_FRICTION * G:.4f} | {turning_m_s2:.4f} | {ROLLING_FRICTION * G:.4f} | {ROLLING_FRICTION * G:.4f} |",
         f"| creep sideways under 80 % of what holds, mm/s | {bodies.push_sideways(0.8 * TIRE_FRICTION, 1.0):.3f} | "
-        f"{creep_mm_s:.6f} | 0 | 0 |",
+        f"{creep_mm_s:.6f} | 0 | {turning_creep_mm_s:.6f} | 0 | 0 |",
     ]
     for name, wave in WAVES.items():
         ours = simulate_wave(wave, CLOTH, ON_WHEELS).drift_mm_s
         middle = integrate_momentum_balance(wave, ROLLING, in_the_middle=True).drift_mm_s
         separate = integrate_momentum_balance(wave, ROLLING, in_the_middle=True, separate_limits=True).drift_mm_s
         of_bodies = bodies.swim(wave).drift_mm_s
-        rows.append(f"| drift of {name}, mm/s | {of_bodies:+.1f} | {ours:+.1f} | {middle:+.1f} | {separate:+.1f} |")
+        turning_wave = simulate_wave(wave, CLOTH, ON_TURNING_WHEELS).drift_mm_s
+        balance = integrate_momentum_balance(wave, ROLLING, separate_limits=True).drift_mm_s
+        rows.append(
+            f"| drift of {name}, mm/s | {of_bodies:+.1f} | {ours:+.1f} | {middle:+.1f} | {turning_wave:+.1f} | "
+            f"{balance:+.1f} | {separate:+.1f} |"
+        )
     return rows
+
+
+def _measure_creep_mm_s(wheels: dict[str, Any]) -> float:
+    """Return the speed sideways of a body on wheels under 80 % of what holds it."""
+    creep = GlidingSnake("flat ground", wheels)
+    creep.push(np.array([0.0, 0.8 * TIRE_FRICTION]))
+    creep.go(0.5)
+    before = creep.position_w
+    creep.go(1.0)
+    return 1e3 * float((creep.position_w - before)[1])
 
 
 def measure_cost(rounds: int) -> list[str]:

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.outlines import Heading, Point, Size
+from snakesim_hal.model.outlines import Clearance, Heading, Point, Size
 
 
 class StartPlacement(FileStruct, frozen=True, kw_only=True):
@@ -22,6 +22,11 @@ class StartPlacement(FileStruct, frozen=True, kw_only=True):
 
     yaw_rad: Heading = 0.0
     """Direction from the tail to the head in the world frame. Used if `on_route` is false."""
+
+    height_m: Clearance = 0.0
+    """Height above the ground at which the snake starts, for scenes with a [fluid] that carries it. Elsewhere it falls
+    before the run begins.
+    """
 
 
 class HeadingGoal(FileStruct, frozen=True, kw_only=True, tag="heading", tag_field="kind"):

@@ -7,6 +7,7 @@ from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.placement import outline_pipes
 from snakesim_operator.results.report.top_view import find_outline_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import get_time_origin_s
@@ -71,8 +72,8 @@ def _sample_body_points_w(record: RunRecord, span_s: tuple[float, float]) -> Flo
 
 
 def plot_obstacles(axes: Axes, record: RunRecord) -> None:
-    """Plot all obstacles of a run to scale, seen from above."""
-    for placed in record.placed_obstacles:
+    """Plot all obstacles and pipes of a run to scale, seen from above."""
+    for placed in [*outline_pipes(record.config.scene), *record.placed_obstacles]:
         obstacle = placed.obstacle
         if obstacle.shape == "box":
             axes.add_patch(Polygon(find_outline_w(obstacle), closed=True, color=OBSTACLE_COLOR))

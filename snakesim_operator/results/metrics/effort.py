@@ -81,8 +81,10 @@ def compute_propulsive_efficiency(record: RunRecord, cost_of_transport: float | 
     Returns:
         The efficiency, or None if the cost of transport is unknown or the ground is not flat and level.
     """
-    ground = record.config.scene.ground
-    is_level = ground.heightfield is None and ground.slope_rad == 0.0
+    scene = record.config.scene
+    ground = scene.ground
+    is_flat = ground.heightfield is None and not scene.pipe and not scene.stairs and not scene.gaps
+    is_level = is_flat and ground.slope_rad == 0.0 and scene.fluid is None
     if cost_of_transport is None or cost_of_transport <= 0 or not is_level:
         return None
     robot = record.config.robot

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.placement import PlacedObstacle
+from snakesim_hal.model.placement import PlacedObstacle, outline_pipes
 from snakesim_hal.model.scene import compute_normal_gravity_m_s2
 from snakesim_hal.wire.messages import KnownObstacle, WorldContact
 from snakesim_operator.results.page.svg import (
@@ -78,9 +78,11 @@ def draw_top_view(record: RunRecord, snapshot: RunSnapshot, view: MapViewport) -
 
 
 def draw_ground(record: RunRecord, view: MapViewport, labels: LabelPlacer) -> str:
-    """Draw the route of the scene and all obstacles."""
-    normal_gravity_m_s2 = compute_normal_gravity_m_s2(record.config.scene)
-    obstacles = [_draw_obstacle(item, normal_gravity_m_s2, view, labels) for item in record.placed_obstacles]
+    """Draw the route of the scene, and all pipes and obstacles."""
+    scene = record.config.scene
+    normal_gravity_m_s2 = compute_normal_gravity_m_s2(scene)
+    items = [*outline_pipes(scene), *record.placed_obstacles]
+    obstacles = [_draw_obstacle(item, normal_gravity_m_s2, view, labels) for item in items]
     return _draw_route(record, view) + "".join(obstacles)
 
 

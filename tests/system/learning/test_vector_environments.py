@@ -290,6 +290,33 @@ def test_slopes_of_different_angles_are_stepped_side_by_side() -> None:
         assert_equal(alone.step(still[0])[0], velocities_m_s[row])
 
 
+@pytest.mark.parametrize(
+    ("scenario", "randomized"),
+    [
+        ("swimming", {"scene.fluid.density_kg_m3": (500.0, 1500.0), "scene.fluid.viscosity_pa_s": (0.0, 5.0)}),
+        ("pipe", {"scene.pipe.0.inner_radius_m": (0.07, 0.105), "scene.pipe.0.friction": (0.1, 0.9)}),
+    ],
+)
+def test_fluids_and_pipes_of_several_kinds_are_stepped_side_by_side(
+    scenario: str, randomized: dict[str, tuple[float, float]]
+) -> None:
+    case: Case = (scenario, {"randomize": randomized, "observe": ("velocity_w_m_s",)})
+    envs = make_many(case, 3)
+    envs.reset(seed=1)
+    bent = np.tile(np.linspace(-0.5, 0.5, 13), (3, 1))
+    for _ in range(4):
+        envs.step(bent)
+    velocities_m_s = envs.step(bent)[0]
+    envs.close()
+    assert len(np.unique(velocities_m_s[:, 0])) == 3
+    for row, seed in enumerate((1, 2, 3)):
+        alone = make(case)
+        alone.reset(seed=seed)
+        for _ in range(4):
+            alone.step(bent[0])
+        assert_equal(alone.step(bent[0])[0], velocities_m_s[row])
+
+
 def test_wrappers_of_gymnasium_accept_it() -> None:
     envs = DictInfoToList(RecordEpisodeStatistics(make_many(CASES["torques"], 2, duration=0.06)))
     envs.reset(seed=1)

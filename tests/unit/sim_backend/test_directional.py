@@ -41,7 +41,7 @@ def test_equal_coefficients_are_not_directional() -> None:
     assert not combine_coefficients(0.0, 0.0, 0.0, 0.0, 0.0, 0.0).is_directional
     assert combine_coefficients(0.3, 0.3, 0.3, 0.0, 1.0, 0.0).is_directional
     assert hu().is_directional
-    assert hu(min_friction=2.0) == (2.0, 1.0, 1.0, 1.0, 0.0, 0.0)
+    assert hu(min_friction=2.0) == (2.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
 def test_without_an_axis_all_directions_are_sideways() -> None:

@@ -55,8 +55,26 @@ SCENES: dict[str, dict[str, Any]] = {
         "box": MOVING,
         "cylinder": PEGS[:2],
     },
+    "pipes and stairs": {
+        "ground": {"friction": 0.1},
+        "pipe": [
+            {"position_m": [1.0, 0.0], "length_m": 6.0, "radius_m": 0.12, "inner_radius_m": 0.1, "friction": 0.4},
+            {"position_m": [0.5, 0.0], "length_m": 2.0, "radius_m": 0.2, "axis_height_m": -0.18, "yaw_rad": 1.5},
+        ],
+        "stairs": [{"position_m": [1.2, 0.0], "count": 3, "rise_m": 0.01, "run_m": 0.1, "width_m": 3.0}],
+    },
+    "water": {"ground": {"friction": 0.2}, "fluid": {"density_kg_m3": 1000.0, "buoyancy": 0.5}, "cylinder": PEGS[:2]},
     "cloth": {"ground": {"friction": 0.19, "backward_friction": 0.14}},
     "mud": {"ground": {"friction": 0.1, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 4.0}}},
+    "turning wheels": {
+        "ground": {"friction": 0.1, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 4.0}},
+        "step": [{"position_m": [0.5, 0.0], "size_m": [0.5, 2.0], "height_m": 0.002}],
+        "cylinder": PEGS[:2],
+    },
+    "turning wheels on hills": {
+        "ground": {"friction": 0.3, "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0}},
+        "box": MOVING[:1],
+    },
     "rough hills": {
         "ground": {
             "friction": 0.3,
@@ -81,8 +99,23 @@ SCALES = {
     }
 }
 WHEELS = {"wheels": {"radius_m": 0.03, "bearing_radius_m": 0.004, "bearing_friction": 0.1, "tire_friction": 0.6}}
-ROBOTS: dict[str, dict[str, Any]] = {"cloth": SCALES, "mud": WHEELS, "rough hills": SCALES, "steps": SCALES}
-ROLLED = ("cloth", "mud", "rough hills", "steps")  # scenes in which some robots lie on their sides and backs
+SEPARATE = {"wheels": {**WHEELS["wheels"], "separate_limits": True}}
+ROBOTS: dict[str, dict[str, Any]] = {
+    "cloth": SCALES,
+    "mud": WHEELS,
+    "rough hills": SCALES,
+    "steps": SCALES,
+    "turning wheels": SEPARATE,
+    "turning wheels on hills": SEPARATE,
+}
+ROLLED = (
+    "cloth",
+    "mud",
+    "rough hills",
+    "steps",
+    "turning wheels",
+    "turning wheels on hills",
+)  # scenes in which some robots lie on their sides and backs
 
 
 class Simulation:

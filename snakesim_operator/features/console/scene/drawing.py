@@ -13,6 +13,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
+from snakesim_hal.model.terrain import Pipe
 from snakesim_hal.physics.hills import make_heights
 from snakesim_hal.wire.messages import ColorImage, DepthImage, KnownObstacle, WorldContact, WorldModel
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
@@ -49,6 +50,11 @@ class TrueSurroundings:
     def obstacles(self) -> list[KnownObstacle]:
         """All obstacles, with steps among them."""
         return [placed.obstacle for placed in place_obstacles(self.config)]
+
+    @property
+    def pipes(self) -> list[Pipe]:
+        """All pipes."""
+        return self.config.scene.pipe
 
     @cached_property
     def heights_m(self) -> tuple[Floats, Floats] | None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
+ROUNDING_ERROR_M = 1e-9
 ROUND_SIDES = 32  # sides of the polygon that is drawn for a circle
 
 
@@ -38,6 +39,21 @@ def make_cylinder(radius_m: float, height_m: float) -> Mesh:
     side = _revolve_profile(np.array([lower_edge, upper_edge]))
     top = _revolve_profile(np.array([upper_edge, (0.0, half_m)]))
     return _merge_meshes([bottom, side, top])
+
+
+def make_tube(radius_m: float, inner_radius_m: float, length_m: float, *, open_top: bool) -> Mesh:
+    """Return a hollow pipe along x about the origin. If its top is open, only the half below z = 0 is there."""
+    half_m = length_m / 2
+    inside = (inner_radius_m, -half_m), (inner_radius_m, half_m)
+    outside = (radius_m, -half_m), (radius_m, half_m)
+    # Points with decreasing z give a surface that shows its inside.
+    profiles = [(inside[1], inside[0]), (inside[0], outside[0]), outside, (outside[1], inside[1])]
+    vertices, faces = _merge_meshes([_revolve_profile(np.array(profile)) for profile in profiles])
+    vertices = vertices[:, [2, 0, 1]]
+    if open_top:
+        is_below = vertices[faces][:, :, 2].max(axis=1) <= ROUNDING_ERROR_M
+        faces = faces[is_below]
+    return vertices, faces
 
 
 def make_box(half_m: float) -> Mesh:

@@ -18,6 +18,7 @@ from snakesim_operator.features.console.scene.batches import add_batch, to_float
 from snakesim_operator.features.console.scene.drawing import CameraFrustum, SnapshotDrawing, TrueSurroundings
 from snakesim_operator.features.console.scene.meshes import make_capsule, make_cylinder
 from snakesim_operator.features.console.scene.obstacle_meshes import PerceivedObstacles, TrueObstacles
+from snakesim_operator.features.console.scene.pipe_meshes import add_pipes
 from snakesim_operator.features.console.scene.scene_colors import Color, convert_to_linear_colors
 
 TRAIL_STEP_M = 0.02
@@ -82,6 +83,7 @@ class RobotScene:
         self._add_ground(surroundings)
         self._true_obstacles: TrueObstacles | None = None
         if surroundings is not None:
+            add_pipes(scene, surroundings.pipes)
             self._true_obstacles = TrueObstacles(scene, surroundings.obstacles)
         self._perceived_obstacles = PerceivedObstacles(scene)
 

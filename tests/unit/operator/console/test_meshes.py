@@ -5,7 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_operator.features.console.scene.meshes import Mesh, make_box, make_capsule, make_cylinder, make_sphere
+from snakesim_operator.features.console.scene.meshes import (
+    Mesh,
+    make_box,
+    make_capsule,
+    make_cylinder,
+    make_sphere,
+    make_tube,
+)
 
 
 @pytest.mark.parametrize(
@@ -15,6 +22,7 @@ from snakesim_operator.features.console.scene.meshes import Mesh, make_box, make
         (make_sphere(1.0), (1.0, 1.0, 1.0), 4 / 3 * math.pi),
         (make_cylinder(1.0, 2.0), (1.0, 1.0, 1.0), 2 * math.pi),
         (make_box(1.0), (1.0, 1.0, 1.0), 8.0),
+        (make_tube(1.0, 0.5, 4.0, open_top=False), (2.0, 1.0, 1.0), 3 * math.pi),
     ],
 )
 def test_a_shape_has_its_size_and_faces_outwards(mesh: Mesh, half_m: tuple[float, ...], volume_m3: float):
@@ -24,3 +32,10 @@ def test_a_shape_has_its_size_and_faces_outwards(mesh: Mesh, half_m: tuple[float
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     # Tetrahedra from the origin to each face: their sum is the volume, and negative for a shape inside out.
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(volume_m3, rel=0.03)
+
+
+def test_a_half_tube_has_no_top():
+    vertices, faces = make_tube(1.0, 0.5, 4.0, open_top=True)
+    corners = vertices[faces].reshape(-1, 3)
+    assert corners.max(axis=0) == pytest.approx((2.0, 1.0, 0.0))
+    assert corners.min(axis=0) == pytest.approx((-2.0, -1.0, -1.0))
