@@ -100,6 +100,11 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
     add_scenario_name_argument(parser)
     add_channel(parser, f"interface, or INTERFACE:CHANNEL of python-can, tail to head (default: {DEFAULT_CHANNEL})")
     parser.add_argument(
+        "--firmware",
+        action="store_true",
+        help="run the reference firmware in C, each module with a simulated joint of its own, on --channel unix:PATH",
+    )
+    parser.add_argument(
         "--physics-model", metavar="NAME", help="body that the motors move: mujoco, inertia, or ./file.py:Class"
     )
     add_set_argument(parser)

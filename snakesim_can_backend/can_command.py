@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_can_backend.arguments import EXPANDED_DBC_FILENAME
-from snakesim_can_backend.bus.adapter import open_bus, open_wire, validate_channel
+from snakesim_can_backend.bus.adapter import open_bus, open_wire, split_channel, validate_channel
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.bus.load import (
     MAX_LOAD,
@@ -24,6 +24,7 @@ from snakesim_can_backend.bus.load import (
     suggest_alternatives,
 )
 from snakesim_can_backend.bus.read_log import BusLog
+from snakesim_can_backend.bus.unix_wire import UNIX
 from snakesim_can_backend.bus.unknown_frames import UnknownFrames, listen_for_unknown_frames
 from snakesim_can_backend.driver.bring_up import ModuleBus, ModuleIdentity, find_modules
 from snakesim_can_backend.driver.modules import compute_response_timeout_s
@@ -199,8 +200,14 @@ def scan_channels(arguments: argparse.Namespace) -> int:
 
 
 def find_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
-    """Listen to a bus without sending, and return the frames that are not from joint modules, by sender."""
+    """Listen to a bus without sending, and return the frames that are not from joint modules, by sender.
+
+    A Unix socket connects two programs only, so that no other sender can be there.
+    """
     validate_channel(channel)
+    interface, _ = split_channel(channel)
+    if interface == UNIX:
+        return []
     bus = open_bus(channel, bit_rate)
     try:
         return listen_for_unknown_frames(bus, LISTEN_DURATION_S)

@@ -24,8 +24,8 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     """Buses, modules on them, and their reports."""
 
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
-    """CAN buses, tail to head: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can. Empty: a virtual
-    bus in this process with emulated joint modules.
+    """CAN buses, tail to head: SocketCAN interfaces such as can0, INTERFACE:CHANNEL of python-can, or unix:PATH of
+    emulated modules. Empty: a virtual bus in this process with emulated joint modules.
     """
 
     bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
@@ -36,9 +36,10 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     joints_per_channel: Annotated[list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)] = []
     """Number of joints of each channel, tail to head. Empty: joints are distributed evenly."""
 
-    emulators: Literal["here", "process", "none"] | None = None
-    """Where emulated joint modules run: `here`, in a `process` that the driver starts, or `none` for real modules and
-    those of `snakesim drive emulate can`. Default: `here` without channels, `none` with them.
+    emulators: Literal["here", "process", "firmware", "none"] | None = None
+    """Where emulated joint modules run: `here`, in a `process` that the driver starts, in one with the reference
+    `firmware` in C, or `none` for real modules and those of `snakesim drive emulate can`. Default: `here` without
+    channels, `none` with them.
     """
 
     physics_model: str = "mujoco"
@@ -74,6 +75,6 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     """Candump file of all frames that are sent and received. Empty: no file is written."""
 
     @property
-    def emulators_run(self) -> Literal["here", "process", "none"]:
+    def emulators_run(self) -> Literal["here", "process", "firmware", "none"]:
         """Where the emulated joint modules run."""
         return self.emulators or ("none" if self.channels else "here")

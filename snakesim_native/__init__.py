@@ -5,6 +5,7 @@
 `libraries`  names the libraries; a folder of C files is one library
 `compile`    compiles them: `python -m snakesim_native.compile`
 `load`       finds the compiled library and loads it; compiles it first if its sources have changed
+`programs`   the reference firmware of joint modules in `joint_module/`, as programs; compiled when first needed
 
 Every library has a Python version of the same functions, with the same results to the last bit. SnakeSIM uses the
 Python version where no library can be loaded, for example because the computer has no C compiler.
@@ -15,6 +16,8 @@ To add a C file, put it into the folder of a library. To add a library, make a f
     from snakesim_native.load import load_shared_library
 
     library = load_shared_library(LAWS_LIBRARY).library  # a ctypes.CDLL; None: use the Python version
+
+`joint_module/` is different: its programs are for people who build joint modules, and nothing else needs them.
 
 This package imports nothing of SnakeSIM.
 """

@@ -148,7 +148,7 @@ def _run_compiler(
                     mujoco_library = _make_placeholder_library(command, mujoco, Path(temporary))
                 arguments += ["-isystem", str(mujoco.include_folder), "-Wl,--no-as-needed", str(mujoco_library)]
             compiled = Path(temporary, file.name)
-            problem = _run_and_get_error([*arguments, "-lm", "-o", str(compiled)])
+            problem = run_and_get_error([*arguments, "-lm", "-o", str(compiled)])
             if not problem:
                 compiled.replace(file)
             return problem
@@ -164,13 +164,13 @@ def _make_placeholder_library(command: list[str], mujoco: MujocoFiles, folder: P
     source = folder / "empty.c"
     source.write_text("")
     file = folder / mujoco.library.name
-    problem = _run_and_get_error([*command, "-shared", f"-Wl,-soname,{file.name}", str(source), "-o", str(file)])
+    problem = run_and_get_error([*command, "-shared", f"-Wl,-soname,{file.name}", str(source), "-o", str(file)])
     if problem:
         raise OSError(problem)
     return file
 
 
-def _run_and_get_error(arguments: list[str]) -> str:
+def run_and_get_error(arguments: list[str]) -> str:
     """Run a compiler command, and return the first error that it prints; an empty text if it succeeded."""
     try:
         completed = subprocess.run(

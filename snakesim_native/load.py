@@ -89,8 +89,12 @@ def _find_compiled_file(library: NativeLibrary, key: str) -> Path | None:
 
 def _compile_to_writable_folder(library: NativeLibrary) -> Path:
     """Compile a library into this package, or into the user's cache if the package is read-only."""
-    folder = SHIPPED_FOLDER if _is_writable(SHIPPED_FOLDER) else _get_cache_folder()
-    return compile_library(library, folder)
+    return compile_library(library, choose_writable_folder())
+
+
+def choose_writable_folder() -> Path:
+    """Return the folder for what is compiled here: in this package, or the user's cache if the package is read-only."""
+    return SHIPPED_FOLDER if _is_writable(SHIPPED_FOLDER) else _get_cache_folder()
 
 
 def _is_writable(folder: Path) -> bool:

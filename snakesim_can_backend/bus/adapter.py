@@ -3,7 +3,7 @@
 A channel is a SocketCAN interface (`can0`), or `INTERFACE:CHANNEL` of python-can: `slcan:/dev/ttyACM0`,
 `pcan:PCAN_USBBUS1`, `kvaser:0`, `gs_usb:0`, `udp_multicast:239.74.163.2`. Its adapter is configured to the bit rate; a
 kernel interface has that of `ip link`. A bus of CAN FD has a second bit rate, for data, and frames of up to 64 bytes
-with ids of 11 or 29 bits.
+with ids of 11 or 29 bits. `unix:PATH` is a socket of emulated modules in another process, without any adapter.
 """
 
 import contextlib
@@ -20,14 +20,16 @@ import can
 from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, to_python_can, validate_interface
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
+from snakesim_can_backend.bus.unix_wire import UNIX, UnixWire, validate_socket
 from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError, suggest_word
 
-INTERFACES_WITHOUT_ADAPTER = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
+INTERFACES_WITHOUT_ADAPTER = ("udp_multicast", "virtual", UNIX)  # interfaces without an adapter, and without a bit rate
 FD_INTERFACES = (
     "socketcan",
     "kvaser",
-    *INTERFACES_WITHOUT_ADAPTER,
+    "udp_multicast",
+    "virtual",
 )  # interfaces through which this driver supports CAN FD
 ARE_MULTICAST_GROUPS_SEPARATE = sys.platform == "linux"  # only Linux keeps multicast groups on one UDP port apart
 IP_MULTICAST_ALL = 49  # linux/in.h
@@ -83,6 +85,8 @@ def open_wire(
     interface, name = split_channel(channel)
     if interface == "socketcan" and data_bit_rate is None:
         return SocketCanWire(name, only)
+    if interface == UNIX:
+        return UnixWire(name)
     return AdapterWire(channel, only, bit_rate, data_bit_rate)
 
 
@@ -91,8 +95,8 @@ def split_channel(channel: str) -> tuple[str, str]:
     interface, colon, name = channel.partition(":")
     if not colon:
         return "socketcan", channel
-    if interface not in can.VALID_INTERFACES:
-        interfaces = sorted(can.VALID_INTERFACES)
+    if interface != UNIX and interface not in can.VALID_INTERFACES:
+        interfaces = sorted((*can.VALID_INTERFACES, UNIX))
         raise ConfigError(
             f"channel {channel!r}: python-can has no interface {interface!r}; "
             f"{suggest_word(interface, interfaces)}it has {', '.join(interfaces)}",
@@ -124,6 +128,8 @@ def validate_channel(channel: str, *, fd: bool = False) -> None:
         )
     if interface == "socketcan":
         validate_interface(name)
+    if interface == UNIX:
+        validate_socket(name)
 
 
 def validate_channels(channels: Sequence[str], *, fd: bool = False) -> None:

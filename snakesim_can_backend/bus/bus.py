@@ -44,7 +44,7 @@ MAX_AT_ONCE = 4096  # frames; a babbling bus must not block its reader for ever
 MAX_WAIT_S = 0.01  # for frames, before control cycles begin
 PAUSE_S = 0.001  # while nothing can arrive
 IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
-_RAW_FRAME_FORMAT = struct.Struct("<IB3x8s")  # id, length, data
+RAW_FRAME_FORMAT = struct.Struct("<IB3x8s")  # id, length, data
 
 
 class Wire(Protocol):
@@ -119,7 +119,7 @@ class SocketCanWire:
             raise BackendError(f"{channel}: cannot be opened: {error}", code="bus/cannot-open") from error
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        self._buffer = bytearray(_RAW_FRAME_FORMAT.size)
+        self._buffer = bytearray(RAW_FRAME_FORMAT.size)
         self._errors: list[BusError] = []
         self._is_down = False  # whether the interface is down
         self._is_unplugged = False  # whether the adapter of the interface was unplugged
@@ -128,7 +128,7 @@ class SocketCanWire:
     def send(self, frame: CanFrame) -> bool:
         """Send a frame; return False if the queue is full or the interface is down."""
         try:
-            self._socket.send(_RAW_FRAME_FORMAT.pack(frame.id, len(frame.data), frame.data))
+            self._socket.send(RAW_FRAME_FORMAT.pack(frame.id, len(frame.data), frame.data))
         except OSError as error:
             self._record_os_error(error)
             return False
@@ -355,7 +355,7 @@ def drain_socket(
     """
     # This loop runs for every frame: local names, and a Frame that is made without its argument handling.
     receive_into = source.recv_into
-    unpack = _RAW_FRAME_FORMAT.unpack
+    unpack = RAW_FRAME_FORMAT.unpack
     append = frames.append
     new_tuple = tuple.__new__
     with contextlib.suppress(BlockingIOError):

@@ -71,9 +71,9 @@ class CanBackend(DriveBackend):
         """
         self.check(config, settings)
         clock = DriverClock(config)
-        has_emulators = settings.emulators_run != "none"
+        sends_pose = settings.emulators_run in ("here", "process")  # the reference firmware has no world to see
         mocap = make_receiver(
-            config, settings.pose_listen, are_emulated=has_emulators, clock=lambda _timestamp_ns: clock.now_ns()
+            config, settings.pose_listen, are_emulated=sends_pose, clock=lambda _timestamp_ns: clock.now_ns()
         )
         self._reports = plan_reports(config, settings)
 

@@ -15,6 +15,7 @@ from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_
 from snakesim_can_backend.bus.load import compute_max_frame_bits, count_joints_per_bus, plan_reports
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.driver.bring_up import ModuleBus, configure_modules, find_discovery_errors, find_modules
+from snakesim_can_backend.driver.firmware_process import FirmwareProcess
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE_SYNCS, ModuleMonitor
 from snakesim_can_backend.driver.own_emulators import EmulatorProcess, start_in_process_emulators, supports_fault
 from snakesim_can_backend.driver.parameters import plan_parameters, validate_ratings
@@ -170,8 +171,11 @@ class JointModules(Drives):
             wire.send(query)
         if module_reports.is_complete:  # no response is expected; but emulators in this process run only in `wait`
             wait(self.wires, 0.0)
+        is_every_bus_queried = len(queries) == len(self.wires)
         deadline_s = time.monotonic() + self._response_timeout_s
         while not module_reports.is_complete:
+            if is_every_bus_queried and module_reports.answers_missing <= 0:
+                break  # all earlier frames have arrived, and a module that has not answered will not
             remaining_s = deadline_s - time.monotonic()
             if remaining_s <= 0 or not wait(self.wires, remaining_s):
                 break
@@ -314,10 +318,15 @@ class JointModules(Drives):
             The buses, with the nodes that are expected on each of them.
         """
         settings = self._settings
+        channels = settings.channels
         if settings.emulators_run == "process":
             self._emulator_process = EmulatorProcess(self._config, settings, pose_address, stepped=self._lockstep)
-        if settings.channels:
-            for channel in settings.channels:
+        if settings.emulators_run == "firmware":
+            firmware_process = FirmwareProcess(self._config, settings, stepped=self._lockstep)
+            self._emulator_process = firmware_process
+            channels = [firmware_process.channel]
+        if channels:
+            for channel in channels:
                 self.wires.append(open_wire(channel, bit_rate=settings.bit_rate))
         else:
             channel = make_virtual_channel()

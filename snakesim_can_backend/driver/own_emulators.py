@@ -33,13 +33,21 @@ def validate_emulator_settings(config: RunConfig, settings: CanSettings) -> None
         settings: Settings of the backend.
 
     Raises:
-        ConfigError: One of these conditions is true: emulators run in the driver process ("here") although channels
-            are named; modules are elsewhere ("process" or "none") although no channel is named; faults are given
-            although there are no emulators ("none"); or a fault is invalid.
+        ConfigError: One of these conditions is true: emulators have a bus of their own ("here", "firmware") although
+            channels are named; modules are elsewhere ("process" or "none") although no channel is named; faults are
+            given although there are no emulators ("none"); or a fault is invalid.
     """
     from snakesim_can_backend.emulator.faults import parse_fault
+    from snakesim_can_backend.emulator.reference_firmware import validate_firmware_settings
 
     emulator_location = settings.emulators_run
+    if emulator_location == "firmware":
+        validate_firmware_settings(settings)
+    if emulator_location == "firmware" and settings.channels:
+        raise ConfigError(
+            f'`backends.can.emulators` = "firmware" has a bus of its own: remove `channels` = {settings.channels}',
+            code="bus/not-virtual",
+        )
     if emulator_location == "here" and settings.channels:
         raise ConfigError(
             f'`backends.can.emulators` = "here" is a virtual bus inside the driver, and `channels` = '
@@ -47,7 +55,7 @@ def validate_emulator_settings(config: RunConfig, settings: CanSettings) -> None
             f'"process"',
             code="bus/not-virtual",
         )
-    if emulator_location != "here" and not settings.channels:
+    if emulator_location not in ("here", "firmware") and not settings.channels:
         raise ConfigError(
             f'`backends.can.emulators` = "{emulator_location}" needs a bus: '
             'name it in `backends.can.channels`, such as ["vcan0"]',
@@ -124,26 +132,28 @@ class EmulatorProcess:
         Raises:
             BackendError: The child cannot be started, ended at once, or was not ready in time.
         """
-        backends = {**config.backends, "can": msgspec.to_builtins(settings)}
-        child_config = msgspec.structs.replace(config, backends=backends)
-        arguments = ["--parent", str(os.getpid()), "--pose", pose_address or "none"]
-        for channel in settings.channels:
-            arguments += ["--channel", channel]
-        if stepped:
-            arguments.append("--stepped")
         try:
             self._folder = tempfile.TemporaryDirectory(prefix="snakesim-emulators-", ignore_cleanup_errors=True)
             self._output_path = Path(self._folder.name, "modules.log")
-            self._process = self._start(child_config, arguments)
+            self._process = self._start(config, settings, pose_address, stepped=stepped)
         except OSError as error:
             raise BackendError(
                 f"the emulated joint modules cannot be started: {error}", code="emulator/not-started"
             ) from error
         self._wait_until_ready()
 
-    def _start(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
+    def _start(
+        self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool
+    ) -> subprocess.Popen[bytes]:
+        """Write the configuration for the child, and start it."""
+        backends = {**config.backends, "can": msgspec.to_builtins(settings)}
         config_path = Path(self._folder.name, "config.json")
-        write_config(config, config_path)
+        write_config(msgspec.structs.replace(config, backends=backends), config_path)
+        arguments = ["--parent", str(os.getpid()), "--pose", pose_address or "none"]
+        for channel in settings.channels:
+            arguments += ["--channel", channel]
+        if stepped:
+            arguments.append("--stepped")
         module = "snakesim_can_backend.emulator.command"
         with self._output_path.open("wb") as output:
             return subprocess.Popen(

@@ -246,13 +246,15 @@ class ModuleChain:
 
         Args:
             channel: Index of the bus.
-            frame: Received frame. A frame that no host sends, or of a wrong length, is only counted.
+            frame: Received frame. A frame that no host sends, such as a Sync to one node or a frame of a wrong length,
+                is only counted.
         """
         opcode = parse_opcode(frame.id)
         node = parse_node(frame.id)
         # An Emergency is valid at any length.
         has_wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)
-        if opcode not in FROM_HOST or has_wrong_length:
+        is_sync_to_one_node = opcode == Opcode.SYNC and node != BROADCAST
+        if opcode not in FROM_HOST or has_wrong_length or is_sync_to_one_node:
             self.refused += 1
             return
         if self.stepped:

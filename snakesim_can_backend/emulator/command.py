@@ -7,16 +7,19 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from typing import NoReturn
 
 import msgspec
 
 from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation
-from snakesim_can_backend.bus.adapter import is_emulated, open_wire, validate_channels
+from snakesim_can_backend.bus.adapter import is_emulated, open_wire, split_channel, validate_channels
 from snakesim_can_backend.bus.bus import Wire, wait
 from snakesim_can_backend.bus.load import count_joints_per_bus, format_bit_rate
+from snakesim_can_backend.bus.unix_wire import UNIX
 from snakesim_can_backend.emulator.bus_time import BusTraffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.faults import parse_fault, parse_typed_fault
+from snakesim_can_backend.emulator.reference_firmware import replace_this_process, validate_firmware_settings
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST
 from snakesim_can_backend.settings import CanSettings
@@ -59,6 +62,8 @@ def emulate(arguments: argparse.Namespace) -> int:
         set_parent_death_signal(arguments.parent)
     loaded = _load_configuration(arguments)
     settings = _make_settings(arguments, loaded)
+    if arguments.firmware:
+        _run_reference_firmware(arguments, loaded, settings)
     module_count = loaded.config.robot.chain.modules
     _validate_virtual_channels(settings.channels, on_real_bus=arguments.on_real_bus)
     count_joints_per_bus(loaded.config, settings)
@@ -83,6 +88,19 @@ def emulate(arguments: argparse.Namespace) -> int:
         for line in loop.summary():
             print_line(line)
         return 0
+
+
+def _run_reference_firmware(arguments: argparse.Namespace, loaded: LoadedScenario, settings: CanSettings) -> NoReturn:
+    """Run the reference firmware in C instead of this process. Raises ConfigError, and BackendError."""
+    validate_firmware_settings(settings)
+    sockets = [name for interface, name in map(split_channel, settings.channels) if interface == UNIX]
+    if len(settings.channels) != 1 or not sockets:
+        raise ConfigError(
+            f"--firmware: the reference firmware has one bus, which is a Unix socket, not {settings.channels}; add "
+            "--channel unix:PATH, such as unix:/tmp/modules.sock",
+            code="bus/invalid-channel",
+        )
+    replace_this_process(loaded.config, settings, sockets[0], duration_s=arguments.duration, stepped=arguments.stepped)
 
 
 def _load_configuration(arguments: argparse.Namespace) -> LoadedScenario:

@@ -281,9 +281,9 @@ class ModuleFirmware:
         return self._next_due_us(now_us)
 
     @property
-    def watchdog_us(self) -> float:
-        """Return how long a module acts on one setpoint."""
-        return self.parameters.values[ModuleParameter.WATCHDOG] * 1e6
+    def watchdog_us(self) -> int:
+        """Return how long a module acts on one setpoint, to the nearest microsecond."""
+        return round(self.parameters.values[ModuleParameter.WATCHDOG] * 1e6)
 
     def reboot(self, now_us: float) -> None:
         """Reset everything that is not saved, and restart."""
@@ -418,6 +418,7 @@ class ModuleFirmware:
             (health.winding_c >= max_winding_c) << ModuleFault.OVERHEAT
             | health.leak << ModuleFault.LEAK
             | (health.voltage_v < self._min_voltage_v) << ModuleFault.VOLTAGE
+            | health.sensor_failed << ModuleFault.SENSOR
         )
 
     def _latch_new_faults(self, now_us: float) -> None:

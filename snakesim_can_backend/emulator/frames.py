@@ -45,6 +45,7 @@ class EmulatedHealth:
     voltage_v: float = 24.0
     current_a: float = 0.0
     leak: bool = False
+    sensor_failed: bool = False  # whether the joint's angle or the motor's current cannot be measured
 
 
 class SignalRounder:

@@ -10,7 +10,9 @@ from snakesim_can_backend.protocol.definitions import CanFrame, parse_node
 from snakesim_drivers.kit.mixed import MixedBackend
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import ClockMode
+from snakesim_native.compile import NO_COMPILER, list_compilers
 from snakesim_testing.benches.emulated_drives import DrivesOfAnyType, ModuleDrives
+from snakesim_testing.benches.firmware_drives import FirmwareDrives
 from snakesim_testing.benches.homing_drives import HomingBackend
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
@@ -72,6 +74,14 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("sim-camera", "sim", overrides=LOOKS_AHEAD),
         Bench("sim-position", "sim", overrides=POSITION_ONLY),
         Bench("can-virtual", "can", mute_joint=cut_off, make_emulated_drives=ModuleDrives),
+        Bench(
+            "can-firmware",
+            "can",
+            overrides=('backend.emulators="firmware"',),
+            mute_joint=cut_off,
+            make_emulated_drives=FirmwareDrives,
+            unavailable_reason=find_reason_against_firmware(),
+        ),
         Bench("odrive", "odrive", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
         Bench("moteus", "moteus", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
         Bench("cia402", "cia402", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
@@ -107,6 +117,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.name == "test_contract.py" and not any(words in item.name for words in IN_AN_EMULATED_MACHINE):
             item.add_marker(pytest.mark.slow)
+
+
+def find_reason_against_firmware() -> str | None:
+    """Why the reference firmware cannot be compiled here. CI has a compiler, and must run its clauses."""
+    if list_compilers() or os.environ.get("CI"):
+        return None
+    return f"the reference firmware of joint modules is in C, and {NO_COMPILER}"
 
 
 def cut_off(backend: Any, joint: int) -> None:

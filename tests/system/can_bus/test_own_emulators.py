@@ -34,6 +34,8 @@ VCAN = ["vcan0"]
         CanSettings(faults=["mute:joint_5@1"]),
         CanSettings(faults=["melt:joint_1@1"]),
         CanSettings(channels=VCAN, emulators="process", faults=["mute:joint_9@1"]),
+        CanSettings(channels=VCAN, emulators="firmware"),
+        CanSettings(emulators="firmware", faults=["mute:joint_1@1"]),
     ],
 )
 def test_twins_that_cannot_be_are_refused(settings: CanSettings) -> None:

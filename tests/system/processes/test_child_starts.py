@@ -51,6 +51,8 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "docs/site/build.py": "git",
     "docs/style/check_prose.py": "git and proselint",
     "snakesim_can_backend/bus/bus_faults.py": "ip",
+    "snakesim_can_backend/driver/firmware_process.py": "the reference firmware, a program in C",
+    "snakesim_can_backend/emulator/reference_firmware.py": "the same program",
     "snakesim_native/compile.py": "the C compiler",
     "snakesim_hal/base/process.py": "the same program again, with its own options",
 }

@@ -1,0 +1,55 @@
+"""The reference firmware in C as a child of the driver, on a socket of its own."""
+
+import subprocess
+from pathlib import Path
+
+from snakesim_can_backend.driver.own_emulators import EmulatorProcess
+from snakesim_can_backend.settings import CanSettings
+from snakesim_hal.model.scenario import RunConfig
+
+SOCKET_NAME = "bus.sock"
+MODULES_NAME = "modules.txt"
+
+
+class FirmwareProcess(EmulatorProcess):
+    """The program `joint_modules` as a child that ends when this process closes its input."""
+
+    def __init__(self, config: RunConfig, settings: CanSettings, *, stepped: bool) -> None:
+        """Compile the program if necessary, start it, and wait until its modules are on the bus.
+
+        Args:
+            config: Configuration of the run, with the robot.
+            settings: Settings of the backend.
+            stepped: Whether time advances only from Sync to Sync.
+
+        Raises:
+            BackendError: The program cannot be compiled or started, ended at once, or was not ready in time.
+        """
+        super().__init__(config, settings, None, stepped=stepped)
+
+    @property
+    def channel(self) -> str:
+        """Channel of the bus with the modules."""
+        return f"unix:{self._folder.name}/{SOCKET_NAME}"
+
+    def _start(
+        self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool
+    ) -> subprocess.Popen[bytes]:
+        from snakesim_can_backend.emulator.reference_firmware import (
+            build_program,
+            describe_modules,
+            make_program_arguments,
+        )
+
+        folder = Path(self._folder.name)
+        modules_path = folder / MODULES_NAME
+        modules_path.write_text(describe_modules(config, settings), encoding="utf-8")
+        arguments = make_program_arguments(str(folder / SOCKET_NAME), str(modules_path), stepped=stepped)
+        with self._output_path.open("wb") as output:
+            return subprocess.Popen(
+                [str(build_program()), *arguments, "--until-input-ends"],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
