@@ -41,13 +41,13 @@ PLANE_FRICTION = 0.3  # under the bare chain
 Step = Callable[[], Any]
 INTRODUCTION = """\
 Printed by `python -m benchmarks.environments` on {machine}, Python {python}, load average {load}: read the ratios.
-The laws of ground and friction run in {laws}. A step is 50 ms of robot time, 5 ticks with 5 physics steps in each;
-observations are of the joints, and no resets are counted. *Bare chain* is `mj_step` for a chain with the robot's links,
-joints and gains on a plane, with MuJoCo's own contacts, without sensors, command limiter, obstacles and rewards.
+The laws of ground and friction run in {laws}. A step is 50 ms of robot time: 5 ticks with 5 physics steps in each.
+Observations are those of the joints, and resets are not counted. *Bare chain* is `mj_step` for a chain with the robot's
+links, joints and gains on a plane. It has MuJoCo's own contacts, and no sensors, limiter, obstacles or rewards.
 """
 ONE_CORE = """\
 One environment, per CPU second. The last column is the time of a step of the environment, divided by that of the bare
-chain; the goal is 1.1.
+chain. The goal is 1.1.
 """
 MANY = """\
 Many environments in one process on {threads} threads. *Bare batch* steps as many bare chains by `mujoco.batch.Batch`

@@ -24,7 +24,6 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.browser import open_chromium
 from snakesim_testing.runs.command import running_snakesim
 
-SETTLE_S = 6.0  # for the browser to draw, without a graphics card
 PHONE = 400, 800
 
 
@@ -33,7 +32,13 @@ def main() -> None:
     parser.add_argument("run", help="folder of a recorded run, or what follows `snakesim run`")
     parser.add_argument("out", type=Path, help="the picture, a PNG")
     parser.add_argument("--at", type=float, default=0.0, metavar="S", help="seconds into the recording")
-    parser.add_argument("--after", type=float, default=8.0, metavar="S", help="seconds after the page was there")
+    parser.add_argument(
+        "--after",
+        type=float,
+        default=8.0,
+        metavar="S",
+        help="seconds for the page to draw, without a graphics card (8)",
+    )
     parser.add_argument("--click", action="append", default=[], metavar="LABEL", help="in this order (may be repeated)")
     parser.add_argument("--signals", default="", metavar="NAMES", help="in the tab Signals: plots are parted by ;")
     parser.add_argument("--commission", metavar="FILE", help="of a host: RUN is what follows `snakesim start host`")
@@ -51,7 +56,7 @@ def main() -> None:
         if given.phone:
             tab.size(width, height, scale=2.0, mobile=True)
         tab.wait_for("RECORDING" if recorded else "DISARMED" if given.commission else "armed by")
-        time.sleep(SETTLE_S if recorded else given.after)
+        time.sleep(given.after)
         tab.value("document.querySelectorAll('[class*=Notification-closeButton]').forEach(e => e.click())")
         if given.dark:
             tab.click("Dark page")
@@ -59,9 +64,9 @@ def main() -> None:
             tab.click(label)
             time.sleep(1.0)
         if given.signals:
-            tab.value(f"document.querySelector('iframe').src = '/signals?within&with#{given.signals}'")
+            tab.value(f"document.querySelector('iframe').src = 'signals?within&with#{given.signals}'")
         tab.value(f"document.querySelectorAll('[class*=viewport]').forEach(e => {{ e.scrollTop += {given.scroll}; }})")
-        time.sleep(SETTLE_S if recorded or given.scroll else 0.0)
+        time.sleep(given.after if recorded or given.scroll else 0.0)
         taken = tab.picture()
     with Image.open(io.BytesIO(taken)) as picture:
         few = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)

@@ -39,13 +39,13 @@ IMAGE_MESSAGE_TYPES = "planar13_camera/sensor/depth/*"
 RATE_MBIT = 6.0
 AIM, AIM_SATURATED = 1.5, 1.3
 EXPLAINED = (
-    "A run that stops is named; a lease lasts 50 ms. On such a link a packet of 1500 bytes takes 2 ms, and nothing",
-    "passes the one that is under way: so p99 is longer, also with raw Zenoh. Smaller pieces of an image do not help,",
-    "TCP joins them to whole packets again. Previews instead of images keep the aim: see",
+    "The table names a run that stops. A lease lasts 50 ms. On such a link a packet of 1500 bytes takes 2 ms, and no",
+    "other packet can overtake it. So p99 is longer, also with raw Zenoh. Smaller pieces of an image do not help,",
+    "because TCP joins them to whole packets again. With previews instead of images the aim is met: see",
     "[bandwidth](../docs/benchmarks/bandwidth.md).",
     "",
-    "What ours takes longer is mostly Python that runs once in 10 ms, so from a cold cache, half of it in the process",
-    "of control. That ours sends five messages a tick costs little: all that have a reader are in one packet.",
+    "The additional time of SnakeSIM is mostly Python that runs once in 10 ms, and so from a cold cache. Half of it is",
+    "in the process of control. The five messages of a tick cost little, because those with a reader share a packet.",
 )
 
 Percentiles = tuple[float, float]  # p50, p99 in microseconds
@@ -149,8 +149,9 @@ def main() -> None:
         f"Printed by `python -m benchmarks.paths --write --seconds {arguments.seconds:g} "
         f"--repeats {arguments.repeats}` on "
         f"{date.today()}, {os.cpu_count()} cores, Python {platform.python_version()}, load {os.getloadavg()[1]:.1f}.",
-        "Network namespaces on one computer; state to command at 100 Hz beside a raw Zenoh round trip of",
-        f"{len(state)} and {len(command)} bytes on the same way, in turn; medians of {arguments.repeats}.",
+        "The machines are network namespaces on one computer. *Ours* is the time from state to command at 100 Hz.",
+        f"*Raw* is a Zenoh round trip of {len(state)} and {len(command)} bytes on the same path. Both are measured "
+        f"in turn, and are medians of {arguments.repeats}.",
         "",
         "| way | ours p50 / p99, µs | raw p50 / p99, µs | ratio p50 | ratio p99 | aim |",
         "|---|---|---|---|---|---|",
@@ -170,7 +171,8 @@ def main() -> None:
         slow = [
             "",
             f"With a camera whose images a client reads by one router over a link of {RATE_MBIT:g} Mbit/s (`tbf`),",
-            "less than the images need; against quiet. Before the link is one queue, or three by priority.",
+            "which is less than the images need. *Quiet* is without that client. Before the link is one queue, or",
+            "three by priority.",
             "",
             "| queue | watched p50 / p99, µs | quiet p50 / p99, µs | ratio p50 | ratio p99 | aim | images, Mbit/s |",
             "|---|---|---|---|---|---|---|",

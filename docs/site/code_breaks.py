@@ -1,6 +1,7 @@
 """A hook of mkdocs: lets long code in table cells break after a separator, such as `tests/unit/` + `test_lease.py`.
 
-Without it a browser either breaks names between any two letters, or makes the column as wide as the longest name.
+Without it a browser either breaks names between any two letters, or makes the column as wide as the longest name. It
+also shows a `|` in such code without the backslash that Markdown needs in a table.
 """
 
 import re
@@ -23,6 +24,7 @@ def _allow_breaks_in_cell(cell: re.Match[str]) -> str:
 
 def _allow_breaks_in_code(code: re.Match[str]) -> str:
     opening, text, closing = code.groups()
+    text = text.replace("\\|", "|")
     if len(text) < MIN_LETTERS:
-        return code[0]
+        return opening + text + closing
     return opening + SEPARATOR.sub(r"\1<wbr>", text) + closing

@@ -49,7 +49,7 @@ FILES: dict[str, tuple[type[msgspec.Struct], str]] = {
     "Scenario file": (RunConfig, SCENARIO),
     "Suite file": (
         EvaluationSuite,
-        "A suite is described in [evaluation](../how-to/evaluate-controllers.md#a-suite-of-your-own).",
+        "A suite is described in [Write an evaluation suite](../how-to/write-a-suite.md).",
     ),
     "Lab file": (LabFile, "A lab is described in [a lab](../how-to/lab.md)."),
 }

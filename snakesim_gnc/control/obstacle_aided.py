@@ -346,7 +346,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         setpoints = self._bumpless_follower.make_setpoints(
             observation, reference, may_have_jumped=self._contact_search.has_changed_wave
         )
-        reason = "it does not come on: it moves by a wave, in search of contacts"
+        reason = "the body does not advance: it moves by a wave, in search of contacts"
         return ControllerCommand(setpoints, Telemetry(reason=reason, reference_rad=reference.tolist()))
 
     def _command_rest(self, observation: Observation) -> ControllerCommand:

@@ -112,15 +112,13 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     desired_force_correlation: Annotated[
         float | None,
         _make_quantity_meta(
-            "1", "of measured with solved forces at push-points while it locomoted; null: nothing to compare"
+            "1", "of measured with desired forces at push-points while it locomoted; null: nothing to compare"
         ),
     ]
     desired_force_error: Annotated[
-        float | None, _make_quantity_meta("1", "|measured - solved| over solved there, median")
+        float | None, _make_quantity_meta("1", "|measured - desired| over desired there, median")
     ]
-    empty_push_points: Annotated[
-        float | None, _make_quantity_meta("1", "share of those push-points that carried nothing")
-    ]
+    empty_push_points: Annotated[float | None, _make_quantity_meta("1", "share of those push-points without contact")]
     energy_j: Annotated[
         float | None,
         _make_quantity_meta("J", "sum over joints of |torque x velocity| over time, from one sample a control period"),

@@ -248,7 +248,7 @@ def _make_motion_rows(summary: RunSummary) -> list[tuple[str, str]]:
     ]
     force_tracking = _describe_force_tracking(summary)
     if force_tracking:
-        rows.append(("solved forces", force_tracking))
+        rows.append(("desired forces", force_tracking))
     return rows
 
 
@@ -299,7 +299,8 @@ def _describe_force_tracking(summary: RunSummary) -> str:
     if error is None or without_contact is None:
         return ""
     follows = "of unknown correlation" if correlation is None else f"correlation {correlation:.2f}"
-    return f"measured: {follows}, median error {100 * error:.0f} %, {100 * without_contact:.0f} % of push-points empty"
+    share = f"{100 * without_contact:.0f} % of push-points without contact"
+    return f"measured: {follows}, median error {100 * error:.0f} %, {share}"
 
 
 def _describe_energy(summary: RunSummary) -> str:

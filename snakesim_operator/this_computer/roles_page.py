@@ -15,17 +15,19 @@ from snakesim_hal.wire.roles import (
 INTRODUCTION = """\
 # Roles
 
-Made by `make schemas` from `snakesim_hal/wire/roles.py`, as are the access rules that `snakesim lab render` writes
-for a lab's routers. A certificate gives a process one role for one robot. Keys are below that robot's namespace. What
-no cell grants is denied: other keys, other robots, `delete`, a query where a stream is, a wildcard that covers a key
-where no wildcard is granted. [docs/how-to/lab.md](../docs/how-to/lab.md) shows how a lab is set up.
+`make schemas` makes this page from `snakesim_hal/wire/roles.py`. `snakesim lab render` makes the access rules of a
+lab's routers from the same table. A certificate gives a process one role for one robot. Keys are below that robot's
+namespace. [docs/how-to/lab.md](../docs/how-to/lab.md) shows how a lab is set up.
+
+What no cell grants is denied. Examples are other keys, other robots, `delete`, and a query where a stream is. A
+wildcard is denied if it covers a key for which none is granted.
 """
 NOTES = """\
-A `gnc` publishes, declares and answers at `*` only under the names of its own services, as the lab file lists them, and
-a recorder under the name `recorder`. At `process/*` these names are followed by `-` and an id.
+A `gnc` publishes, declares and answers at `*` only under the names of its own services, as the lab file lists them. A
+recorder does so only under the name `recorder`. At `process/*` these names are followed by `-` and an id.
 Fault injection is granted only for a robot with `faults = true` in the lab file. An administrator may also query the
-routers' own state (`@/**`), read-only. Subscribing is granted for any pattern within the robot's namespace: what is
-then delivered is decided key by key.
+routers' own state (`@/**`), read-only. Subscribing is granted for any pattern within the robot's namespace. The
+router then decides key by key what it delivers.
 """
 
 
@@ -41,7 +43,7 @@ def make_roles_page() -> str:
             NOTES,
             "## In Zenoh's words",
             "",
-            "What a router lets in from such a process, and what it sends to it.",
+            "These Zenoh messages are accepted by a router from a process with this right, and sent to it.",
             "",
             *_format_table(("act", "in", "out"), _iter_message_rows()),
             "",

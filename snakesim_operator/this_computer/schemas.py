@@ -101,9 +101,9 @@ def _format_key_space_page() -> str:
         rows.append(f"| `{row.key}` | {message} | {row.writer} | {row.kind} | {row.when} | {row.about} |")
     rows += [
         "",
-        "Kinds: a *stream* is published regularly and old samples are useless; a *latched* value is kept for",
-        "later subscribers, who must query it; a *query* is answered with an [Answer](messages/Answer.json);",
-        "*liveliness* is a token that vanishes with its process. A *tick* lasts `RobotDescription.period_ns`.",
+        "There are four kinds. A *stream* is published regularly, and old samples are useless. A *latched* value is",
+        "kept for later subscribers, which must query it. A *query* gets an [Answer](messages/Answer.json).",
+        "*Liveliness* is a token that vanishes with its process. A *tick* lasts `RobotDescription.period_ns`.",
         "",
     ]
     return "\n".join(rows)

@@ -142,7 +142,7 @@ class ControlState(Message, frozen=True, kw_only=True):
         ),
     ] = []
     propulsion_torque_nm: Annotated[q.Torque | None, about("of `propulsion_joint` (null: none pushes)")] = None
-    bending_torque_nm: Annotated[q.Torques, about("of every joint, for the solved forces; or empty")] = []
+    bending_torque_nm: Annotated[q.Torques, about("of every joint, for the desired forces; or empty")] = []
     reference_rad: Annotated[q.Angles, about("of every joint, from the path; or empty")] = []
     condition: Annotated[q.Scalar | None, about("condition number of the equations (null: none were solved)")] = None
     torque_headroom_nm: Annotated[q.Torque | None, about("left below its limit at full push (null: none pushes)")] = (

@@ -50,9 +50,9 @@ METRICS = {
     "torque_headroom": CardMetric("torque headroom", 2),
     "form_closure": CardMetric("form closure, share of time", 3),
     "planning_fraction": CardMetric("planning, share of turns", 2),
-    "desired_force_correlation": CardMetric("solved forces: correlation with measured", 2),
-    "desired_force_error": CardMetric("solved forces: median error", 2),
-    "empty_push_points": CardMetric("solved forces: push-points that carried nothing", 2),
+    "desired_force_correlation": CardMetric("desired forces: correlation with measured", 2),
+    "desired_force_error": CardMetric("desired forces: median error", 2),
+    "empty_push_points": CardMetric("desired forces: push-points without contact", 2),
 }
 
 

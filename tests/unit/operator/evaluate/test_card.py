@@ -56,7 +56,7 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
         card(["hold"], 1, crosses=True), [card(["hold"], 1, crosses=True, **{"scene.ground.friction": 0.3})]
     )
     said = "\n".join(format_card(ours, pairs))
-    assert "solved forces: median error                     unknown" in said
+    assert "desired forces: median error                    unknown" in said
     assert "6/6 (61-100 %)" in said
 
 

@@ -53,14 +53,14 @@ def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
     html = report_page(late, summarize_run(late, "complete"))
     red = re.findall(r'class="tile alarming">.*?<span>(.*?)</span>(?:<span class="why">(.*?)</span>)?</div>', html)
     why = {what.partition(";")[0]: reason for what, reason in red}
-    assert why.keys() >= {"of the push-points carried nothing", "commands refused", "ticks whose command came in time"}
+    assert why.keys() >= {"of the push-points without contact", "commands refused", "ticks whose command came in time"}
     assert all(why.values())
     assert why["commands refused"] == "stale 2"
     assert "a tick is 10.0 ms" in why["ticks whose command came in time"]
     apart = re.fullmatch(
         r"the body was off the obstacle in (\d+) % of them, by [\d.]+ mm \(median\); it touched in (\d+) % of them; "
         r"most often peg_\d_\d, \d+ of \d+",
-        why["of the push-points carried nothing"],
+        why["of the push-points without contact"],
     )
     assert apart is not None
     assert sum(map(int, apart.groups())) == 100

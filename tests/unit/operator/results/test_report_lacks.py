@@ -114,7 +114,7 @@ def test_report_of_controller_without_push_points_has_all_sections(short_record:
     plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in short_record.control_states]
     config_ = msgspec.structs.replace(short_record.config, controller="hold")
     page = read(changed(short_record, control_states=plain, config=config_))
-    assert "controller hold solved for no push-points" in page.text
+    assert "controller hold published no desired forces" in page.text
     assert "controller hold named no propulsion joint" in page.text
     assert re.search("measured contacts?, in sum", page.text)
 
