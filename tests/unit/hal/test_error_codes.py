@@ -71,7 +71,7 @@ def test_faults_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
         match node:
             case ast.Call(func=ast.Name(id="Fault"), keywords=keywords):
                 used |= {text for word in keywords if word.arg == "what" for text in find_texts(word.value)}
-            case ast.Call(func=ast.Name(id="Finding" | "report"), args=[ast.Constant(value=str(word)), *_]):
+            case ast.Call(func=ast.Name(id="FaultFinding" | "report"), args=[ast.Constant(value=str(word)), *_]):
                 used.add(word)
             case _:
                 pass
