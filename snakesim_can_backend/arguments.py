@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from snakesim_can_backend.protocol.definitions import LAST_NODE
-from snakesim_drivers.kit.commands import add_channel, add_channels, add_pose
+from snakesim_drivers.kit.commands import add_channel, add_channels, add_control_arguments, add_pose
 from snakesim_hal.programs.arguments import (
     add_duration_argument,
     add_json_argument,
@@ -115,9 +115,7 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
         metavar="FAULT",
         help="inject a fault, as KIND:JOINT@START[-END] in seconds (may be repeated)",
     )
-    parser.add_argument(
-        "--interactive", action="store_true", help="read `KIND joint_N` and `KIND joint_N off` from the terminal"
-    )
+    add_control_arguments(parser)
     parser.add_argument(
         "--stepped", action="store_true", help="advance time only from Sync to Sync, for a host in lockstep"
     )

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from snakesim_drivers.emulation.drive_emulator import serve_until_stopped
+from snakesim_drivers.emulation.emulator_control import EmulatorControl
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import set_parent_death_signal
@@ -51,11 +52,13 @@ def emulate_servos(arguments: argparse.Namespace, backend: type[ServoBackend[Any
     link_paths = [Path(channel) for channel in arguments.channel or ["servos"]]
     settings = decode_backend_settings(config, backend, loaded.table)
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in link_paths])
-    with create_named_ptys(link_paths) as ptys:
+    with contextlib.ExitStack() as exit_stack:
+        ptys = exit_stack.enter_context(create_named_ptys(link_paths))
         emulator = backend.make_robot_emulator(config, settings, ptys, DriverClock(config), arguments.pose)
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(link_paths, ptys, strict=True))
         ready = f"servos ready: {len(config.robot.joint_table)} on {ends}"
-        serve_until_stopped(ready, emulator, partial(select.select, ptys, [], []))
+        control = EmulatorControl(arguments, emulator.inject_typed, emulator.read_true_state, exit_stack)
+        serve_until_stopped(ready, emulator, partial(select.select, ptys, [], []), control.run)
     return 0
 
 

@@ -49,6 +49,7 @@ class PseudoTerminal:
         self.expected_bytes: int | None = None
         self.sent_bytes = 0
         self._received_bytes = 0
+        self._is_cut = False  # by an injected fault
 
     def receive(self) -> bytes:
         """Return what has arrived. Waits for all expected bytes, which the kernel may pass on late."""
@@ -60,10 +61,18 @@ class PseudoTerminal:
                     f"{self.path}: the kernel has not handed on what was written to it", code="bus/io-failed"
                 )
             data += self._read()
-        return data
+        return b"" if self._is_cut else data
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Start or end the fault "cut", in which nothing passes. Raises ConfigError for other kinds."""
+        if kind != "cut":
+            raise ConfigError(f"fault {kind}: a pseudo terminal knows only cut", code="injection/not-supported")
+        self._is_cut = begins
 
     def send(self, data: bytes) -> None:
         """Send an answer. If no program reads it, it is lost once the kernel's buffer is full."""
+        if self._is_cut:
+            return
         with contextlib.suppress(BlockingIOError):
             self.sent_bytes += os.write(self._master, data)
 
@@ -88,7 +97,7 @@ class PseudoTerminal:
 
 
 class SerialWire:
-    """One port, opened for this process alone."""
+    """One port, opened for this process alone unless it only reads beside another one."""
 
     def __init__(
         self,
@@ -97,6 +106,8 @@ class SerialWire:
         log: TextIO | None = None,
         pty: PseudoTerminal | None = None,
         run_drives: RunDrives | None = None,
+        *,
+        exclusive: bool = True,
     ) -> None:
         """Open a serial port.
 
@@ -106,6 +117,7 @@ class SerialWire:
             log: Text file to which a line is written for everything that is sent or received; None for no log.
             pty: Pseudo terminal, if its drives are emulated in this process; otherwise None.
             run_drives: Function that runs the drives that are emulated in this process; otherwise None.
+            exclusive: Whether no other program may open the port meanwhile.
 
         Raises:
             ConfigError: There is no such port.
@@ -114,6 +126,7 @@ class SerialWire:
         self.port = port
         self.baud = baud
         self._log = log
+        self._is_exclusive = exclusive
 
         # Drives that are emulated in this process.
         self._pty = pty
@@ -228,7 +241,9 @@ class SerialWire:
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _open(self) -> serial.Serial:
-        port = serial.Serial(self.port, self.baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
+        port = serial.Serial(
+            self.port, self.baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=self._is_exclusive
+        )
         with contextlib.suppress(*IO_ERRORS):  # pseudo terminals and some adapters do not have this mode
             port.set_low_latency_mode(True)
         return port

@@ -135,6 +135,25 @@ def draw_overview() -> Drawing:
     return drawing
 
 
+def draw_qualification() -> Drawing:
+    """Return what takes part in the first hour with a drive: a host, a second program, the drive and the record."""
+    drawing = Drawing(920, 250, "Qualification of one drive: the command, the host, a second program and the record")
+    drawing.box(20, 70, 190, 80, "snakesim drive qualify\ninstructs and measures", "yours")
+    drawing.box(300, 20, 190, 70, "HAL host\nlease, command limiter", "computer")
+    drawing.box(300, 130, 190, 70, "second program\npolls the drive", "plain")
+    drawing.box(680, 60, 210, 100, "one drive\nclamped,\ncurrent limited", "drive")
+    drawing.line((210, 95), (255, 95), (255, 55), (300, 55), arrow=True)
+    drawing.text(248, 46, "commands", anchor="middle")
+    drawing.line((210, 125), (255, 125), (255, 165), (300, 165), arrow=True)
+    drawing.line((490, 55), (585, 55), (585, 95), (680, 95), kind="bus")
+    drawing.line((490, 165), (585, 165), (585, 125), (680, 125), kind="bus")
+    drawing.text(585, 46, "setpoints", anchor="middle")
+    drawing.text(585, 186, "status only", anchor="middle")
+    drawing.line((115, 150), (115, 205), arrow=True)
+    drawing.text(115, 226, "signed record of confirmed claims", anchor="middle")
+    return drawing
+
+
 def draw_mixed() -> Drawing:
     """Return a robot with drives of two types, on three buses."""
     drawing = Drawing(920, 300, "One robot with ODrive axes on two CAN buses and Dynamixel servos on a serial port")
@@ -307,6 +326,7 @@ def draw_tour() -> Drawing:
 
 DIAGRAMS: dict[str, Callable[[], Drawing]] = {
     "hardware-overview.svg": draw_overview,
+    "qualification.svg": draw_qualification,
     "mixed-buses.svg": draw_mixed,
     "cable-turns.svg": draw_cable,
     "motion-capture.svg": draw_motion_capture,

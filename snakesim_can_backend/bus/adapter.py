@@ -3,7 +3,8 @@
 A channel is a SocketCAN interface (`can0`), or `INTERFACE:CHANNEL` of python-can: `slcan:/dev/ttyACM0`,
 `pcan:PCAN_USBBUS1`, `kvaser:0`, `gs_usb:0`, `udp_multicast:239.74.163.2`. Its adapter is configured to the bit rate; a
 kernel interface has that of `ip link`. A bus of CAN FD has a second bit rate, for data, and frames of up to 64 bytes
-with ids of 11 or 29 bits. `unix:PATH` is a socket of emulated modules in another process, without any adapter.
+with ids of 11 or 29 bits. Two kinds of bus need no adapter: `unix:PATH`, a socket of emulated modules in another
+process, and `loopback:FOLDER`, a bus of emulated drives between processes.
 """
 
 import contextlib
@@ -20,16 +21,20 @@ import can
 from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, to_python_can, validate_interface
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
+from snakesim_can_backend.bus.loopback_wire import INTERFACE as LOOPBACK
+from snakesim_can_backend.bus.loopback_wire import LoopbackWire
 from snakesim_can_backend.bus.unix_wire import UNIX, UnixWire, validate_socket
 from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError, suggest_word
 
-INTERFACES_WITHOUT_ADAPTER = ("udp_multicast", "virtual", UNIX)  # interfaces without an adapter, and without a bit rate
+OWN_INTERFACES = (UNIX, LOOPBACK)  # implemented here, not by python-can
+INTERFACES_WITHOUT_ADAPTER = ("udp_multicast", "virtual", *OWN_INTERFACES)  # they have no bit rate, either
 FD_INTERFACES = (
     "socketcan",
     "kvaser",
     "udp_multicast",
     "virtual",
+    LOOPBACK,
 )  # interfaces through which this driver supports CAN FD
 ARE_MULTICAST_GROUPS_SEPARATE = sys.platform == "linux"  # only Linux keeps multicast groups on one UDP port apart
 IP_MULTICAST_ALL = 49  # linux/in.h
@@ -83,6 +88,8 @@ def open_wire(
         BackendError: The channel cannot be opened.
     """
     interface, name = split_channel(channel)
+    if interface == LOOPBACK:
+        return LoopbackWire(channel, name, only)
     if interface == "socketcan" and data_bit_rate is None:
         return SocketCanWire(name, only)
     if interface == UNIX:
@@ -95,8 +102,8 @@ def split_channel(channel: str) -> tuple[str, str]:
     interface, colon, name = channel.partition(":")
     if not colon:
         return "socketcan", channel
-    if interface != UNIX and interface not in can.VALID_INTERFACES:
-        interfaces = sorted((*can.VALID_INTERFACES, UNIX))
+    if interface not in (*can.VALID_INTERFACES, *OWN_INTERFACES):
+        interfaces = sorted((*can.VALID_INTERFACES, *OWN_INTERFACES))
         raise ConfigError(
             f"channel {channel!r}: python-can has no interface {interface!r}; "
             f"{suggest_word(interface, interfaces)}it has {', '.join(interfaces)}",

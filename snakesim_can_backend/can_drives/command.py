@@ -13,6 +13,7 @@ from snakesim_can_backend.bus.bus import wait
 from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_drivers.emulation.drive_emulator import serve_until_stopped
+from snakesim_drivers.emulation.emulator_control import EmulatorControl
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import set_parent_death_signal
@@ -48,8 +49,10 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
     wires = [open_wire(channel, None, settings.bit_rate, settings.fd_rate) for channel in settings.channels]
     emulator = backend.make_emulator(config, settings, wires, DriverClock(config), arguments.pose)
     ready_text = f"{backend.plural_noun} ready: {len(emulator.wires)} on {', '.join(settings.channels)}"
-    with contextlib.closing(emulator):
-        serve_until_stopped(ready_text, emulator, partial(wait, wires))
+    with contextlib.ExitStack() as exit_stack:
+        exit_stack.enter_context(contextlib.closing(emulator))
+        control = EmulatorControl(arguments, emulator.inject_typed, emulator.read_true_state, exit_stack)
+        serve_until_stopped(ready_text, emulator, partial(wait, wires), control.run)
     return 0
 
 

@@ -8,6 +8,7 @@ from snakesim_can_backend.cia402.drives import Cia402Drives
 from snakesim_can_backend.cia402.eds import read_all_eds
 from snakesim_can_backend.cia402.emulator import EmulatedCia402
 from snakesim_can_backend.cia402.frames import FIRST_NODE, LAST_NODE
+from snakesim_can_backend.cia402.probe import NodeProbe
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
@@ -45,6 +46,10 @@ class Cia402Backend(CanDriveBackend):
         ),  # SYNC and heartbeat; five reads of health and serial number
         heartbeats_hz=10.0,
     )
+
+    @classmethod
+    def open_probe(cls, config: RunConfig, settings: Cia402Settings) -> NodeProbe:
+        return NodeProbe(config, settings)
 
     @classmethod
     def validate_joint(cls, config: RunConfig, settings: Cia402Settings, joint: Joint) -> None:

@@ -177,6 +177,9 @@ class EmulatedCia402(CanEmulator):
         elif function in RECEIVE_PDOS:
             self._receive_pdo(i, frame)
 
+    def list_enabled(self) -> list[bool]:
+        return [drive.state in (PowerState.ENABLED, PowerState.QUICK_STOP) for drive in self.drives]
+
     def on_step(self, now_us: float) -> None:
         """Let drives boot, watch the host, stop when they are too hot, and send heartbeats."""
         for i, drive in enumerate(self.drives):

@@ -5,6 +5,7 @@ from snakesim_can_backend.bus.load import plan_reports, validate_bus_load
 from snakesim_can_backend.driver.modules import JointModules
 from snakesim_can_backend.driver.own_emulators import validate_emulator_settings, validate_fault_plan
 from snakesim_can_backend.driver.parameters import validate_joint_drives, validate_ratings, validate_watchdog
+from snakesim_can_backend.driver.probe import ModuleProbe
 from snakesim_can_backend.driver.sensors import SampleBuilder, describe_sensors
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import validate_mounting_overrides
@@ -27,6 +28,10 @@ class CanBackend(DriveBackend):
     reset_grace_cycles = 0  # the monitor itself gives modules time to follow a reset
     modules: JointModules
     _sample_builder: SampleBuilder
+
+    @classmethod
+    def open_probe(cls, config: RunConfig, settings: CanSettings) -> ModuleProbe:
+        return ModuleProbe(config, settings)
 
     @classmethod
     def check(cls, config: RunConfig, settings: CanSettings) -> tuple[ClockMode, ...]:

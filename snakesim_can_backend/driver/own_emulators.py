@@ -189,7 +189,7 @@ class EmulatorProcess:
 
     def inject(self, fault: FaultInjection, *, begins: bool) -> None:
         """Start or end a fault of a module. Raises BackendError if the child has ended."""
-        from snakesim_can_backend.emulator.faults import format_typed_fault
+        from snakesim_drivers.emulation.emulator_control import format_typed_fault
 
         assert self._process.stdin is not None
         line = f"{format_typed_fault(fault, begins=begins)}\n"

@@ -1,8 +1,8 @@
 """`snakesim drive emulate can`: the joint modules of a robot, emulated, as a process on SocketCAN interfaces."""
 
 import argparse
+import dataclasses
 import math
-import select
 import sys
 import time
 from collections.abc import Sequence
@@ -13,21 +13,23 @@ import msgspec
 
 from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation
 from snakesim_can_backend.bus.adapter import is_emulated, open_wire, split_channel, validate_channels
-from snakesim_can_backend.bus.bus import Wire, wait
+from snakesim_can_backend.bus.bus import Wire, inject_into, wait
 from snakesim_can_backend.bus.load import count_joints_per_bus, format_bit_rate
 from snakesim_can_backend.bus.unix_wire import UNIX
 from snakesim_can_backend.emulator.bus_time import BusTraffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
-from snakesim_can_backend.emulator.faults import parse_fault, parse_typed_fault
+from snakesim_can_backend.emulator.faults import parse_fault, validate_fault
 from snakesim_can_backend.emulator.reference_firmware import replace_this_process, validate_firmware_settings
 from snakesim_can_backend.emulator.server import EmulatorServer
-from snakesim_can_backend.protocol.definitions import FROM_HOST
+from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
 from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation.emulator_control import EmulatorControl, TrueState
 from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import call_on_stop_signals, set_parent_death_signal, tune_garbage_collector
 from snakesim_hal.base.terminal import print_line, run_tool
+from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.files import ConfigTable, decode_table
 from snakesim_hal.model.scenario import KeyOverride, LoadedScenario, load_scenario, parse_set_option
 
@@ -35,6 +37,7 @@ TOOL = "snakesim drive emulate can"
 NO_POSE = "none"
 STATS_PERIOD_S = 1.0
 MAX_PAUSE_S = 0.5  # until a stop signal is checked
+DRIVING_STATES = (ModuleState.ARMED, ModuleState.STOPPING)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -81,10 +84,11 @@ def emulate(arguments: argparse.Namespace) -> int:
         physics_model = make_physics_model(loaded.config, settings, "can")
         chain = ModuleChain(loaded.config, settings, physics_model, stepped=arguments.stepped, send_pose=send_pose)
         loop = EmulatorLoop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
+        control = EmulatorControl(arguments, loop.inject_typed, loop.read_true_state, exit_stack)
         call_on_stop_signals(loop.stop)
         tune_garbage_collector()
         print_line(f"modules ready: {module_count} on {', '.join(settings.channels)}")
-        loop.run()
+        loop.run(control)
         for line in loop.summary():
             print_line(line)
         return 0
@@ -154,7 +158,6 @@ class EmulatorLoop:
         # Options.
         self._duration_s: float | None = arguments.duration
         self._should_print_stats: bool = arguments.stats
-        self._is_interactive: bool = arguments.interactive  # until the terminal is closed
 
         # Statistics.
         self._start_s = time.monotonic()
@@ -165,8 +168,12 @@ class EmulatorLoop:
         """End after this cycle."""
         self._should_run = False
 
-    def run(self) -> None:
-        """Serve the buses until the loop is stopped or its duration is over."""
+    def run(self, control: EmulatorControl) -> None:
+        """Serve the buses until the loop is stopped or its duration is over.
+
+        Args:
+            control: Typed faults and a log of the modules.
+        """
         deadline_s = math.inf if self._duration_s is None else self._start_s + self._duration_s
         last_printed_traffic = self._start_traffic
         last_printed_s = self._start_s
@@ -178,8 +185,7 @@ class EmulatorLoop:
             if self._should_print_stats and now_s - last_printed_s >= STATS_PERIOD_S:
                 last_printed_traffic = self._print_loads(last_printed_traffic, now_s)
                 last_printed_s = now_s
-            if self._is_interactive:
-                self._inject_typed_faults()
+            control.run()
             if idle_duration_s is None:  # stepped: only a frame can make something due
                 wait(self._server.wires, MAX_PAUSE_S)
                 continue
@@ -220,23 +226,17 @@ class EmulatorLoop:
         print_line(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}")
         return after
 
-    def _inject_typed_faults(self) -> None:
-        """Inject the faults that a person has typed."""
-        while self._is_interactive and select.select([sys.stdin], [], [], 0)[0]:
-            line = sys.stdin.readline()
-            if not line:
-                self._is_interactive = False
-            elif line.strip():
-                self._inject_typed_fault(line)
+    def inject_typed(self, fault: FaultInjection, begins: bool) -> None:
+        """Start or end a fault that was typed: of a module, or of a bus at the modules' end. Raises ConfigError."""
+        if inject_into(self._server.wires, fault, begins=begins):
+            return
+        validate_fault(fault, self._chain.module_count)
+        self._chain.inject(dataclasses.replace(fault, start_s=self._chain.now_us * 1e-6), begins=begins)
 
-    def _inject_typed_fault(self, line: str) -> None:
-        now_s = self._chain.now_us * 1e-6
-        try:
-            fault, begins = parse_typed_fault(line, self._chain.module_count, now_s)
-        except ConfigError as error:
-            print_line(str(error))
-        else:
-            self._chain.inject(fault, begins=begins)
+    def read_true_state(self) -> TrueState:
+        """Return what the modules really do now."""
+        enabled = [slot.module.state in DRIVING_STATES for slot in self._chain.slots if slot.drives]
+        return TrueState(enabled, [float(angle) for angle in self._chain.physics_model.angle_rad])
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from snakesim_can_backend.can_drives.backend import CanDriveBackend
 from snakesim_can_backend.can_drives.traffic import CycleTraffic
 from snakesim_can_backend.moteus.controllers import MoteusControllers, compute_required_gains, get_configured_gains
 from snakesim_can_backend.moteus.emulator import EmulatedMoteus
+from snakesim_can_backend.moteus.probe import ControllerProbe
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
 from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_hal.base.errors import ConfigError
@@ -31,6 +32,10 @@ class MoteusBackend(CanDriveBackend):
         bytes_per_drive=(5, 24, 48),  # request, answer and command
         bytes_per_cycle=(6, 24, 3, 16),  # requests and answers of health and serial number
     )
+
+    @classmethod
+    def open_probe(cls, config: RunConfig, settings: MoteusSettings) -> ControllerProbe:
+        return ControllerProbe(config, settings)
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: MoteusSettings, joints: Sequence[Joint]) -> None:

@@ -114,6 +114,9 @@ class EmulatedMoteus(CanEmulator):
             source, _ = split_addresses(frame)
             self.send_frame(i, make_frame(self.controllers[i].id, source, *response_subframes))
 
+    def list_enabled(self) -> list[bool]:
+        return [controller.mode == MoteusMode.POSITION for controller in self.controllers]
+
     def on_step(self, now_us: float) -> None:
         """Stop controllers whose watchdog has expired, and those that are too hot."""
         for i, controller in enumerate(self.controllers):

@@ -14,6 +14,7 @@ from snakesim_can_backend.odrive.axes import (
 )
 from snakesim_can_backend.odrive.emulator import HEARTBEAT_US, EmulatedOdrive
 from snakesim_can_backend.odrive.endpoints import read_all_endpoints
+from snakesim_can_backend.odrive.probe import AxisProbe
 from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_can_backend.odrive.settings import OdriveSettings
 from snakesim_drivers.kit.drive_settings import make_joint_label
@@ -38,6 +39,10 @@ class OdriveBackend(CanDriveBackend):
         bytes_per_cycle=(0, 0, 0, 0, 8, 8, 8, 8),  # four requests and their answers
         heartbeats_hz=1e6 / HEARTBEAT_US,
     )
+
+    @classmethod
+    def open_probe(cls, config: RunConfig, settings: OdriveSettings) -> AxisProbe:
+        return AxisProbe(config, settings)
 
     @classmethod
     def validate_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:

@@ -160,6 +160,9 @@ class EmulatedOdrive(CanEmulator):
         else:
             self._execute_command(i, axis, message_id, values)
 
+    def list_enabled(self) -> list[bool]:
+        return [axis.state == AxisState.CLOSED_LOOP for axis in self.axes]
+
     def on_step(self, now_us: float) -> None:
         """Stop axes whose watchdog has expired; at each heartbeat, also those that are too hot."""
         for i, axis in enumerate(self.axes):

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
+from snakesim_drivers.emulation.emulator_control import TrueState
+from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import (
     SERVICE_PRIORITY,
     call_on_stop_signals,
@@ -19,7 +21,12 @@ MAX_WAIT_S = 0.001  # longest wait for frames or bytes, of drives in a process o
 MAX_REALTIME_BUSY_S = 0.2  # computing without a pause, after which emulated drives give up their real-time priority
 
 
-def serve_until_stopped(ready_text: str, emulator: Callable[[], object], wait: Callable[[float], object]) -> None:
+def serve_until_stopped(
+    ready_text: str,
+    emulator: Callable[[], object],
+    wait: Callable[[float], object],
+    control: Callable[[], object] = lambda: None,
+) -> None:
     """Run emulated drives until this process gets a stop signal.
 
     The process gets real-time priority if the system allows it, because real drives answer however busy the computer
@@ -29,6 +36,7 @@ def serve_until_stopped(ready_text: str, emulator: Callable[[], object], wait: C
         ready_text: Line that is printed when the drives are ready.
         emulator: Function that handles what has arrived, and simulates up to the current time.
         wait: Function that waits until frames or bytes arrive; its argument is the maximum wait in s.
+        control: Function that is called in each cycle, for typed faults and a log.
     """
     run_flag = [True]  # emptied by the signal handler
     call_on_stop_signals(run_flag.clear)
@@ -38,6 +46,7 @@ def serve_until_stopped(ready_text: str, emulator: Callable[[], object], wait: C
     print_line(ready_text)
     while run_flag:
         emulator()
+        control()
         wait(MAX_WAIT_S)
 
 
@@ -46,6 +55,10 @@ class BusEnd(Protocol):
 
     def close(self) -> None:
         """Close it."""
+        ...
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Start or end a fault of the bus at this end, such as "cut"."""
         ...
 
 
@@ -83,11 +96,32 @@ class DriveEmulator(ABC, Generic[BusEndT]):
         """Update the drives after a physics step: watchdogs, over-temperature, and reports that are due."""
 
     def list_enabled(self) -> list[bool]:
-        """Return for each drive whether it would follow a setpoint now, for the contract suite.
-
-        The default is for emulators that the contract suite knows.
-        """
+        """Return for each drive whether it would follow a setpoint now, for the contract suite and the drive log."""
         raise NotImplementedError(f"{type(self).__name__}.list_enabled")
+
+    def read_true_state(self) -> TrueState:
+        """Return what the drives really do now."""
+        return TrueState(self.list_enabled(), [self.body.read_joint_angle_rad(i) for i in range(len(self.body.joints))])
+
+    def inject_typed(self, injection: FaultInjection, begins: bool) -> None:
+        """Start or end a fault that was typed: of a drive, or of a bus at the drives' end.
+
+        Args:
+            injection: The fault, with its joint or bus.
+            begins: Whether the fault starts; otherwise it ends.
+
+        Raises:
+            ConfigError: There is no such fault, joint or bus.
+        """
+        if injection.target_type != "bus":
+            self.inject(injection, begins=begins)
+            return
+        if injection.target_index >= len(self._bus_ends):
+            raise ConfigError(
+                f"there is no {injection.target}; these drives are on bus_1 to bus_{len(self._bus_ends)}",
+                code="injection/unknown-target",
+            )
+        self._bus_ends[injection.target_index].inject(injection.kind, begins=begins)
 
     def catch_up(self) -> None:
         """Simulate the time in which this process was paused, before any frame that has arrived since is handled.

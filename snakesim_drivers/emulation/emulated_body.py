@@ -118,6 +118,10 @@ class EmulatedBody:
         torque_nm = float(self.motors.torque_nm[j])
         return ShaftState(drive.zero_rad + ratio * angle_rad, ratio * velocity_rad_s, torque_nm / ratio)
 
+    def read_joint_angle_rad(self, i: int) -> float:
+        """Return the true angle of a drive's joint, however the drive is mounted."""
+        return float(self.physics_model.angle_rad[self._joint_indices[i]])
+
     def read_supply(self, i: int) -> tuple[float, float]:
         """Return the voltage in V and the current in A of a drive's supply."""
         supply = self.joints[i].supply

@@ -1,6 +1,7 @@
 """The nouns of `snakesim drive`, below which driver types register their commands, and arguments that these share."""
 
 import argparse
+from pathlib import Path
 
 from snakesim_hal.programs.arguments import (
     add_json_argument,
@@ -37,10 +38,23 @@ def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = 
     parser.add_argument("--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})")
 
 
+def add_control_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a process that emulates drives and that a person or a program controls."""
+    parser.add_argument(
+        "--interactive",
+        action="store_true",
+        help="read faults from the terminal: `KIND joint_N` or `cut bus_1`, and the same with `off`",
+    )
+    parser.add_argument(
+        "--drive-log", type=Path, metavar="FILE", help="write when each drive was enabled and disabled, as JSON lines"
+    )
+
+
 def add_emulation(parser: argparse.ArgumentParser, channel_about: str) -> None:
     """Add all arguments of a command that emulates drives; `channel_about` is the help text of `--channel`."""
     add_scenario_name_argument(parser)
     add_channel(parser, channel_about)
     add_set_argument(parser)
     add_pose(parser, "default: nowhere")
+    add_control_arguments(parser)
     add_parent_argument(parser)

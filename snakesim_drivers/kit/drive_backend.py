@@ -7,19 +7,20 @@ between here and the drives are those at the drives' shafts, in SI units.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 
 from snakesim_drivers.kit.braking import BrakingJoints
 from snakesim_drivers.kit.drive_guard import NO_DRIVES, RESET_GRACE_CYCLES
+from snakesim_drivers.kit.drive_probe import DriveProbe
 from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import FaultFinding, ReportedFindings
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
-from snakesim_hal.base.errors import BackendError
+from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.robot import add_drive_identities
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
@@ -67,6 +68,28 @@ class DriveBackend(Backend):
     """A backend on drives. The hooks at the end are for driver types that need more."""
 
     reset_grace_cycles: ClassVar[int] = RESET_GRACE_CYCLES  # after a reset, in which drives may report older errors
+    polling_feeds_watchdog: ClassVar[bool] = False  # True: packets of any program keep a drive on after its host died
+
+    @classmethod
+    def open_probe(cls, config: RunConfig, settings: Any) -> DriveProbe:
+        """Open a second program on the bus of the first joint's drive, which only reads.
+
+        `snakesim drive qualify` uses it. A driver type without a probe raises ConfigError, as the default does.
+
+        Args:
+            config: Configuration of the run.
+            settings: An instance of `Settings`, which names the bus.
+
+        Raises:
+            ConfigError: The driver type has no probe.
+            BackendError: The bus cannot be opened.
+        """
+        del config, settings
+        raise ConfigError(
+            f"{cls.__name__} has no `open_probe`, so no second program can read its drives; see "
+            f"docs/hardware/write-a-driver.md",
+            code="drive/unsupported-setting",
+        )
 
     def __init__(self, config: RunConfig, parts: DriveBackendParts) -> None:
         """Open the buses and bring up every drive; no drive is enabled.

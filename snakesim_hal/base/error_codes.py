@@ -383,6 +383,11 @@ ERROR_CODES = {
         "Correct it, and arm again.",
         page="troubleshooting/not-armed.md",
     ),
+    "robot/not-running": ErrorCode(
+        "The robot's host ended before the command could connect to it.",
+        "The host could not start, or its drives did not answer. The last lines of the host are in the message.",
+        "Correct what these lines name, and run the command again.",
+    ),
     "robot/not-disarmed": ErrorCode(
         "The robot must be disarmed for this.",
         "It is armed, or stopped by a fault.",

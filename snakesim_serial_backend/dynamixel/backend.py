@@ -14,6 +14,7 @@ from snakesim_serial_backend.dynamixel.emulator import MAX_CURRENT, MODEL, Emula
 from snakesim_serial_backend.dynamixel.load import PORT_LOAD
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import DynamixelPort
+from snakesim_serial_backend.dynamixel.probe import DynamixelProbe
 from snakesim_serial_backend.dynamixel.servo import REVOLUTION_RAD, SLACK_RAD, DynamixelServo
 from snakesim_serial_backend.dynamixel.servos import DynamixelContext, DynamixelServos
 from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
@@ -30,7 +31,12 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
     Settings = DynamixelSettings
     name = NAME
     port_load: ClassVar[PortLoad] = PORT_LOAD
+    polling_feeds_watchdog: ClassVar[bool] = True  # the bus watchdog counts every packet to the servo
     supported_modes = ("position", "torque")  # servos have no other mode, even if the robot file lists one
+
+    @classmethod
+    def open_probe(cls, config: RunConfig, settings: DynamixelSettings) -> DynamixelProbe:
+        return DynamixelProbe(config, settings)
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:

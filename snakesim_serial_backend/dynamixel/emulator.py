@@ -389,6 +389,9 @@ class EmulatedDynamixel(ServoEmulator):
         else:
             self.body.drive_motor(i, JointMode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
+    def list_enabled(self) -> list[bool]:
+        return [servo.is_torque_on and servo.table[registers.WATCHDOG] != registers.TRIPPED for servo in self.servos]
+
     def on_step(self, now_us: float) -> None:
         """Let watchdogs expire, and detect servos that are too hot or have too little supply voltage."""
         for i, servo in enumerate(self.servos):

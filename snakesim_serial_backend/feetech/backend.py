@@ -15,6 +15,7 @@ from snakesim_serial_backend.feetech.emulator import EmulatedFeetech
 from snakesim_serial_backend.feetech.load import PORT_LOAD
 from snakesim_serial_backend.feetech.packets import LAST_ID
 from snakesim_serial_backend.feetech.port import FeetechPort
+from snakesim_serial_backend.feetech.probe import FeetechProbe
 from snakesim_serial_backend.feetech.servo import FeetechServo
 from snakesim_serial_backend.feetech.servos import FeetechContext, FeetechServos
 from snakesim_serial_backend.feetech.settings import NAME, FeetechSettings
@@ -32,6 +33,10 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
     supported_modes = ("position",)  # servos have no other mode that the driver uses, even if the robot file lists one
     unmeasured: ClassVar[Collection[Measurement]] = ("torque",)
     has_watchdog: ClassVar[bool] = False
+
+    @classmethod
+    def open_probe(cls, config: RunConfig, settings: FeetechSettings) -> FeetechProbe:
+        return FeetechProbe(config, settings)
 
     @classmethod
     def check_drives(cls, config: RunConfig, settings: FeetechSettings, joints: Sequence[Joint]) -> None:

@@ -253,6 +253,9 @@ class EmulatedFeetech(ServoEmulator):
         goal_rad = registers.to_angle_rad(goal + offset)
         self.body.drive_motor(i, JointMode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
 
+    def list_enabled(self) -> list[bool]:
+        return [servo.is_torque_on for servo in self.servos]
+
     def on_step(self, now_us: float) -> None:
         """Detect servos that are too hot or have too little supply voltage."""
         del now_us

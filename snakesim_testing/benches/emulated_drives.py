@@ -2,17 +2,8 @@
 
 from typing import Any
 
-from snakesim_can_backend.cia402.emulator import EmulatedCia402
-from snakesim_can_backend.cia402.state_machine import PowerState
-from snakesim_can_backend.moteus.emulator import EmulatedMoteus
-from snakesim_can_backend.moteus.protocol import MoteusMode
-from snakesim_can_backend.odrive.emulator import EmulatedOdrive
-from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_can_backend.protocol.definitions import ModuleState
-from snakesim_drivers.template.minimal_driver import MinimalDrives, MinimalEmulator
-from snakesim_serial_backend.dynamixel import registers as at
-from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
-from snakesim_serial_backend.feetech.emulator import EmulatedFeetech
+from snakesim_drivers.template.minimal_driver import MinimalDrives
 from snakesim_testing.can.driver_loop import chain_of
 from snakesim_testing.contract.bench import TorqueSwitch
 from snakesim_testing.contract.kit_drives import KitDrives
@@ -68,18 +59,4 @@ class ModuleDrives:
 
 def list_enabled_drives(emulator: Any) -> list[bool]:
     """Of the emulated drives of one driver type, those that would follow a setpoint."""
-    match emulator:
-        case EmulatedOdrive():
-            return [axis.state == AxisState.CLOSED_LOOP for axis in emulator.axes]
-        case EmulatedCia402():
-            return [drive.state in (PowerState.ENABLED, PowerState.QUICK_STOP) for drive in emulator.drives]
-        case EmulatedMoteus():
-            return [controller.mode == MoteusMode.POSITION for controller in emulator.controllers]
-        case EmulatedDynamixel():
-            return [servo.is_torque_on and servo.table[at.WATCHDOG] != at.TRIPPED for servo in emulator.servos]
-        case MinimalEmulator():
-            return emulator.list_enabled()
-        case EmulatedFeetech():
-            return [servo.is_torque_on for servo in emulator.servos]
-        case _:
-            raise TypeError(f"drives of an unknown driver type: {emulator}")
+    return emulator.list_enabled()

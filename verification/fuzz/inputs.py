@@ -18,6 +18,7 @@ import msgspec
 import pytest
 
 from snakesim_can_backend.emulator import faults as twin_faults
+from snakesim_drivers.emulation.emulator_control import parse_typed_fault
 from snakesim_drivers.motion_capture.mocap import MAX_DATAGRAM_BYTES, MocapReceiver
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP, EstopLatch
@@ -204,7 +205,7 @@ def texts() -> list[DecoderInput]:
         DecoderInput(
             "a typed fault",
             [b"mute joint_3 off", b"leak joint_1"],
-            typed(lambda t: twin_faults.parse_typed_fault(t, 13, 1.0)),
+            typed(parse_typed_fault),
         ),
     ]
 

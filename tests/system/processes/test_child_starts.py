@@ -39,7 +39,7 @@ STARTS = {
     "LocalCluster",
 }
 OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
-    "benchmarks/checkouts.py": "Python of another checkout, with the environment of that one",
+    "benchmarks/checkouts.py": "git",
     "benchmarks/paths/ways.py": "openssl",
     "benchmarks/peers/__main__.py": "rospy, dora and apt, each with an interpreter of its own",
     "deploy/bootstrap.py": "before anything is installed; its environment has the variable",

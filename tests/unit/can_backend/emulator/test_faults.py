@@ -2,18 +2,26 @@
 
 import pytest
 
-from snakesim_can_backend.emulator.faults import format_typed_fault, parse_fault, parse_typed_fault
+from snakesim_can_backend.emulator.faults import parse_fault
+from snakesim_drivers.emulation.emulator_control import format_typed_fault, parse_typed_fault
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_testing.messages import raises_error
 
 
 def test_emulator_typed_fault_starts_or_ends_immediately():
-    fault = FaultInjection("mute", "joint_2", 7.0)
-    assert parse_typed_fault("mute joint_2\n", 4, 7.0) == (fault, True)
-    assert parse_typed_fault("mute joint_2 off", 4, 7.0) == (fault, False)
+    fault = FaultInjection("mute", "joint_2")
+    assert parse_typed_fault("mute joint_2\n") == (fault, True)
+    assert parse_typed_fault("mute joint_2 off") == (fault, False)
+    assert parse_typed_fault("cut bus_1") == (FaultInjection("cut", "bus_1"), True)
     for begins in (True, False):
-        assert parse_typed_fault(format_typed_fault(fault, begins=begins), 4, 7.0) == (fault, begins)
+        assert parse_typed_fault(format_typed_fault(fault, begins=begins)) == (fault, begins)
+
+
+@pytest.mark.parametrize("text", ["mute", "mute joint_2 on", "boil joint_1", "mute joint_2=1", "x" * 400])
+def test_typed_fault_of_another_form_is_refused(text: str):
+    with raises_error(ConfigError, code="injection/unknown-fault"):
+        parse_typed_fault(text)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,42 @@
+"""`snakesim` with emulated drives that have a fault of their own, for tests that must find it.
+
+`python -m snakesim_testing.drivers.mutant_drive_program MUTANT drive emulate moteus ...`
+"""
+
+import sys
+from collections.abc import Callable
+
+from snakesim_can_backend.moteus.emulator import EmulatedMoteus
+from snakesim_can_backend.moteus.protocol import MoteusMode
+from snakesim_operator.cli import main as run_command
+
+
+def disable_watchdog() -> None:
+    """The controller follows its last command for ever."""
+
+    def on_step(self: EmulatedMoteus, now_us: float) -> None:
+        del self, now_us
+
+    EmulatedMoteus.on_step = on_step
+
+
+def enable_again() -> None:
+    """The controller returns to position mode half a second after its watchdog has stopped it."""
+    correct_on_step = EmulatedMoteus.on_step
+
+    def on_step(self: EmulatedMoteus, now_us: float) -> None:
+        correct_on_step(self, now_us)
+        for controller in self.controllers:
+            if controller.mode == MoteusMode.TIMEOUT and now_us - controller.watchdog_fed_us > 6e5:
+                controller.mode = MoteusMode.POSITION
+                controller.watchdog_fed_us = now_us
+
+    EmulatedMoteus.on_step = on_step
+
+
+MUTANTS: dict[str, Callable[[], None]] = {"no_watchdog": disable_watchdog, "enables_again": enable_again}
+
+
+if __name__ == "__main__":
+    MUTANTS[sys.argv[1]]()
+    sys.exit(run_command(sys.argv[2:]))
