@@ -24,7 +24,10 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
     "controller": (["run", "--controller", ""], set(list_installed_plugins(CONTROLLERS))),
     "free value": (["run", "--duration", ""], set()),
     "after a free value": (["run", "--duration", "3", "pe"], {"peg_row"}),
-    "of an installed package": (["drive", ""], {"load", "scan", "replay", "emulate", "dbc", "new"}),
+    "of an installed package": (
+        ["drive", ""],
+        {"load", "scan", "replay", "emulate", "dbc", "new", "qualify", "verify"},
+    ),
     "driver type": (["drive", "emulate", "o"], {"odrive"}),
     "its argument": (["drive", "load", "can", "pe"], {"peg_row"}),
     "its flag": (["drive", "load", "can", "peg_row", "--jo"], {"--joints"}),
