@@ -23,7 +23,8 @@ from can.interfaces.socketcan.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
-from snakesim_can_backend.bus.bus_faults import SendOutcome, VirtualFaults, inject_into_interface
+from snakesim_can_backend.bus.bus_faults import inject_into_interface
+from snakesim_can_backend.bus.faultable_wire import FaultableWire
 from snakesim_can_backend.protocol.definitions import NODE_BITS, NODE_MASK, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
@@ -269,7 +270,7 @@ def make_virtual_channel() -> str:
     return f"virtual-{uuid.uuid4().hex[:8]}-0"
 
 
-class VirtualWire:
+class VirtualWire(FaultableWire):
     """One end of python-can's virtual bus."""
 
     def __init__(self, channel: str, peer: VirtualPeer | None = None, *, fd: bool = False) -> None:
@@ -280,44 +281,27 @@ class VirtualWire:
             peer: Other end of the bus, which is run whenever this end is idle; None if it runs by itself.
             fd: Whether the bus is CAN FD.
         """
-        self.channel = channel
+        super().__init__(channel)
         self.peer = peer
         self._uses_fd = fd
         protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._bus = VirtualBus(channel=channel, protocol=protocol)
-        self._faults = VirtualFaults(channel)
 
-    def send(self, frame: CanFrame) -> bool:
-        """Send a frame, and return whether the bus accepted it. It always does, unless a fault is active."""
-        if self._faults.active:
-            match self._faults.simulate_send():
-                case SendOutcome.REJECTED:
-                    return False
-                case SendOutcome.LOST:
-                    return True
-                case SendOutcome.SENT:
-                    pass
+    def _send_frame(self, frame: CanFrame) -> bool:
         try:
             self._bus.send(to_python_can(frame, fd=self._uses_fd))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
         return True
 
-    def receive(self) -> list[CanFrame]:
-        """Return all received frames, in order."""
+    def _receive_frames(self) -> list[CanFrame]:
         frames: list[CanFrame] = []
         try:
             while (message := self._bus.recv(0)) is not None:
                 frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot receive: {error}", code="bus/io-failed") from error
-        if self._faults.active:
-            return self._faults.filter_received(frames)
         return frames
-
-    def errors(self) -> list[BusError]:
-        """Return the injected errors since the last call; a virtual bus has no others."""
-        return self._faults.pop_errors()
 
     def fileno(self) -> int | None:
         """Return None, because there is no file descriptor to wait on."""
@@ -327,10 +311,6 @@ class VirtualWire:
         """Let the other end run, and return when it must run again."""
         idle_duration_s = math.inf if self.peer is None else self.peer()
         return idle_duration_s if self._bus.queue.empty() else 0.0
-
-    def inject(self, kind: str, *, begins: bool) -> None:
-        """Start or end a fault, as an interface of the kernel would have it; the other end is not affected."""
-        self._faults.inject(kind, begins=begins)
 
     def close(self) -> None:
         """Close this end, and the other one if it is run by this one."""

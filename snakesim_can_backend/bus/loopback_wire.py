@@ -14,8 +14,7 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from snakesim_can_backend.bus.bus_errors import BusError
-from snakesim_can_backend.bus.bus_faults import SendOutcome, VirtualFaults
+from snakesim_can_backend.bus.faultable_wire import FaultableWire
 from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError
 
@@ -28,7 +27,7 @@ LIST_PERIOD_S = 0.05  # after which the other ends of the bus are looked up agai
 _ID = struct.Struct("<I")
 
 
-class LoopbackWire:
+class LoopbackWire(FaultableWire):
     """One end of a bus between processes of this computer."""
 
     def __init__(self, channel: str, folder: str, only: Iterable[Opcode] | None = None) -> None:
@@ -42,10 +41,9 @@ class LoopbackWire:
         Raises:
             BackendError: The folder cannot be used.
         """
-        self.channel = channel
+        super().__init__(channel)
         self._folder = Path(folder)
         self._received_opcodes = None if only is None else frozenset(int(opcode) for opcode in only)
-        self._faults = VirtualFaults(channel)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
@@ -61,24 +59,15 @@ class LoopbackWire:
         self._other_ports: list[int] = []
         self._next_list_s = 0.0
 
-    def send(self, frame: CanFrame) -> bool:
-        """Send a frame to all other ends; return False if a fault is injected that prevents it."""
-        if self._faults.active:
-            match self._faults.simulate_send():
-                case SendOutcome.REJECTED:
-                    return False
-                case SendOutcome.LOST:
-                    return True
-                case SendOutcome.SENT:
-                    pass
+    def _send_frame(self, frame: CanFrame) -> bool:
+        """Send a frame to all other ends. Each accepts it, or loses it if its buffer is full."""
         datagram = _ID.pack(frame.id) + frame.data
         for port in self._list_other_ports():
             with contextlib.suppress(OSError):  # a full buffer loses the frame, as that of a kernel interface does
                 self._socket.sendto(datagram, (LOCALHOST, port))
         return True
 
-    def receive(self) -> list[CanFrame]:
-        """Return all received frames, in order."""
+    def _receive_frames(self) -> list[CanFrame]:
         frames: list[CanFrame] = []
         with contextlib.suppress(OSError):
             for _ in range(MAX_AT_ONCE):
@@ -88,13 +77,7 @@ class LoopbackWire:
                 (identifier,) = _ID.unpack_from(datagram)
                 if self._received_opcodes is None or identifier >> NODE_BITS in self._received_opcodes:
                     frames.append(CanFrame(identifier, datagram[_ID.size :]))
-        if self._faults.active:
-            return self._faults.filter_received(frames)
         return frames
-
-    def errors(self) -> list[BusError]:
-        """Return the injected errors since the last call; this bus has no others."""
-        return self._faults.pop_errors()
 
     def fileno(self) -> int | None:
         """Return the socket's file descriptor."""
@@ -103,10 +86,6 @@ class LoopbackWire:
     def idle(self) -> float | None:
         """Return that a frame may arrive at any time."""
         return math.inf
-
-    def inject(self, kind: str, *, begins: bool) -> None:
-        """Start or end a fault, as an interface of the kernel would have it; the other ends are not affected."""
-        self._faults.inject(kind, begins=begins)
 
     def close(self) -> None:
         """Leave the bus."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from snakesim_can_backend.bus.bus import IO_ERRORS, LAST_STANDARD_ID, RAW_FRAME_FORMAT
 from snakesim_can_backend.bus.bus_errors import BusError
-from snakesim_can_backend.bus.bus_faults import SendOutcome, VirtualFaults
+from snakesim_can_backend.bus.faultable_wire import FaultableWire
 from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.errors import BackendError, ConfigError
 
@@ -34,7 +34,7 @@ def validate_socket(path: str) -> None:
         )
 
 
-class UnixWire:
+class UnixWire(FaultableWire):
     """The driver's end of a bus on a Unix socket."""
 
     def __init__(self, path: str) -> None:
@@ -48,7 +48,7 @@ class UnixWire:
             BackendError: No process listens there.
         """
         validate_socket(path)
-        self.channel = f"{UNIX}:{path}"
+        super().__init__(f"{UNIX}:{path}")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self._socket.connect(path)
@@ -56,21 +56,12 @@ class UnixWire:
         except OSError as error:
             self._socket.close()
             raise BackendError(f"{self.channel}: cannot be opened: {error}", code="bus/cannot-open") from error
-        self._faults = VirtualFaults(self.channel)
         self._received = b""  # the beginning of a frame that has not arrived completely
         self._errors: list[BusError] = []
         self._is_down = False  # whether the modules' process has ended
 
-    def send(self, frame: CanFrame) -> bool:
+    def _send_frame(self, frame: CanFrame) -> bool:
         """Send a frame; return False if the modules' process does not read, or has ended."""
-        if self._faults.active:
-            match self._faults.simulate_send():
-                case SendOutcome.REJECTED:
-                    return False
-                case SendOutcome.LOST:
-                    return True
-                case SendOutcome.SENT:
-                    pass
         record = RAW_FRAME_FORMAT.pack(frame.id, len(frame.data), frame.data)
         try:
             sent_bytes = self._socket.send(record)
@@ -86,23 +77,19 @@ class UnixWire:
             return False
         return True
 
-    def receive(self) -> list[CanFrame]:
-        """Return all received frames, in order."""
+    def _receive_frames(self) -> list[CanFrame]:
         data = self._received + self._read_all()
         complete_bytes = len(data) - len(data) % RAW_FRAME_FORMAT.size
         self._received = data[complete_bytes:]
-        frames = [
+        return [
             CanFrame(identifier, payload[:length])
             for identifier, length, payload in RAW_FRAME_FORMAT.iter_unpack(data[:complete_bytes])
             if identifier <= LAST_STANDARD_ID
         ]
-        if self._faults.active:
-            return self._faults.filter_received(frames)
-        return frames
 
     def errors(self) -> list[BusError]:
         """Return the errors since the last call, with injected ones."""
-        errors = self._errors + self._faults.pop_errors()
+        errors = self._errors + super().errors()
         self._errors = []
         return errors
 
@@ -113,10 +100,6 @@ class UnixWire:
     def idle(self) -> float | None:
         """Return infinity, because a frame may arrive at any time; None if nothing can arrive any more."""
         return None if self._is_down else math.inf
-
-    def inject(self, kind: str, *, begins: bool) -> None:
-        """Start or end a fault, as an interface of the kernel would have it; the other end is not affected."""
-        self._faults.inject(kind, begins=begins)
 
     def close(self) -> None:
         """Close the socket."""
