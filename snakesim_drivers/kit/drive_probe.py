@@ -27,13 +27,6 @@ class ReadBack:
     reported: float | None  # None: the drive does not answer the request
     tolerance: float = 0.0  # largest allowed difference
 
-    @property
-    def is_as_required(self) -> bool | None:
-        """Whether the drive is configured as required; None if it does not answer."""
-        if self.reported is None:
-            return None
-        return abs(self.reported - self.required) <= self.tolerance
-
 
 class DriveProbe(ABC):
     """Reads one drive as a second program. A driver type returns one from `open_probe`.

@@ -1,21 +1,21 @@
 """A second program that reads one Dynamixel servo."""
 
-from snakesim_drivers.kit.drive_probe import DriveStatus, ReadBack
+from snakesim_drivers.kit.drive_probe import DriveStatus
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.port import DynamixelPort
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.servo_probe import ServoProbe
 
-REQUIRED_REGISTERS = {  # one byte each
-    "operating mode (11)": (registers.OPERATING_MODE, registers.CURRENT_BASED_POSITION),
-    "return delay (9)": (registers.DELAY, 0),
-    "status return level (68)": (registers.STATUS_LEVEL, 2),
-}
-
 
 class DynamixelProbe(ServoProbe[DynamixelPort]):
     """Reads the control table of a servo."""
+
+    required_registers = {
+        "operating mode (11)": (registers.OPERATING_MODE, registers.CURRENT_BASED_POSITION),
+        "return delay (9)": (registers.DELAY, 0),
+        "status return level (68)": (registers.STATUS_LEVEL, 2),
+    }
 
     def __init__(self, config: RunConfig, settings: DynamixelSettings) -> None:
         """Open the port of the servo."""
@@ -32,12 +32,3 @@ class DynamixelProbe(ServoProbe[DynamixelPort]):
         if is_tripped:
             text += ", the bus watchdog has tripped"
         return DriveStatus(bool(data[0]) and not is_tripped, text)
-
-    def read_configuration(self, timeout_s: float) -> list[ReadBack]:
-        """Read the registers that the driver has written or checked."""
-        del timeout_s
-        values: list[ReadBack] = []
-        for name, (address, required) in REQUIRED_REGISTERS.items():
-            data = self.read_registers(address, 1)
-            values.append(ReadBack(name, "1", required, None if data is None else float(data[0])))
-        return values

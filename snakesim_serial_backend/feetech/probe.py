@@ -1,21 +1,21 @@
 """A second program that reads one Feetech servo."""
 
-from snakesim_drivers.kit.drive_probe import DriveStatus, ReadBack
+from snakesim_drivers.kit.drive_probe import DriveStatus
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.port import FeetechPort
 from snakesim_serial_backend.feetech.settings import FeetechSettings
 from snakesim_serial_backend.servo_probe import ServoProbe
 
-REQUIRED_REGISTERS = {  # one byte each
-    "operating mode (33)": (registers.OPERATING_MODE, registers.POSITION_MODE),
-    "return delay (7)": (registers.DELAY, 0),
-    "status return level (8)": (registers.STATUS_LEVEL, 1),
-}
-
 
 class FeetechProbe(ServoProbe[FeetechPort]):
     """Reads the control table of a servo."""
+
+    required_registers = {
+        "operating mode (33)": (registers.OPERATING_MODE, registers.POSITION_MODE),
+        "return delay (7)": (registers.DELAY, 0),
+        "status return level (8)": (registers.STATUS_LEVEL, 1),
+    }
 
     def __init__(self, config: RunConfig, settings: FeetechSettings) -> None:
         """Open the port of the servo."""
@@ -28,12 +28,3 @@ class FeetechProbe(ServoProbe[FeetechPort]):
         if data is None:
             return None
         return DriveStatus(bool(data[0]), f"torque enable {data[0]}")
-
-    def read_configuration(self, timeout_s: float) -> list[ReadBack]:
-        """Read the registers that the driver has written."""
-        del timeout_s
-        values: list[ReadBack] = []
-        for name, (address, required) in REQUIRED_REGISTERS.items():
-            data = self.read_registers(address, 1)
-            values.append(ReadBack(name, "1", required, None if data is None else float(data[0])))
-        return values
