@@ -1,10 +1,10 @@
 """The reference firmware in C as a child of the driver, on a socket of its own."""
 
-import subprocess
 from pathlib import Path
 
 from snakesim_can_backend.driver.own_emulators import EmulatorProcess
 from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation.emulator_child import EmulatorChild
 from snakesim_hal.model.scenario import RunConfig
 
 SOCKET_NAME = "bus.sock"
@@ -33,8 +33,8 @@ class FirmwareProcess(EmulatorProcess):
         return f"unix:{self._folder.name}/{SOCKET_NAME}"
 
     def _start(
-        self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool
-    ) -> subprocess.Popen[bytes]:
+        self, config: RunConfig, settings: CanSettings, pose_address: str | None, output_path: Path, *, stepped: bool
+    ) -> EmulatorChild:
         from snakesim_can_backend.emulator.reference_firmware import (
             build_program,
             describe_modules,
@@ -45,11 +45,4 @@ class FirmwareProcess(EmulatorProcess):
         modules_path = folder / MODULES_NAME
         modules_path.write_text(describe_modules(config, settings), encoding="utf-8")
         arguments = make_program_arguments(str(folder / SOCKET_NAME), str(modules_path), stepped=stepped)
-        with self._output_path.open("wb") as output:
-            return subprocess.Popen(
-                [str(build_program()), *arguments, "--until-input-ends"],
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+        return EmulatorChild([str(build_program()), *arguments, "--until-input-ends"], output_path)

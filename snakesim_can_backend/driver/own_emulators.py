@@ -1,28 +1,22 @@
 """Emulated joint modules that a driver starts itself: in its own process on a virtual bus, or as a child on vcan."""
 
-import contextlib
 import os
-import signal
-import subprocess
 import tempfile
-import time
 from pathlib import Path
 
 import msgspec
 
 from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation.emulator_child import EmulatorChild
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import FAULT_KINDS, FaultInjection
 from snakesim_hal.model.fault_plan import validate_faults_for_backend
 from snakesim_hal.model.scenario import RunConfig, write_config
-from snakesim_hal.service import SERVICE_START_LIMIT_S
 
 READY_TEXT = "modules ready"  # a child prints it when its modules are on the bus
-STOP_TIMEOUT_S = 5.0  # after which a child that ignores SIGTERM is killed
-POLL_PERIOD_S = 0.02
 
 
 def validate_emulator_settings(config: RunConfig, settings: CanSettings) -> None:
@@ -134,18 +128,22 @@ class EmulatorProcess:
         """
         try:
             self._folder = tempfile.TemporaryDirectory(prefix="snakesim-emulators-", ignore_cleanup_errors=True)
-            self._output_path = Path(self._folder.name, "modules.log")
-            self._process = self._start(config, settings, pose_address, stepped=stepped)
+            output_path = Path(self._folder.name, "modules.log")
+            self._child = self._start(config, settings, pose_address, output_path, stepped=stepped)
         except OSError as error:
             raise BackendError(
                 f"the emulated joint modules cannot be started: {error}", code="emulator/not-started"
             ) from error
-        self._wait_until_ready()
+        if not self._child.wait_until_ready(READY_TEXT):
+            self.stop()
+            raise BackendError(
+                "the emulated joint modules did not start; see their output above", code="emulator/not-started"
+            )
 
     def _start(
-        self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool
-    ) -> subprocess.Popen[bytes]:
-        """Write the configuration for the child, and start it."""
+        self, config: RunConfig, settings: CanSettings, pose_address: str | None, output_path: Path, *, stepped: bool
+    ) -> EmulatorChild:
+        """Write the configuration for the child, and start it. Raises OSError."""
         backends = {**config.backends, "can": msgspec.to_builtins(settings)}
         config_path = Path(self._folder.name, "config.json")
         write_config(msgspec.structs.replace(config, backends=backends), config_path)
@@ -154,35 +152,14 @@ class EmulatorProcess:
             arguments += ["--channel", channel]
         if stepped:
             arguments.append("--stepped")
-        module = "snakesim_can_backend.emulator.command"
-        with self._output_path.open("wb") as output:
-            return subprocess.Popen(
-                make_python_command("-m", module, str(config_path), *arguments, "--interactive"),
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=make_child_environment({"PYTHONUNBUFFERED": "1"}),
-                start_new_session=True,
-            )
-
-    def _wait_until_ready(self) -> None:
-        """Wait until the child prints READY. Raises BackendError."""
-        deadline_s = time.monotonic() + SERVICE_START_LIMIT_S
-        while time.monotonic() < deadline_s:
-            with contextlib.suppress(OSError):
-                if READY_TEXT in self._output_path.read_text(encoding="utf-8", errors="replace"):
-                    return
-            if self._process.poll() is not None:
-                break
-            time.sleep(POLL_PERIOD_S)
-        self.stop()
-        raise BackendError(
-            "the emulated joint modules did not start; see their output above", code="emulator/not-started"
+        command = make_python_command(
+            "-m", "snakesim_can_backend.emulator.command", str(config_path), *arguments, "--interactive"
         )
+        return EmulatorChild(command, output_path, make_child_environment({"PYTHONUNBUFFERED": "1"}))
 
     def describe_exit(self) -> str | None:
         """Return a sentence about the exit of the child; None while it runs."""
-        code = self._process.poll()
+        code = self._child.exit_code
         if code is None:
             return None
         return f"the emulated joint modules have ended, with exit code {code}"
@@ -191,11 +168,8 @@ class EmulatorProcess:
         """Start or end a fault of a module. Raises BackendError if the child has ended."""
         from snakesim_drivers.emulation.emulator_control import format_typed_fault
 
-        assert self._process.stdin is not None
-        line = f"{format_typed_fault(fault, begins=begins)}\n"
         try:
-            self._process.stdin.write(line.encode())
-            self._process.stdin.flush()
+            self._child.write_line(format_typed_fault(fault, begins=begins))
         except (OSError, ValueError) as error:  # the latter when it was stopped
             raise BackendError(
                 f"the emulated joint modules do not accept {fault}: {error}", code="injection/not-supported"
@@ -203,17 +177,7 @@ class EmulatorProcess:
 
     def stop(self) -> None:
         """Terminate the child, and kill it if it does not end. Its output is this process's stderr."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
-            try:
-                self._process.wait(STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
-        with contextlib.suppress(OSError):  # an unreadable log does not prevent ending
-            for line in self._output_path.read_text(encoding="utf-8", errors="replace").splitlines():
-                print_stderr(line)
+        self._child.stop()
+        for line in self._child.read_output().splitlines():
+            print_stderr(line)
         self._folder.cleanup()

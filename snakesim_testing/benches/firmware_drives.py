@@ -1,9 +1,9 @@
 """The joint modules of the reference firmware in C, which runs as a child of the driver, by what the program prints."""
 
 import re
-from pathlib import Path
 from typing import Any
 
+from snakesim_drivers.emulation.emulator_child import EmulatorChild
 from snakesim_testing.contract.bench import TorqueSwitch
 from snakesim_testing.harness.wait import wait_until
 
@@ -15,7 +15,7 @@ class FirmwareDrives:
     """The modules of an open backend in lockstep."""
 
     def __init__(self, backend: Any) -> None:
-        self._process = backend.modules._emulator_process
+        self._child: EmulatorChild = backend.modules._emulator_process._child
         self._joint_count = len(backend.describe().joints)
 
     def list_enabled(self) -> list[bool]:
@@ -35,17 +35,14 @@ class FirmwareDrives:
     def list_torque_switches(self) -> list[TorqueSwitch]:
         return [
             TorqueSwitch(float(time_s), int(number) - 1, is_on=switch == "on")
-            for time_s, number, switch in SWITCH_PATTERN.findall(self._read_output())
+            for time_s, number, switch in SWITCH_PATTERN.findall(self._child.read_output())
         ]
 
     def _advance(self, seconds: float) -> float:
         """Let time pass at the modules, and return their time in s. All that they did before has been printed then."""
-        known_count = len(TIME_PATTERN.findall(self._read_output()))
-        self._process._process.stdin.write(f"advance {seconds:g}\n".encode())
-        self._process._process.stdin.flush()
-        wait_until(lambda: len(TIME_PATTERN.findall(self._read_output())) > known_count, "the time of the modules")
-        return float(TIME_PATTERN.findall(self._read_output())[-1])
-
-    def _read_output(self) -> str:
-        path: Path = self._process._output_path
-        return path.read_text(encoding="utf-8")
+        known_count = len(TIME_PATTERN.findall(self._child.read_output()))
+        self._child.write_line(f"advance {seconds:g}")
+        wait_until(
+            lambda: len(TIME_PATTERN.findall(self._child.read_output())) > known_count, "the time of the modules"
+        )
+        return float(TIME_PATTERN.findall(self._child.read_output())[-1])

@@ -3,21 +3,17 @@
 import contextlib
 import json
 import os
-import signal
-import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from snakesim_drivers.emulation.emulator_child import EmulatorChild
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.model.scenario import RunConfig, write_config
-from snakesim_hal.service import SERVICE_START_LIMIT_S
 
 READY_TEXT = " ready: "  # each command prints it when its drives are on the bus
-STOP_TIMEOUT_S = 5.0
-POLL_PERIOD_S = 0.02
 SNAKESIM_MODULE = ("snakesim_operator",)
 
 
@@ -49,7 +45,6 @@ class EmulatedDrive:
             BackendError: The process ended at once, or was not ready in time.
         """
         self._log_path = folder / "drive.log"
-        self._output_path = folder / "drive.txt"
         self._log_path.unlink(missing_ok=True)
         config_path = folder / "drive.json"
         write_config(config, config_path)
@@ -58,31 +53,15 @@ class EmulatedDrive:
         arguments += ["--interactive", "--drive-log", str(self._log_path), "--parent", str(os.getpid())]
         if config.backend == "can":
             arguments += ["--pose", "none"]
-        with self._output_path.open("wb") as output:
-            self._process = subprocess.Popen(
-                make_python_command("-m", *module, *arguments),
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=make_child_environment({"PYTHONUNBUFFERED": "1"}),
-                start_new_session=True,
-            )
-        self._wait_until_ready()
-
-    def _wait_until_ready(self) -> None:
-        deadline_s = time.monotonic() + SERVICE_START_LIMIT_S
-        while time.monotonic() < deadline_s and self._process.poll() is None:
-            if READY_TEXT in self._read_output():
-                return
-            time.sleep(POLL_PERIOD_S)
-        output = self._read_output().strip().splitlines()[-5:]
-        self.close()
-        raise BackendError("the emulated drive did not start:", *output, code="emulator/not-started")
-
-    def _read_output(self) -> str:
-        with contextlib.suppress(OSError):
-            return self._output_path.read_text(encoding="utf-8", errors="replace")
-        return ""
+        self._child = EmulatorChild(
+            make_python_command("-m", *module, *arguments),
+            folder / "drive.txt",
+            make_child_environment({"PYTHONUNBUFFERED": "1"}),
+        )
+        if not self._child.wait_until_ready(READY_TEXT):
+            output = self._child.read_output().strip().splitlines()[-5:]
+            self.close()
+            raise BackendError("the emulated drive did not start:", *output, code="emulator/not-started")
 
     def type_fault(self, text: str) -> int:
         """Type a fault such as `cut bus_1 off`, and return when, by the monotonic clock in ns.
@@ -90,11 +69,9 @@ class EmulatedDrive:
         Raises:
             BackendError: The process has ended.
         """
-        assert self._process.stdin is not None
         now_ns = time.monotonic_ns()
         try:
-            self._process.stdin.write(f"{text}\n".encode())
-            self._process.stdin.flush()
+            self._child.write_line(text)
         except OSError as error:
             raise BackendError(f"the emulated drive has ended: {error}", code="emulator/not-started") from error
         return now_ns
@@ -112,13 +89,4 @@ class EmulatedDrive:
 
     def close(self) -> None:
         """End the process."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
-            try:
-                self._process.wait(STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
+        self._child.stop()

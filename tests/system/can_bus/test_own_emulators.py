@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.driver import own_emulators
 from snakesim_can_backend.driver.own_emulators import EmulatorProcess, validate_emulator_settings
 from snakesim_can_backend.settings import CanSettings
+from snakesim_drivers.emulation import emulator_child
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_testing.can.driver_loop import config
@@ -112,7 +112,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: py
 
 
 def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(own_emulators, "STOP_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(emulator_child, "STOP_TIMEOUT_S", 0.2)
     child.does("signal.signal(signal.SIGTERM, signal.SIG_IGN)", READY, SERVE)
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     began = time.monotonic()
@@ -125,7 +125,7 @@ def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.M
 def test_emulator_process_that_never_becomes_ready_is_reported_and_removed(
     ending: str, child: Child, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(own_emulators, "SERVICE_START_LIMIT_S", 5.0)
+    monkeypatch.setattr(emulator_child, "SERVICE_START_LIMIT_S", 5.0)
     child.does("print('no such physics_model', flush=True)", ending)
     with raises_error(BackendError, code="emulator/not-started"):
         EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
@@ -145,7 +145,7 @@ def test_emulator_process_exit_is_noticed_without_its_log(child: Child) -> None:
     child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     assert emulators.describe_exit() is None
-    emulators._output_path.unlink()
+    emulators._child.output_path.unlink()
     wait_until(emulators.describe_exit, "the end of the child")
     assert emulators.describe_exit() == "the emulated joint modules have ended, with exit code 3"
     emulators.stop()
