@@ -3,7 +3,8 @@
 A qualification runs a list of steps on one clamped drive. Data flows in one direction:
 
     protocol/steps.py    what each step asks of the operator, and its criterion (pure)
-    procedures.py        carries out each step through the rig, and returns checks: values with bounds
+    procedures.py        names the procedure of each step, which carries it out through the rig and returns checks:
+                         values with bounds. They are in motion_procedures.py and stop_procedures.py
     protocol/checks.py   decides: confirmed, refuted or unknown (pure)
     protocol/record.py   the steps and claims with their verdicts; signature.py signs it, summary.py prints it
 

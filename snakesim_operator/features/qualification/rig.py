@@ -38,6 +38,11 @@ POLL_PAUSE_S = 0.004  # between two polls of the drive
 HOST_MODULE = "snakesim_hal.programs.host_program"
 
 
+def make_requester() -> str:
+    """Return the name under which requests of a qualification are in the host's records."""
+    return f"{get_user_name()[:40]}, drive qualify"
+
+
 class Rig:
     """One drive, and everything that a qualification does with it."""
 
@@ -208,7 +213,7 @@ class Rig:
             RefusedError: The host refuses, or no commands are sent.
         """
         self.commands.set_plan(plan)
-        request = make_arm_request(self.robot, f"{get_user_name()[:40]}, drive qualify", unchecked=True)
+        request = make_arm_request(self.robot, make_requester(), unchecked=True)
         self._request(request, "armed")
         self.commands.set_plan(plan)  # its oscillation begins now
         if self.wait_for_lifecycle("armed", timeout_s=2.0) != "armed":
@@ -224,7 +229,7 @@ class Rig:
         Raises:
             SnakesimError: Not even a new host is disarmed.
         """
-        requester = f"{get_user_name()[:40]}, drive qualify"
+        requester = make_requester()
         action = "disarm" if self.read_lifecycle() == "armed" else "reset"
         if self.read_lifecycle() == "disarmed":
             return
