@@ -2,21 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
+
+import msgspec
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import get_user_name
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.checked import (
     PROPERTIES,
     START_CHECK_CONTROLLER,
     JointProperty,
-    StartCheckRecord,
     compute_mounting_digest,
 )
-from snakesim_hal.model.robot import list_serial_numbers
 from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import (
     SIGNAL_NAMES,
@@ -25,6 +23,7 @@ from snakesim_operator.features.commissioning.measured import (
     read_imus,
 )
 from snakesim_operator.features.commissioning.robot_edit import (
+    make_check_record,
     read_joints_with_drive_modes,
     require_own_robot_file,
     write_check_record,
@@ -197,14 +196,8 @@ def _write_check_record(
     if unconfirmed:
         print_line(f"{path}: nothing was written: {', '.join(unconfirmed)} are wrong or unknown")
         return
-    checked = StartCheckRecord(
-        by=get_user_name(),
-        on=date.today().isoformat(),
-        joints=compute_mounting_digest(joints),
-        backend=robot.backend,
-        hardware=robot.hardware,
-        serials=list_serial_numbers(robot),
-        confirmed=list(PROPERTIES),
+    checked = msgspec.structs.replace(
+        make_check_record(joints, robot, PROPERTIES),
         by_hand=_group_joints_confirmed_by_hand(verdicts),
         by_shape=_list_properties_confirmed_by_shape(verdicts),
         straight=statement.straight,

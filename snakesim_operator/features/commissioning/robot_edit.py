@@ -13,11 +13,12 @@ from tomlkit.items import Table
 from snakesim_hal.base.atomic_write import write_atomically, write_through
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.model.checked import StartCheckRecord
+from snakesim_hal.model.checked import JointProperty, StartCheckRecord, compute_mounting_digest
 from snakesim_hal.model.files import decode_table, read_table_with_base, resolve_file_path
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot import RobotFile, list_serial_numbers
 from snakesim_hal.model.textfiles import read_text
+from snakesim_hal.wire.messages import RobotDescription
 
 
 def require_own_robot_file(path: Path) -> None:
@@ -73,6 +74,27 @@ def write_joint_fields(path: Path, values: dict[str, dict[str, Any]], origin: st
             item.comment(comment)
             section[field] = item
     _validate_and_replace_file(path, document)
+
+
+def make_check_record(
+    joints: Sequence[Joint], robot: RobotDescription, confirmed: Sequence[JointProperty]
+) -> StartCheckRecord:
+    """Return the record of a check that this user has made today.
+
+    Args:
+        joints: Joints of the robot file, with the modes that their drives have.
+        robot: Description of the robot, with the serial numbers of its drives.
+        confirmed: Properties that are confirmed for every joint.
+    """
+    return StartCheckRecord(
+        by=get_user_name(),
+        on=date.today().isoformat(),
+        joints=compute_mounting_digest(joints),
+        backend=robot.backend,
+        hardware=robot.hardware,
+        serials=list_serial_numbers(robot),
+        confirmed=list(confirmed),
+    )
 
 
 def write_check_record(path: Path, checked: StartCheckRecord) -> None:

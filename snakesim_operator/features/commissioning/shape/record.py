@@ -1,23 +1,22 @@
 """Writes the properties that drawn shapes confirmed into the robot file, and reads which of them are still valid."""
 
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 
-from snakesim_hal.base.process import get_user_name
+import msgspec
+
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.checked import (
     PROPERTIES,
     JointProperty,
     StartCheckRecord,
-    compute_mounting_digest,
     find_change_since_check,
 )
 from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile, list_serial_numbers
+from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.wire.messages import RobotDescription
-from snakesim_operator.features.commissioning.robot_edit import write_check_record
+from snakesim_operator.features.commissioning.robot_edit import make_check_record, write_check_record
 from snakesim_operator.features.commissioning.shape.decide import SHAPE_PROPERTIES
 
 
@@ -38,14 +37,8 @@ def write_shape_record(path: Path, joints: Sequence[Joint], robot: RobotDescript
         print_line(f"{path}: nothing was written: the drives are emulated, and need no check")
         return
     confirmed: set[JointProperty] = {*SHAPE_PROPERTIES, *_read_confirmed_properties(path, joints, robot)}
-    record = StartCheckRecord(
-        by=get_user_name(),
-        on=date.today().isoformat(),
-        joints=compute_mounting_digest(joints),
-        backend=robot.backend,
-        hardware=robot.hardware,
-        serials=list_serial_numbers(robot),
-        confirmed=[name for name in PROPERTIES if name in confirmed],
+    record = msgspec.structs.replace(
+        make_check_record(joints, robot, [name for name in PROPERTIES if name in confirmed]),
         by_shape=list(SHAPE_PROPERTIES),
     )
     write_check_record(path, record)
