@@ -13,16 +13,14 @@ from snakesim_hal.model.fluid import Fluid
 from snakesim_hal.model.links import compute_capsule_inertia
 from snakesim_hal.model.robot import RobotFile
 from snakesim_sim_backend.laws.chain import FREE_DOFS
-from snakesim_sim_backend.model.build import FREE_QPOS
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config, make_resting_body
 from snakesim_testing.sim.waves import (
     BALANCE_STEP_S,
     PERIODS,
-    SERVO_NM_PER_RAD,
-    SERVO_NM_S_PER_RAD,
     BodyTrack,
     JointWave,
+    follow_wave,
 )
 
 HEIGHT_M = 5.0  # above the ground
@@ -181,30 +179,10 @@ def swim_wave(wave: JointWave, fluid: dict[str, Any], step_s: float = 0.002, sti
     Returns:
         The motion of the body over PERIODS periods of the wave.
     """
-    servo_nm_per_rad = stiffness * SERVO_NM_PER_RAD
-    servo_nm_s_per_rad = stiffness * SERVO_NM_S_PER_RAD
     config = make_config(scene={"fluid": fluid})
     sim, data, physics = make_resting_body(config, SimSettings(timestep_s=step_s))
-    model = sim.model
-    assert sim.feet is not None
-    count = model.nv - FREE_DOFS
-    model.dof_damping[FREE_DOFS:] = servo_nm_s_per_rad
-    model.dof_frictionloss[FREE_DOFS:] = 0.0
     data.qpos[2] = HEIGHT_M
-    data.qpos[FREE_QPOS:] = wave.at(0.0, count)
-    physics.reset()
-    step_s = model.opt.timestep
-    tail, head = sim.feet.geoms[[0, -1]]
-    step_count = int(PERIODS * wave.period_s / step_s) + 1
-    center_m, axis_m = np.empty((step_count, 2)), np.empty((step_count, 2))
-    for k in range(step_count):
-        time_s = (k + 1) * step_s
-        torques_nm = servo_nm_per_rad * (wave.at(time_s, count) - data.qpos[FREE_QPOS:])
-        data.qfrc_applied[FREE_DOFS:] = torques_nm + servo_nm_s_per_rad * wave.rates_at(time_s, count)
-        physics.step(1)
-        center_m[k] = data.subtree_com[sim.first_link_body, :2]
-        axis_m[k] = (data.geom_xpos[head] - data.geom_xpos[tail])[:2]
-    return BodyTrack(center_m, axis_m, step_s, wave.period_s)
+    return follow_wave(sim, data, physics, wave, stiffness)
 
 
 def swim_without_mujoco(wave: JointWave, fluid: dict[str, Any], step_s: float = BALANCE_STEP_S) -> BodyTrack:

@@ -11,7 +11,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_operator.features.reproduce.gait_motion import GroundFriction, find_friction_per_load
 from snakesim_operator.features.reproduce.planar_chain import PlanarChain
-from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, build_sim_model
+from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, SimModel, build_sim_model
 from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
@@ -97,14 +97,35 @@ def simulate_wave(
     """
     config = make_config(robot, {"ground": ground})
     sim = build_sim_model(config, SimSettings(timestep_s=step_s), motors=False)
-    model, data = sim.model, mujoco.MjData(sim.model)
-    assert sim.feet is not None
-    joint_count = model.nv - FREE_DOFS
-    model.dof_damping[FREE_DOFS:], model.dof_frictionloss[FREE_DOFS:] = SERVO_NM_S_PER_RAD, 0.0
+    data = mujoco.MjData(sim.model)
     data.qpos[2] = config.robot.module.radius_m
     data.qpos[3], data.qpos[6] = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
+    return follow_wave(sim, data, PhysicsStepper(sim, data), wave)
+
+
+def follow_wave(
+    sim: SimModel, data: mujoco.MjData, physics: PhysicsStepper, wave: JointWave, stiffness: float = 1.0
+) -> BodyTrack:
+    """Let the joints of a snake follow a wave by stiff servos.
+
+    Args:
+        sim: Model of the snake, without motors.
+        data: Its state, with the pose of the base at the start.
+        physics: Advances this state.
+        wave: Joint angles as a function of time.
+        stiffness: Factor of stiffness and damping of the servos.
+
+    Returns:
+        The motion of the body over PERIODS periods of the wave.
+    """
+    model = sim.model
+    assert sim.feet is not None
+    servo_nm_per_rad = stiffness * SERVO_NM_PER_RAD
+    servo_nm_s_per_rad = stiffness * SERVO_NM_S_PER_RAD
+    joint_count = model.nv - FREE_DOFS
+    model.dof_damping[FREE_DOFS:] = servo_nm_s_per_rad
+    model.dof_frictionloss[FREE_DOFS:] = 0.0
     data.qpos[FREE_QPOS:] = wave.at(0.0, joint_count)
-    physics = PhysicsStepper(sim, data)
     physics.reset()
     step_s = model.opt.timestep
     tail, head = sim.feet.geoms[[0, -1]]
@@ -112,12 +133,12 @@ def simulate_wave(
     center_m, axis_m = np.empty((step_count, 2)), np.empty((step_count, 2))
     for k in range(step_count):
         end_time_s = (k + 1) * step_s
-        position_torques_nm = SERVO_NM_PER_RAD * (wave.at(end_time_s, joint_count) - data.qpos[FREE_QPOS:])
-        data.qfrc_applied[FREE_DOFS:] = position_torques_nm + SERVO_NM_S_PER_RAD * wave.rates_at(
+        position_torques_nm = servo_nm_per_rad * (wave.at(end_time_s, joint_count) - data.qpos[FREE_QPOS:])
+        data.qfrc_applied[FREE_DOFS:] = position_torques_nm + servo_nm_s_per_rad * wave.rates_at(
             end_time_s, joint_count
         )
         physics.step(1)
-        center_m[k] = data.subtree_com[0, :2]
+        center_m[k] = data.subtree_com[sim.first_link_body, :2]
         axis_m[k] = (data.geom_xpos[head] - data.geom_xpos[tail])[:2]
     return BodyTrack(center_m, axis_m, step_s, wave.period_s)
 
