@@ -1,5 +1,6 @@
 """The reference firmware in C as a child of the driver, on a socket of its own."""
 
+import subprocess
 from pathlib import Path
 
 from snakesim_can_backend.driver.own_emulators import EmulatorProcess
@@ -45,4 +46,12 @@ class FirmwareProcess(EmulatorProcess):
         modules_path = folder / MODULES_NAME
         modules_path.write_text(describe_modules(config, settings), encoding="utf-8")
         arguments = make_program_arguments(str(folder / SOCKET_NAME), str(modules_path), stepped=stepped)
-        return EmulatorChild([str(build_program()), *arguments, "--until-input-ends"], output_path)
+        with output_path.open("wb") as output:
+            process = subprocess.Popen(
+                [str(build_program()), *arguments, "--until-input-ends"],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        return EmulatorChild(process, output_path)

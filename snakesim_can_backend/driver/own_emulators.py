@@ -8,9 +8,8 @@ import msgspec
 
 from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.emulator_child import EmulatorChild
+from snakesim_drivers.emulation.emulator_child import EmulatorChild, start_python_emulator
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.fault_kinds import FAULT_KINDS, FaultInjection
 from snakesim_hal.model.fault_plan import validate_faults_for_backend
@@ -152,10 +151,8 @@ class EmulatorProcess:
             arguments += ["--channel", channel]
         if stepped:
             arguments.append("--stepped")
-        command = make_python_command(
-            "-m", "snakesim_can_backend.emulator.command", str(config_path), *arguments, "--interactive"
-        )
-        return EmulatorChild(command, output_path, make_child_environment({"PYTHONUNBUFFERED": "1"}))
+        module = "snakesim_can_backend.emulator.command"
+        return start_python_emulator(["-m", module, str(config_path), *arguments, "--interactive"], output_path)
 
     def describe_exit(self) -> str | None:
         """Return a sentence about the exit of the child; None while it runs."""

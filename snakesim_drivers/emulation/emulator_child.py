@@ -4,9 +4,10 @@ import contextlib
 import signal
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
+from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 
 POLL_PERIOD_S = 0.02
@@ -14,29 +15,17 @@ STOP_TIMEOUT_S = 5.0  # after which a process that ignores SIGTERM is killed
 
 
 class EmulatorChild:
-    """A started process of emulated drives, in a session of its own, so that Ctrl-C does not reach it."""
+    """A started process of emulated drives."""
 
-    def __init__(self, command: Sequence[str], output_path: Path, environment: Mapping[str, str] | None = None) -> None:
-        """Start the process.
+    def __init__(self, process: subprocess.Popen[bytes], output_path: Path) -> None:
+        """Take charge of a process.
 
         Args:
-            command: Program and arguments.
-            output_path: File of its output and errors, which is replaced.
-            environment: Its environment; None for that of this process.
-
-        Raises:
-            OSError: The process cannot be started, or the file cannot be written.
+            process: A process whose input is a pipe.
+            output_path: File of its output and errors.
         """
+        self._process = process
         self.output_path = output_path
-        with output_path.open("wb") as output:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                start_new_session=True,
-            )
 
     @property
     def exit_code(self) -> int | None:
@@ -87,3 +76,25 @@ class EmulatorChild:
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
+
+
+def start_python_emulator(arguments: Sequence[str], output_path: Path) -> EmulatorChild:
+    """Start emulated drives in a session of their own, so that Ctrl-C does not reach them.
+
+    Args:
+        arguments: Arguments of Python, such as `-m` and a module.
+        output_path: File of their output and errors, which is replaced.
+
+    Raises:
+        OSError: The process cannot be started, or the file cannot be written.
+    """
+    with output_path.open("wb") as output:
+        process = subprocess.Popen(
+            make_python_command(*arguments),
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=make_child_environment({"PYTHONUNBUFFERED": "1"}),
+            start_new_session=True,
+        )
+    return EmulatorChild(process, output_path)

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from snakesim_drivers.emulation.emulator_child import EmulatorChild
+from snakesim_drivers.emulation.emulator_child import start_python_emulator
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.model.scenario import RunConfig, write_config
 
 READY_TEXT = " ready: "  # each command prints it when its drives are on the bus
@@ -53,11 +52,7 @@ class EmulatedDrive:
         arguments += ["--interactive", "--drive-log", str(self._log_path), "--parent", str(os.getpid())]
         if config.backend == "can":
             arguments += ["--pose", "none"]
-        self._child = EmulatorChild(
-            make_python_command("-m", *module, *arguments),
-            folder / "drive.txt",
-            make_child_environment({"PYTHONUNBUFFERED": "1"}),
-        )
+        self._child = start_python_emulator(["-m", *module, *arguments], folder / "drive.txt")
         if not self._child.wait_until_ready(READY_TEXT):
             output = self._child.read_output().strip().splitlines()[-5:]
             self.close()
