@@ -42,12 +42,12 @@ def make_reports(sync: int) -> list[bytes]:
     return [RAW_FRAME.pack(frame.id, len(frame.data), frame.data) for frame in frames]
 
 
-def report_frame_costs(report: Callable[[str], None], repeats: int) -> float:
+def report_frame_costs(report: Callable[[str], None], repeat_count: int) -> float:
     """Measure the driver and its references in turn, and report them as a table.
 
     Args:
         report: gets each line of the table.
-        repeats: number of rounds.
+        repeat_count: number of rounds.
 
     Returns:
         The cost of a frame in the driver, in µs.
@@ -56,7 +56,7 @@ def report_frame_costs(report: Callable[[str], None], repeats: int) -> float:
     driver_us: list[float] = []
     bare_us: list[float] = []
     python_can_us: list[float] = []
-    for _ in range(repeats):
+    for _ in range(repeat_count):
         driver_us.append(_measure_frame_us(_make_driver_receiver))
         bare_us.append(_measure_frame_us(_make_bare_receiver))
         if on_vcan:

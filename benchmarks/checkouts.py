@@ -96,11 +96,11 @@ def measure_goal(goal: Goal, checkout: Path) -> float:
     return float(line.removeprefix("measured "))
 
 
-def measure_in_turn(goal: Goal, base: Path, rounds: int) -> tuple[list[float], list[float]]:
+def measure_in_turn(goal: Goal, base: Path, round_count: int) -> tuple[list[float], list[float]]:
     """Return the values of a goal in the other checkout and in this one, one of each for every round."""
     before: list[float] = []
     after: list[float] = []
-    for round_number in range(rounds):
+    for round_number in range(round_count):
         order = [(base, before), (HERE.parent, after)]
         if round_number % 2:
             order.reverse()
@@ -149,12 +149,12 @@ def main() -> int:
     return 0
 
 
-def describe_measurement(base: Path, rounds: int) -> list[str]:
+def describe_measurement(base: Path, round_count: int) -> list[str]:
     """Return the lines above the table: when and how it was measured."""
     day = datetime.now(tz=UTC).date().isoformat()
     return [
-        f"Measured by `python -m benchmarks.checkouts BASE --rounds {rounds} --write` on {day}: `{find_commit(base)}` "
-        f"before, `{find_commit(HERE.parent)}` after, {os.cpu_count()} processors, Python "
+        f"Measured by `python -m benchmarks.checkouts BASE --rounds {round_count} --write` on {day}: "
+        f"`{find_commit(base)}` before, `{find_commit(HERE.parent)}` after, {os.cpu_count()} processors, Python "
         f"{sys.version_info.major}.{sys.version_info.minor}, load average {os.getloadavg()[2]:.1f}. Each cell has the "
         "median, and the lowest and the highest value. Judge by the ratios: other programs ran on the same machine.",
         "",

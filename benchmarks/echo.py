@@ -35,20 +35,20 @@ def answer_requests(session: zenoh.Session, reply: bytes, congestion: zenoh.Cong
         publisher.put(reply)
 
 
-def measure_echo_us(request: bytes, reply: bytes, rounds: int = ECHO_ROUNDS, period_s: float = 0.0) -> float:
+def measure_echo_us(request: bytes, reply: bytes, round_count: int = ECHO_ROUNDS, period_s: float = 0.0) -> float:
     """Return the median round trip of `measure_echo_times_us`."""
-    return statistics.median(measure_echo_times_us(request, reply, rounds, period_s))
+    return statistics.median(measure_echo_times_us(request, reply, round_count, period_s))
 
 
 def measure_echo_times_us(
-    request: bytes, reply: bytes, rounds: int, period_s: float, prefix: Sequence[str] = ()
+    request: bytes, reply: bytes, round_count: int, period_s: float, prefix: Sequence[str] = ()
 ) -> list[float]:
     """Measure round trips to another process, in µs.
 
     Args:
         request: the bytes on the way there.
         reply: bytes on the way back; only their number counts.
-        rounds: number of round trips.
+        round_count: number of round trips.
         period_s: time between two requests; 0.0: each follows the reply to the one before.
         prefix: words before the command that starts the other process, such as `chrt -f 40`.
 
@@ -64,7 +64,7 @@ def measure_echo_times_us(
         try:
             _wait_for_first_reply(publisher, replies, request)
             times_us: list[float] = []
-            for _ in range(rounds):
+            for _ in range(round_count):
                 begin_s = time.perf_counter()
                 publisher.put(request)
                 replies.recv()

@@ -58,8 +58,8 @@ on as many threads. The goal is 0.7 of it.
 class TravelingWave:
     """Joint targets of a traveling wave."""
 
-    def __init__(self, joints: int) -> None:
-        self._lag_rad = 0.9 * np.arange(joints)[::-1]
+    def __init__(self, joint_count: int) -> None:
+        self._lag_rad = 0.9 * np.arange(joint_count)[::-1]
         self._step = 0
 
     def next_target_rad(self) -> np.ndarray:
@@ -160,7 +160,7 @@ def make_bare_batch_step(scenario: str, count: int) -> Step:
 
 def make_vector_step(scenario: str, count: int) -> Step:
     """Return a function that makes a step of many environments whose episodes do not end."""
-    envs = SnakeVectorEnv(count, scenario=scenario, frame_skip=FRAME_SKIP, threads=THREADS, **JOINT_OBSERVATIONS)
+    envs = SnakeVectorEnv(count, scenario=scenario, frame_skip=FRAME_SKIP, thread_count=THREADS, **JOINT_OBSERVATIONS)
     wave = TravelingWave(len(envs.single_action_space.sample()))
     envs.reset(seed=1)
     shape = envs.action_space.shape

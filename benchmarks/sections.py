@@ -137,7 +137,7 @@ def report_latency(report: Report) -> None:
     for _ in range(LATENCY_ROUNDS):
         latencies_us.append(measure_latency_us())
         in_host_us.append(measure_latency_us(*CONTROL_IN_HOST))
-        echo_us = measure_echo_us(state, command, rounds=LATENCY_ECHO_ROUNDS, period_s=config.period_ns * 1e-9)
+        echo_us = measure_echo_us(state, command, round_count=LATENCY_ECHO_ROUNDS, period_s=config.period_ns * 1e-9)
         echoes_us.append(echo_us)
     report(RATIO_HEADER)
     subject = "realtime state-to-command, p50, controller included"

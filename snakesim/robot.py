@@ -72,18 +72,18 @@ class Robot:
     with a fault.
     """
 
-    def __init__(self, link: ConnectionSettings) -> None:
+    def __init__(self, connection: ConnectionSettings) -> None:
         """Open a session to a robot whose link is known. `connect` finds the link.
 
         Args:
-            link: Endpoint, namespace and session file of the robot.
+            connection: Endpoint, namespace and session file of the robot.
 
         Raises:
             NotConnectedError: The endpoint does not answer, or the robot publishes no description or status.
         """
-        self._link = link
+        self._link = connection
         self._exit_stack = ExitStack()
-        self._session: Session = self._exit_stack.enter_context(open_session(link, CONNECT_TIMEOUT_S))
+        self._session: Session = self._exit_stack.enter_context(open_session(connection, CONNECT_TIMEOUT_S))
 
         # Messages.
         self._reader_by_key: dict[str, SampleReader[Any]] = {}

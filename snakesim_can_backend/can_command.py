@@ -152,8 +152,10 @@ def format_load_table(
     yield f"Worst-case load of {on}, {of}; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
 
 
-def _format_load_cell(joints: int, reports: ReportSchedule) -> str:
-    return f"{100 * compute_bus_load(joints, reports):.1f} %" + ("" if is_feasible(joints, reports) else " refused")
+def _format_load_cell(joint_count: int, reports: ReportSchedule) -> str:
+    return f"{100 * compute_bus_load(joint_count, reports):.1f} %" + (
+        "" if is_feasible(joint_count, reports) else " refused"
+    )
 
 
 # --- scan --------------------------------------------------------------------------------------------------

@@ -26,19 +26,19 @@ class PortLoad:
             f"rate at which it takes {MAX_LOAD:.0%} of a period"
         )
 
-    def cycle_s(self, servos: int, baud: int) -> float:
+    def cycle_s(self, servo_count: int, baud: int) -> float:
         """Return how long a port is busy, or waits, in a cycle."""
-        return self.count_cycle_bytes(servos) * BITS_PER_BYTE / baud + REQUESTS * USB_LATENCY_S
+        return self.count_cycle_bytes(servo_count) * BITS_PER_BYTE / baud + REQUESTS * USB_LATENCY_S
 
-    def compute_max_rate_hz(self, servos: int, baud: int) -> int:
+    def compute_max_rate_hz(self, servo_count: int, baud: int) -> int:
         """Return the fastest possible control rate, in whole Hz."""
-        return int(MAX_LOAD / self.cycle_s(servos, baud))
+        return int(MAX_LOAD / self.cycle_s(servo_count, baud))
 
-    def check(self, servos: int, rate_hz: float, baud: int, section: str) -> None:
+    def check(self, servo_count: int, rate_hz: float, baud: int, section: str) -> None:
         """Check that a port can carry its servos.
 
         Args:
-            servos: Number of servos on the port.
+            servo_count: Number of servos on the port.
             rate_hz: Rate of the control cycle.
             baud: Baud rate of the port in bit/s.
             section: Dotted name of the settings section, used in error messages.
@@ -46,12 +46,12 @@ class PortLoad:
         Raises:
             ConfigError: A cycle takes more than `MAX_LOAD` of a control period.
         """
-        busy_s = self.cycle_s(servos, baud)
+        busy_s = self.cycle_s(servo_count, baud)
         if busy_s * rate_hz > MAX_LOAD:
             raise ConfigError(
-                f"{servos} servos at {rate_hz:g} Hz: a cycle of {self.count_cycle_bytes(servos)} bytes takes "
+                f"{servo_count} servos at {rate_hz:g} Hz: a cycle of {self.count_cycle_bytes(servo_count)} bytes takes "
                 f"{busy_s * 1e3:.1f} ms at {baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
-                f"most {MAX_LOAD:.0%}: use rate_hz = {self.compute_max_rate_hz(servos, baud)}, a higher "
+                f"most {MAX_LOAD:.0%}: use rate_hz = {self.compute_max_rate_hz(servo_count, baud)}, a higher "
                 f"`{section}.baud`, or more `{section}.ports`",
                 code="bus/overloaded",
             )

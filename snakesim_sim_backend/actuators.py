@@ -105,12 +105,12 @@ class _InputHistory:
 
     HEADER_NUMBERS = 2
 
-    def __init__(self, model: mujoco.MjModel, motor: int) -> None:
+    def __init__(self, model: mujoco.MjModel, motor_index: int) -> None:
         """Find the history of a motor in a compiled model."""
-        self._motor = motor
-        self._sample_count = int(model.actuator_history[motor, 0])
+        self._motor = motor_index
+        self._sample_count = int(model.actuator_history[motor_index, 0])
         self._step_s = float(model.opt.timestep)
-        self._start = int(model.actuator_historyadr[motor])
+        self._start = int(model.actuator_historyadr[motor_index])
 
     def forget(self, history: Floats, inputs: Floats) -> None:
         """Let the present inputs of a motor be those of all samples, so that they count at once."""

@@ -62,7 +62,7 @@ class SimBackend(Backend):
             supported_faults.append("overheat")
         else:
             explanation += ", and without [sensors.power] in the robot file heat would not be measured"
-        validate_faults_for_backend(config, supported_kinds=supported_faults, buses=0, reason=explanation)
+        validate_faults_for_backend(config, supported_kinds=supported_faults, bus_count=0, reason=explanation)
         return ("lockstep", "realtime", "free")
 
     def __init__(self, config: RunConfig, settings: SimSettings, *, laws: LawsVersion | None = None) -> None:

@@ -150,7 +150,7 @@ class FollowCamera:
         visuals.headlight.ambient[:] = AMBIENT
         visuals.headlight.diffuse[:] = HEADLIGHT
 
-    def _set_colors(self, joints: int) -> None:
+    def _set_colors(self, joint_count: int) -> None:
         """Set the colors of robot, obstacles and ground, which differ from those that the robot's cameras see."""
         colors = self._model.geom_rgba
         colors[:] = OBSTACLE_COLOR
@@ -158,7 +158,7 @@ class FollowCamera:
             if is_roof(self._model.geom(geom).name, int(self._model.geom_group[geom])):
                 colors[geom] = ROOF_COLOR
         tail_body = self._sim.first_link_body
-        head_body = tail_body + joints
+        head_body = tail_body + joint_count
         for body in range(tail_body, head_body + 1):
             if body == head_body:
                 color = HEAD_COLOR

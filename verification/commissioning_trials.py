@@ -81,11 +81,11 @@ class CheckTrial:
         return [f"{row.joint}: {row.summary}" for row in rows if row.list_properties("unknown")]
 
 
-def check_trial(number: int, fault: str, *sets: str, modules: int = 8, seconds: float = 13.0) -> CheckTrial:
+def check_trial(number: int, fault: str, *sets: str, module_count: int = 8, seconds: float = 13.0) -> CheckTrial:
     """Check a robot with a hidden fault. sets: as `--set` of a run."""
     pick = random.Random(number)
-    zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(modules)]
-    joint, other = pick.sample(range(modules), 2)
+    zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(module_count)]
+    joint, other = pick.sample(range(module_count), 2)
     faults: list[str] = []
     match fault:
         case "sign":
@@ -103,7 +103,7 @@ def check_trial(number: int, fault: str, *sets: str, modules: int = 8, seconds: 
         case _:
             pass
     truth = [*faults, *(f"joint_{i + 1}.zero_rad={zero}" for i, zero in enumerate(zeros))]
-    run = [f"seed={number}", f"scene.ground.friction={pick.uniform(0.2, 0.8)}", f"robot.chain.modules={modules}"]
+    run = [f"seed={number}", f"scene.ground.friction={pick.uniform(0.2, 0.8)}", f"robot.chain.modules={module_count}"]
     run += [f"duration_s={seconds}", *(f"backends.can.mounted.{text}" for text in truth)]
     with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
     return CheckTrial(fault, with_fault, _checked("backend=can", *sets, *run))
@@ -126,11 +126,11 @@ def _checked(*sets: str) -> list[JointVerdict]:
     return judge_joints(collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True)
 
 
-def check_table(first: int, trials: int, *sets: str) -> list[str]:
+def check_table(first: int, trial_count: int, *sets: str) -> list[str]:
     """Return the table of trials with every fault, and as many without any."""
     made: list[CheckTrial] = []
     kinds = [*FAULTS, NONE]
-    for number in range(first, first + trials):
+    for number in range(first, first + trial_count):
         fault = kinds[number % len(kinds)]
         trial = check_trial(number, fault, *sets)
         made.append(trial)
@@ -284,12 +284,12 @@ def _shaken(
     return {name: np.array(values) for name, values in rows.items()}, link_rates
 
 
-def identify_table(first: int, trials: int, *sets: str) -> list[str]:
+def identify_table(first: int, trial_count: int, *sets: str) -> list[str]:
     """Return the table of trials with backlash in one of five joints, and without, with IMUs and without."""
     lines = ["| hidden fault | IMUs | robots | named | named falsely | values written | they cover | constants off |"]
     lines.append("|---|---|---|---|---|---|---|---|")
     for backlash in (True, False):
-        made = [identify_trials(number, *sets, backlash=backlash) for number in range(first, first + trials)]
+        made = [identify_trials(number, *sets, backlash=backlash) for number in range(first, first + trial_count)]
         for imus, those in zip(("yes", "no"), zip(*made, strict=True), strict=True):
             lines.append(
                 f"| {'backlash' if backlash else NONE} | {imus} | {_identified_row(those, backlash=backlash)} |"

@@ -82,7 +82,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=2, help="runs side by side (2)")
     asked = parser.parse_args(arguments)
     found: list[tuple[Experiment, ExperimentFindings]] = []
-    for experiment, findings in run_experiments(list(EXPERIMENTS.values()), seeds=asked.seeds, workers=asked.workers):
+    for experiment, findings in run_experiments(
+        list(EXPERIMENTS.values()), seeds=asked.seeds, worker_count=asked.workers
+    ):
         print(f"{experiment.name}: done", file=sys.stderr, flush=True)
         found.append((experiment, findings))
         if asked.write:

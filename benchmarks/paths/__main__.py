@@ -184,7 +184,7 @@ def main() -> None:
 
 
 def slow_link(
-    lab: CabledMachines, seconds: float, repeats: int, folder: Path, state: bytes, command: bytes
+    lab: CabledMachines, seconds: float, repeat_count: int, folder: Path, state: bytes, command: bytes
 ) -> list[str]:
     """The loop over a slow link while a client behind it watches the camera, against quiet: lines of a table."""
     lab.robot.run(*f"tc qdisc add dev robot root handle 1: tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split())
@@ -195,7 +195,7 @@ def slow_link(
         pairs: list[tuple[Percentiles, Percentiles]] = []
         stopped: list[str] = []
         shares: list[float] = []
-        for _ in range(repeats):
+        for _ in range(repeat_count):
             try:
                 quiet = ours(way, seconds, folder, CAMERA)
                 busy, share = watched(way, seconds, folder)
@@ -210,7 +210,7 @@ def slow_link(
         print("\n".join(rows[-len(stopped) - bool(pairs) :]), flush=True)
     bare = [
         (beside_images(way, seconds, folder, state, command), raw(way, seconds, folder, state, command))
-        for _ in range(repeats)
+        for _ in range(repeat_count)
     ]
     rows.append(row(f"`{queue}`, raw Zenoh", bare, AIM_SATURATED) + " |")
     print(rows[-1], flush=True)

@@ -43,13 +43,13 @@ def main() -> None:
             threading.Event().wait()
 
 
-def _ask(session: zenoh.Session, request: bytes, rounds: int) -> list[float]:
+def _ask(session: zenoh.Session, request: bytes, round_count: int) -> list[float]:
     """Every round trip in microseconds, one every `PERIOD_S`; a lost one counts as a second."""
     publisher = declare_publisher(session, REQUEST, DROP)
     replies: SimpleQueue[zenoh.Sample] = SimpleQueue()
     _kept = session.declare_subscriber(REPLY, replies.put)
     times: list[float] = []
-    while len(times) < WARM_UP + rounds:
+    while len(times) < WARM_UP + round_count:
         began = time.perf_counter()
         publisher.put(request)
         answered = True

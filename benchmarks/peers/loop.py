@@ -7,11 +7,11 @@ from collections.abc import Callable
 WARM_UP = 50
 
 
-def measure(exchange: Callable[[], None], rounds: int, period_s: float) -> list[float]:
+def measure(exchange: Callable[[], None], round_count: int, period_s: float) -> list[float]:
     """Round trips in microseconds, one every `period_s`; the first ones are not counted."""
     times: list[float] = []
     begin = time.perf_counter()
-    for number in range(WARM_UP + rounds):
+    for number in range(WARM_UP + round_count):
         sent = time.perf_counter()
         exchange()
         times.append((time.perf_counter() - sent) * 1e6)

@@ -74,48 +74,48 @@ class ArmedRobots:
     """
 
     def __init__(
-        self, robots: int, config: RunConfig, description: RobotDescription, *, safe: bool, threads: int
+        self, robot_count: int, config: RunConfig, description: RobotDescription, *, safe: bool, thread_count: int
     ) -> None:
         """Allocate the arrays for a number of robots. `start` adds each robot.
 
         Args:
-            robots: Number of robots.
+            robot_count: Number of robots.
             config: Configuration of one robot. All other robots must have the same joints, sensors and rates.
             description: Description of the robot of that configuration.
             safe: If True, targets pass the limiter. If False, the motors get the targets unchanged.
-            threads: Number of threads that step the physics.
+            thread_count: Number of threads that step the physics.
         """
         joints = config.robot.chain.modules
-        self.simulation = SimulatedRobots(robots, config, threads=threads)
+        self.simulation = SimulatedRobots(robot_count, config, thread_count=thread_count)
         self._period_ns = config.period_ns
         self._safe = safe
         self._joint_count = joints
 
         # State.
-        self.ticks: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
-        self.joints: Floats = np.zeros((robots, 3 * joints))
-        self.is_armed: Mask = np.zeros(robots, dtype=np.bool_)
-        self.reasons = [""] * robots
-        self.is_limited: Masks = np.zeros((robots, joints), dtype=np.bool_)
-        self._active_limits: NDArray[np.int64] = np.zeros((robots, joints), dtype=np.int64)
+        self.ticks: NDArray[np.int64] = np.zeros(robot_count, dtype=np.int64)
+        self.joints: Floats = np.zeros((robot_count, 3 * joints))
+        self.is_armed: Mask = np.zeros(robot_count, dtype=np.bool_)
+        self.reasons = [""] * robot_count
+        self.is_limited: Masks = np.zeros((robot_count, joints), dtype=np.bool_)
+        self._active_limits: NDArray[np.int64] = np.zeros((robot_count, joints), dtype=np.int64)
         self._last_decision: _LimiterDecision | None = None
-        self._command_digests = CommandDigests(robots, joints)
+        self._command_digests = CommandDigests(robot_count, joints)
 
         # Limits.
-        self._limits = LimitArrays.allocate(robots, joints, config.period_ns * 1e-9)
+        self._limits = LimitArrays.allocate(robot_count, joints, config.period_ns * 1e-9)
         self._max_plausible_change = np.full(
-            (robots, 3 * joints), MAX_FINITE_CHANGE
+            (robot_count, 3 * joints), MAX_FINITE_CHANGE
         )  # of angle, velocity and torque in a tick
-        self._is_temperature_measured = np.ones((robots, joints), dtype=np.bool_)
-        self._stop_at_c = np.ones((robots, joints))
-        self._torque_fraction = np.ones((robots, joints))
+        self._is_temperature_measured = np.ones((robot_count, joints), dtype=np.bool_)
+        self._stop_at_c = np.ones((robot_count, joints))
+        self._torque_fraction = np.ones((robot_count, joints))
         self._is_derated = False
         self._has_full_torque = False  # whether the torque limits of all robots are the full ones
 
         # Setpoints of the last tick.
-        self._modes: NDArray[np.int8] = np.zeros((robots, joints), dtype=np.int8)
-        self._target: Floats = np.zeros((robots, joints))
-        self._torque_limit_nm: Floats = np.zeros((robots, joints))
+        self._modes: NDArray[np.int8] = np.zeros((robot_count, joints), dtype=np.int8)
+        self._target: Floats = np.zeros((robot_count, joints))
+        self._torque_limit_nm: Floats = np.zeros((robot_count, joints))
         self._previous_setpoints = (self._modes, self._target, self._torque_limit_nm)
 
         # Commands, newest last. A limiter uses them some ticks later.
@@ -125,16 +125,18 @@ class ArmedRobots:
 
         # Each robot is limited either as a row of arrays, or by a client with a limiter of its own.
         self._limiter_client_by_robot: dict[int, LimiterClient] = {}
-        self._is_vectorized: Mask = np.zeros(robots, dtype=np.bool_)
-        self._is_excluded: Mask = np.zeros(robots, dtype=np.bool_)  # from the array limiter, until the next `start`
-        self._descriptions = [description] * robots
+        self._is_vectorized: Mask = np.zeros(robot_count, dtype=np.bool_)
+        self._is_excluded: Mask = np.zeros(
+            robot_count, dtype=np.bool_
+        )  # from the array limiter, until the next `start`
+        self._descriptions = [description] * robot_count
         self._all_robots = self.simulation.all_robots
 
         # Robots that take part in the current ticks. The masks are updated only when the arguments of `step` change.
-        self._active: Mask = np.zeros(robots, dtype=np.bool_)
+        self._active: Mask = np.zeros(robot_count, dtype=np.bool_)
         self._active_at_last_call = self._active
         self._active_indices: list[int] = []
-        self._active_vectorized: Mask = np.zeros(robots, dtype=np.bool_)  # active ones
+        self._active_vectorized: Mask = np.zeros(robot_count, dtype=np.bool_)  # active ones
         self._vectorized_at_last_call = self._is_vectorized
 
     def can_start(self, config: RunConfig) -> bool:
@@ -146,11 +148,11 @@ class ArmedRobots:
         )
         return can_arm(config) and has_equal_schedule and self.simulation.can_simulate(config)
 
-    def start(self, robot: int, config: RunConfig, description: RobotDescription) -> bool:
+    def start(self, robot_index: int, config: RunConfig, description: RobotDescription) -> bool:
         """Start an episode of a robot: place it in its scene, and arm it.
 
         Args:
-            robot: Row of the robot in all arrays.
+            robot_index: Row of the robot in all arrays.
             config: Configuration of the episode.
             description: Description of the robot of that configuration.
 
@@ -161,38 +163,38 @@ class ArmedRobots:
             ConfigError: The settings do not match the robot or the scene.
             RefusedError: The robot cannot be armed.
         """
-        self.stop(robot)
-        if not self.simulation.load_robot(robot, config):
+        self.stop(robot_index)
+        if not self.simulation.load_robot(robot_index, config):
             return False
-        self._descriptions[robot] = description
-        self._load_limits(robot)
-        self.ticks = _copy_with_row(self.ticks, robot, 0)
-        self.joints = _copy_with_row(self.joints, robot, self.simulation.sensors.joints[robot])
-        self._modes = _copy_with_row(self._modes, robot, int(JointMode.PASSIVE))
-        self._target = _copy_with_row(self._target, robot, 0.0)
-        self._torque_limit_nm = _copy_with_row(self._torque_limit_nm, robot, self._limits.torque_nm[robot])
-        self._torque_fraction = _copy_with_row(self._torque_fraction, robot, 1.0)
-        self.is_limited = _copy_with_row(self.is_limited, robot, False)
-        self._active_limits[robot] = NO_LIMIT
+        self._descriptions[robot_index] = description
+        self._load_limits(robot_index)
+        self.ticks = _copy_with_row(self.ticks, robot_index, 0)
+        self.joints = _copy_with_row(self.joints, robot_index, self.simulation.sensors.joints[robot_index])
+        self._modes = _copy_with_row(self._modes, robot_index, int(JointMode.PASSIVE))
+        self._target = _copy_with_row(self._target, robot_index, 0.0)
+        self._torque_limit_nm = _copy_with_row(self._torque_limit_nm, robot_index, self._limits.torque_nm[robot_index])
+        self._torque_fraction = _copy_with_row(self._torque_fraction, robot_index, 1.0)
+        self.is_limited = _copy_with_row(self.is_limited, robot_index, False)
+        self._active_limits[robot_index] = NO_LIMIT
         self._has_full_torque = False
 
         # In the first ticks, a robot always has a limiter of its own. `_observe` moves it to the array limiter later.
         client = LimiterClient(description, safe=self._safe)
-        self._pass_samples_to_client(client, robot)
-        client.arm(self.simulation.make_joint_state(robot, 0, self.joints[robot]))
-        self._limiter_client_by_robot[robot] = client
-        self._is_excluded[robot] = False
-        self.is_armed = _copy_with_row(self.is_armed, robot, True)
-        self.reasons[robot] = client.reason
+        self._pass_samples_to_client(client, robot_index)
+        client.arm(self.simulation.make_joint_state(robot_index, 0, self.joints[robot_index]))
+        self._limiter_client_by_robot[robot_index] = client
+        self._is_excluded[robot_index] = False
+        self.is_armed = _copy_with_row(self.is_armed, robot_index, True)
+        self.reasons[robot_index] = client.reason
         return True
 
-    def stop(self, robot: int) -> None:
+    def stop(self, robot_index: int) -> None:
         """End the episode of a robot, which takes part in no tick until the next `start`."""
         self._update_active_limits()
-        self._command_digests.restart(robot)
-        self._limiter_client_by_robot.pop(robot, None)
-        self.is_armed = _copy_with_row(self.is_armed, robot, False)
-        self._is_vectorized = _copy_with_row(self._is_vectorized, robot, False)
+        self._command_digests.restart(robot_index)
+        self._limiter_client_by_robot.pop(robot_index, None)
+        self.is_armed = _copy_with_row(self.is_armed, robot_index, False)
+        self._is_vectorized = _copy_with_row(self._is_vectorized, robot_index, False)
 
     def step(self, mode: JointMode, target: Floats, active: Mask) -> None:
         """Run one tick: limit the commands, step the physics, and read the sensors.
@@ -236,9 +238,9 @@ class ArmedRobots:
             return []
         return [robot for robot in self._limiter_client_by_robot if robots[robot]]
 
-    def read_digest(self, robot: int) -> str:
+    def read_digest(self, robot_index: int) -> str:
         """Return the digest of all setpoints, as the `command_digest` of a run."""
-        return self._command_digests.read(robot)
+        return self._command_digests.read(robot_index)
 
     def read_active_limits(self) -> NDArray[np.int64]:
         """Return the limit that changed each target in the last tick, (robots, joints), as index in LIMIT_NAMES."""
@@ -306,32 +308,32 @@ class ArmedRobots:
         self._has_full_torque = np.array_equal(torque_limit_nm, full_nm)
         return torque_limit_nm
 
-    def _limit_individually(self, robot: int, mode: JointMode, target: list[float]) -> None:
+    def _limit_individually(self, robot_index: int, mode: JointMode, target: list[float]) -> None:
         """Limit the command of one robot with its own limiter, and pass the setpoints to its motors.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             mode: Control mode of all joints.
             target: A target for each joint, tail to head.
         """
-        client = self._limiter_client_by_robot[robot]
-        tick = int(self.ticks[robot])
+        client = self._limiter_client_by_robot[robot_index]
+        tick = int(self.ticks[robot_index])
         now_ns = tick * self._period_ns
         client.command(tick, now_ns, [mode] * len(target), target)
         client.core.latch_faults_and_expire_lease(now_ns, tick)
         decision = client.core.compute_setpoints(self._schedule.used_output_tick(tick + 1))
         setpoints = decision.setpoints
-        self.simulation.enact_one(robot, setpoints)
-        self._modes[robot] = [int(mode) for mode in setpoints.mode]
-        self._target[robot] = setpoints.target
-        self._torque_limit_nm[robot] = setpoints.torque_limit_nm
-        self._active_limits[robot] = NO_LIMIT
+        self.simulation.enact_one(robot_index, setpoints)
+        self._modes[robot_index] = [int(mode) for mode in setpoints.mode]
+        self._target[robot_index] = setpoints.target
+        self._torque_limit_nm[robot_index] = setpoints.torque_limit_nm
+        self._active_limits[robot_index] = NO_LIMIT
         for joint, name in decision.limit_by_joint.items():
-            self._active_limits[robot, joint] = LIMIT_NAMES.index(name)
-        self.is_limited[robot] = self._active_limits[robot] != NO_LIMIT
+            self._active_limits[robot_index, joint] = LIMIT_NAMES.index(name)
+        self.is_limited[robot_index] = self._active_limits[robot_index] != NO_LIMIT
         if client.state != "armed":
-            self.is_armed = _copy_with_row(self.is_armed, robot, False)
-            self.reasons[robot] = client.reason
+            self.is_armed = _copy_with_row(self.is_armed, robot_index, False)
+            self.reasons[robot_index] = client.reason
 
     # --- physics and samples -----------------------------------------------------------------------------------
 
@@ -351,17 +353,17 @@ class ArmedRobots:
         self.simulation.sample(self.ticks, moved)
         return moved
 
-    def _stop_diverged(self, robot: int, cause: str) -> None:
+    def _stop_diverged(self, robot_index: int, cause: str) -> None:
         """Disarm a robot whose simulation has diverged, as a host does when its backend has failed."""
         cause = cause[:MAX_REASON_LENGTH]
-        client = self._limiter_client_by_robot.get(robot)
+        client = self._limiter_client_by_robot.get(robot_index)
         if client is None:
-            self.reasons[robot] = cause
+            self.reasons[robot_index] = cause
         else:
-            fault = Fault(tick=int(self.ticks[robot]), what="backend_failed", cause=cause, reach="robot")
+            fault = Fault(tick=int(self.ticks[robot_index]), what="backend_failed", cause=cause, reach="robot")
             client.core.latch_fault(fault)
-            self.reasons[robot] = client.reason
-        self.is_armed = _copy_with_row(self.is_armed, robot, False)
+            self.reasons[robot_index] = client.reason
+        self.is_armed = _copy_with_row(self.is_armed, robot_index, False)
 
     def _observe(self, mode: JointMode, moved: Mask) -> None:
         """Check the newest samples of the robots that have moved, and choose a limiter for each robot.
@@ -434,72 +436,74 @@ class ArmedRobots:
 
     # --- robots that have a limiter of their own ----------------------------------------------------------------
 
-    def _pass_samples_to_client(self, client: LimiterClient, robot: int) -> None:
+    def _pass_samples_to_client(self, client: LimiterClient, robot_index: int) -> None:
         """Pass the newest samples of one robot to its limiter."""
-        tick = int(self.ticks[robot])
+        tick = int(self.ticks[robot_index])
         now_ns = tick * self._period_ns
-        client.core.observe_joints(self.simulation.make_joint_state(robot, tick, self.joints[robot]), now_ns)
+        client.core.observe_joints(
+            self.simulation.make_joint_state(robot_index, tick, self.joints[robot_index]), now_ns
+        )
         windings = self.simulation.sensors.windings
-        if windings is not None and windings.is_new[robot]:
-            power = self.simulation.make_power(robot, tick)
+        if windings is not None and windings.is_new[robot_index]:
+            power = self.simulation.make_power(robot_index, tick)
             assert power is not None, "a sample has just been delivered"
             client.core.observe_power(power, now_ns)
 
-    def _follows_mode(self, robot: int, mode: JointMode) -> bool:
+    def _follows_mode(self, robot_index: int, mode: JointMode) -> bool:
         """Return whether all joints of a robot follow commands in this mode now, and will do so in the next tick."""
-        has_commands = self.ticks[robot] + 1 >= self._schedule.latency_ticks
-        return bool(self.is_armed[robot] and has_commands and (self._modes[robot] == int(mode)).all())
+        has_commands = self.ticks[robot_index] + 1 >= self._schedule.latency_ticks
+        return bool(self.is_armed[robot_index] and has_commands and (self._modes[robot_index] == int(mode)).all())
 
-    def _move_to_array_limiter(self, robot: int) -> None:
+    def _move_to_array_limiter(self, robot_index: int) -> None:
         """Move a robot from its own limiter to the array limiter, if it is armed."""
-        if self.is_armed[robot]:
-            del self._limiter_client_by_robot[robot]
-            self._is_vectorized = _copy_with_row(self._is_vectorized, robot, True)
+        if self.is_armed[robot_index]:
+            del self._limiter_client_by_robot[robot_index]
+            self._is_vectorized = _copy_with_row(self._is_vectorized, robot_index, True)
 
-    def _move_to_own_client(self, robot: int, joints_before: Floats, mode: JointMode) -> None:
+    def _move_to_own_client(self, robot_index: int, joints_before: Floats, mode: JointMode) -> None:
         """Move a robot from the array limiter to a limiter of its own, and pass the newest samples to that limiter.
 
         The new limiter is put into the state that it would have if it had limited the robot before.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             joints_before: Joint states of the tick before, (3 * joints,): angles, velocities and torques.
             mode: Control mode of all joints.
         """
-        tick = int(self.ticks[robot])
-        client = LimiterClient(self._descriptions[robot], safe=True)
-        self._limiter_client_by_robot[robot] = client
-        self._is_vectorized = _copy_with_row(self._is_vectorized, robot, False)
+        tick = int(self.ticks[robot_index])
+        client = LimiterClient(self._descriptions[robot_index], safe=True)
+        self._limiter_client_by_robot[robot_index] = client
+        self._is_vectorized = _copy_with_row(self._is_vectorized, robot_index, False)
         newest_first = list(self._commands)[::-1][:tick]  # only those of this episode
-        commands = [(tick - 1 - age, target[robot].tolist()) for age, target in enumerate(newest_first)]
+        commands = [(tick - 1 - age, target[robot_index].tolist()) for age, target in enumerate(newest_first)]
         windings = self.simulation.sensors.windings
         power = None
-        if windings is not None and not windings.is_new[robot]:
-            power = self.simulation.make_power(robot, tick - 1)
+        if windings is not None and not windings.is_new[robot_index]:
+            power = self.simulation.make_power(robot_index, tick - 1)
         client.resume(
-            self.simulation.make_joint_state(robot, tick - 1, joints_before),
+            self.simulation.make_joint_state(robot_index, tick - 1, joints_before),
             power,
             applied=(
-                _read_setpoints(self._previous_setpoints, robot),
-                _read_setpoints((self._modes, self._target, self._torque_limit_nm), robot),
+                _read_setpoints(self._previous_setpoints, robot_index),
+                _read_setpoints((self._modes, self._target, self._torque_limit_nm), robot_index),
             ),
             commands=commands[::-1],
             mode=mode,
         )
-        self._pass_samples_to_client(client, robot)
+        self._pass_samples_to_client(client, robot_index)
 
     # --- limits ------------------------------------------------------------------------------------------------
 
-    def _load_limits(self, robot: int) -> None:
+    def _load_limits(self, robot_index: int) -> None:
         """Fill in the limits of a robot from its current description."""
-        description = self._descriptions[robot]
+        description = self._descriptions[robot_index]
         joints = self._joint_count
-        self._limits.set_robot(robot, description)
+        self._limits.set_robot(robot_index, description)
         speed_rad_s = np.array([joint.speed_limit_rad_s for joint in description.joints])
         max_turn_rad = SPEED_MARGIN * speed_rad_s * description.period_ns * 1e-9
-        self._max_plausible_change[robot, :joints] = ANGLE_NOISE_MARGIN_RAD + SURE_JUMP_FRACTION * max_turn_rad
-        self._is_temperature_measured[robot] = ["temperature" in joint.measures for joint in description.joints]
-        self._stop_at_c[robot] = [joint.stop_at_c for joint in description.joints]
+        self._max_plausible_change[robot_index, :joints] = ANGLE_NOISE_MARGIN_RAD + SURE_JUMP_FRACTION * max_turn_rad
+        self._is_temperature_measured[robot_index] = ["temperature" in joint.measures for joint in description.joints]
+        self._stop_at_c[robot_index] = [joint.stop_at_c for joint in description.joints]
 
     def _update_active_limits(self) -> None:
         """Compute the active limits of the last tick. This is done only when they are read, or would be lost."""
@@ -519,14 +523,14 @@ class ArmedRobots:
         np.copyto(self._active_limits, limit_indices, where=decision.robots[:, None])
 
 
-def _copy_with_row(array: ArrayT, robot: int, value: object) -> ArrayT:
+def _copy_with_row(array: ArrayT, robot_index: int, value: object) -> ArrayT:
     """Return a copy of an array in which the row of one robot is replaced."""
     copy = array.copy()
-    copy[robot] = value
+    copy[robot_index] = value
     return copy
 
 
-def _read_setpoints(setpoints: tuple[NDArray[np.int8], Floats, Floats], robot: int) -> AppliedSetpoints:
+def _read_setpoints(setpoints: tuple[NDArray[np.int8], Floats, Floats], robot_index: int) -> AppliedSetpoints:
     """Return the setpoints of one robot from the arrays of modes, targets and torque limits of all robots."""
     modes, target, torque_limit_nm = setpoints
-    return AppliedSetpoints(modes[robot].astype(np.int64), target[robot], torque_limit_nm[robot])
+    return AppliedSetpoints(modes[robot_index].astype(np.int64), target[robot_index], torque_limit_nm[robot_index])

@@ -37,23 +37,25 @@ class LimitArrays:
     velocity_gain: Floats  # N·m·s/rad, of the torque bounds near the ends
 
     @staticmethod
-    def allocate(robots: int, joints: int, period_s: float) -> "LimitArrays":
+    def allocate(robot_count: int, joint_count: int, period_s: float) -> "LimitArrays":
         """Return arrays of placeholder limits, which `set_robot` fills in."""
-        return LimitArrays(period_s, *(np.ones((robots, joints)) for _ in range(9)))
+        return LimitArrays(period_s, *(np.ones((robot_count, joint_count)) for _ in range(9)))
 
-    def set_robot(self, robot: int, description: RobotDescription) -> None:
+    def set_robot(self, robot_index: int, description: RobotDescription) -> None:
         """Fill in the limits of one robot."""
         for i, joint in enumerate(description.joints):
             max_speed = max(joint.speed_limit_rad_s, MIN_SPEED_LIMIT_RAD_S)
-            self.angle_min_rad[robot, i] = joint.angle_min_rad
-            self.angle_max_rad[robot, i] = joint.angle_max_rad
-            self.max_step_rad[robot, i] = description.max_step_rad
-            self.angle_rate_rad[robot, i] = joint.speed_limit_rad_s * self.period_s
-            self.speed_rad_s[robot, i] = joint.speed_limit_rad_s
-            self.acceleration_rad_s2[robot, i] = joint.acceleration_limit_rad_s2
-            self.torque_nm[robot, i] = joint.torque_limit_nm
-            self.torque_rate_nm_s[robot, i] = joint.torque_rate_limit_nm_s
-            self.velocity_gain[robot, i] = max(joint.velocity_gain_nm_s_per_rad, joint.torque_limit_nm / max_speed)
+            self.angle_min_rad[robot_index, i] = joint.angle_min_rad
+            self.angle_max_rad[robot_index, i] = joint.angle_max_rad
+            self.max_step_rad[robot_index, i] = description.max_step_rad
+            self.angle_rate_rad[robot_index, i] = joint.speed_limit_rad_s * self.period_s
+            self.speed_rad_s[robot_index, i] = joint.speed_limit_rad_s
+            self.acceleration_rad_s2[robot_index, i] = joint.acceleration_limit_rad_s2
+            self.torque_nm[robot_index, i] = joint.torque_limit_nm
+            self.torque_rate_nm_s[robot_index, i] = joint.torque_rate_limit_nm_s
+            self.velocity_gain[robot_index, i] = max(
+                joint.velocity_gain_nm_s_per_rad, joint.torque_limit_nm / max_speed
+            )
 
 
 class MeasuredArrays(NamedTuple):

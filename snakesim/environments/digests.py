@@ -25,23 +25,23 @@ class _TickSetpoints(NamedTuple):
 class CommandDigests:
     """Computes a digest of all setpoints for each robot. Ticks are collected, and hashed together."""
 
-    def __init__(self, robots: int, joints: int) -> None:
-        self._hashes = [hashlib.sha256() for _ in range(robots)]
+    def __init__(self, robot_count: int, joint_count: int) -> None:
+        self._hashes = [hashlib.sha256() for _ in range(robot_count)]
         self._pending_ticks: list[_TickSetpoints] = []
         # One tick in the layout of `BlackBox`, little-endian and without gaps.
         self._tick_dtype = np.dtype(
             [
                 ("tick", "<i8"),
-                ("mode", "i1", (joints,)),
-                ("target", "<f8", (joints,)),
-                ("torque_limit_nm", "<f8", (joints,)),
+                ("mode", "i1", (joint_count,)),
+                ("target", "<f8", (joint_count,)),
+                ("torque_limit_nm", "<f8", (joint_count,)),
             ]
         )
 
-    def restart(self, robot: int) -> None:
+    def restart(self, robot_index: int) -> None:
         """Start the digest of a new episode."""
         self._hash_pending_ticks()
-        self._hashes[robot] = hashlib.sha256()
+        self._hashes[robot_index] = hashlib.sha256()
 
     def add(
         self,
@@ -64,10 +64,10 @@ class CommandDigests:
         if len(self._pending_ticks) == MAX_PENDING_TICKS:
             self._hash_pending_ticks()
 
-    def read(self, robot: int) -> str:
+    def read(self, robot_index: int) -> str:
         """Return the digest of all setpoints of the current episode of a robot."""
         self._hash_pending_ticks()
-        return self._hashes[robot].hexdigest()
+        return self._hashes[robot_index].hexdigest()
 
     def _hash_pending_ticks(self) -> None:
         """Add the collected ticks to the digests, and drop the ticks."""

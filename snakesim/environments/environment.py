@@ -73,7 +73,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         self._arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         setup = EnvironmentSetup(**self._arguments)
         self.setup = setup  # the same for all environments with these arguments
-        self._episodes = EpisodeBatch(setup, 1, threads=1)
+        self._episodes = EpisodeBatch(setup, 1, thread_count=1)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": setup.render_fps}
 

@@ -54,19 +54,19 @@ class EpisodeBatch:
         has_robot: Whether each environment has a robot, (environments,).
     """
 
-    def __init__(self, setup: EnvironmentSetup, count: int, threads: int) -> None:
+    def __init__(self, setup: EnvironmentSetup, count: int, thread_count: int) -> None:
         """Allocate the arrays for a number of environments. `reset` makes their robots.
 
         Args:
             setup: Checked arguments that all environments share.
             count: Number of environments.
-            threads: Number of threads that step the physics.
+            thread_count: Number of threads that step the physics.
         """
         self._setup = setup
         self._count = count
         joint_count = len(setup.action_names)
         self.robots = EnvironmentRobots(
-            count, joint_count, assisted=setup.is_assisted, safe=setup.is_safe, threads=threads
+            count, joint_count, assisted=setup.is_assisted, safe=setup.is_safe, thread_count=thread_count
         )
         self._observer = BatchObserver(count, setup.description, setup.parts)
         self.configs: list[RunConfig] = [setup.config] * count

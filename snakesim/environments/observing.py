@@ -37,33 +37,33 @@ class BatchObserver:
         progress: Advance of each robot towards its goal.
     """
 
-    def __init__(self, robots: int, description: RobotDescription, parts: Mapping[str, ObservationPart]) -> None:
+    def __init__(self, robot_count: int, description: RobotDescription, parts: Mapping[str, ObservationPart]) -> None:
         """Allocate the arrays for a number of robots, without tasks. `restart` sets the task of each robot.
 
         Args:
-            robots: Number of robots.
+            robot_count: Number of robots.
             description: Description of a robot with the same joints, which stands for each robot until its `restart`.
             parts: Parts of an observation by name, in their order in the observation.
         """
         self._part_readers = [PART_READERS[name] for name in parts]
         self._low = np.array([value for part in parts.values() for value in part.low], np.float32)
         self._high = np.array([value for part in parts.values() for value in part.high], np.float32)
-        self._descriptions = [description] * robots
+        self._descriptions = [description] * robot_count
         self._has_equal_links = True
         self._locator = BodyLocator(description)
-        self._start_poses = np.zeros((robots, 7))
+        self._start_poses = np.zeros((robot_count, 7))
         self._start_poses[:, 3] = 1.0
         no_task = Task((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), None)
-        self.progress = [GoalProgress(description, no_task) for _ in range(robots)]
+        self.progress = [GoalProgress(description, no_task) for _ in range(robot_count)]
 
-    def restart(self, robot: int, description: RobotDescription, task: Task) -> None:
+    def restart(self, robot_index: int, description: RobotDescription, task: Task) -> None:
         """Start an episode of a robot with a new task. The advance counts from the first observation on."""
-        self._descriptions[robot] = description
+        self._descriptions[robot_index] = description
         first_description = self._descriptions[0]
         self._has_equal_links = all(_has_equal_links(first_description, other) for other in self._descriptions)
         self._locator = BodyLocator(first_description)
-        self._start_poses[robot] = [*task.start_position_w, *task.start_wxyz]
-        self.progress[robot] = GoalProgress(description, task)
+        self._start_poses[robot_index] = [*task.start_position_w, *task.start_wxyz]
+        self.progress[robot_index] = GoalProgress(description, task)
 
     def observe(self, robots: EnvironmentRobots, time_s: Floats, rows: Mask) -> NDArray[np.float32]:
         """Measure the advance of some robots, and return the observations of all robots, (robots, n).

@@ -33,27 +33,27 @@ class EnvironmentRobots:
             tick.
     """
 
-    def __init__(self, robots: int, joints: int, *, assisted: bool, safe: bool, threads: int) -> None:
+    def __init__(self, robot_count: int, joint_count: int, *, assisted: bool, safe: bool, thread_count: int) -> None:
         """Allocate the arrays for a number of robots. `start` puts a robot into a row at the start of its episode.
 
         Args:
-            robots: Number of robots.
-            joints: Number of joints of each robot.
+            robot_count: Number of robots.
+            joint_count: Number of joints of each robot.
             assisted: Whether actions are residuals, which are added to the targets of the scenario's controller.
             safe: If True, targets pass the limiter. If False, the motors get the targets unchanged.
-            threads: Number of threads that step the physics.
+            thread_count: Number of threads that step the physics.
         """
-        self._threads = threads
-        self._robot_count = robots
-        self._joint_count = joints
+        self._threads = thread_count
+        self._robot_count = robot_count
+        self._joint_count = joint_count
         self._has_residual_actions = assisted
         self._uses_limiter = safe
         # Robots that are stepped together; None until the first of them starts. All others are stepped on their own.
         self._batch: ArmedRobots | None = None
         self._single_robot_by_row: dict[int, SteppedRobot | AssistedRobot] = {}
-        self.joints: Floats = np.zeros((robots, 3 * joints))  # angles, velocities, torques
-        self.is_armed: Mask = np.zeros(robots, dtype=np.bool_)
-        self.is_limited: Masks = np.zeros((robots, joints), dtype=np.bool_)
+        self.joints: Floats = np.zeros((robot_count, 3 * joint_count))  # angles, velocities, torques
+        self.is_armed: Mask = np.zeros(robot_count, dtype=np.bool_)
+        self.is_limited: Masks = np.zeros((robot_count, joint_count), dtype=np.bool_)
 
     def start(self, row: int, config: RunConfig, description: RobotDescription) -> None:
         """Start an episode: stop the robot in a row of the arrays, and replace it by a new robot that obeys commands.
@@ -107,25 +107,25 @@ class EnvironmentRobots:
 
     # --- what one robot reports ------------------------------------------------------------------------------
 
-    def read_lifecycle(self, robot: int) -> LifecycleState:
+    def read_lifecycle(self, robot_index: int) -> LifecycleState:
         """Return the lifecycle state, as a host would publish it."""
-        if robot in self._single_robot_by_row:
-            return self._single_robot_by_row[robot].lifecycle
-        return "armed" if self.is_armed[robot] else "fault"
+        if robot_index in self._single_robot_by_row:
+            return self._single_robot_by_row[robot_index].lifecycle
+        return "armed" if self.is_armed[robot_index] else "fault"
 
-    def read_reason(self, robot: int) -> str:
+    def read_reason(self, robot_index: int) -> str:
         """Return why a robot is in its state."""
-        if robot in self._single_robot_by_row:
-            return self._single_robot_by_row[robot].reason
+        if robot_index in self._single_robot_by_row:
+            return self._single_robot_by_row[robot_index].reason
         assert self._batch is not None
-        return self._batch.reasons[robot]
+        return self._batch.reasons[robot_index]
 
-    def read_digest(self, robot: int) -> str:
+    def read_digest(self, robot_index: int) -> str:
         """Return the digest of all setpoints, as the `command_digest` of a run."""
-        if robot in self._single_robot_by_row:
-            return self._single_robot_by_row[robot].digest
+        if robot_index in self._single_robot_by_row:
+            return self._single_robot_by_row[robot_index].digest
         assert self._batch is not None
-        return self._batch.read_digest(robot)
+        return self._batch.read_digest(robot_index)
 
     def read_limit_names(self) -> NDArray[Any]:
         """Return which limit changed each target in the last tick, (robots, joints) of names; None: none did."""
@@ -183,15 +183,15 @@ class EnvironmentRobots:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def _start_in_batch(self, robot: int, config: RunConfig, description: RobotDescription) -> bool:
+    def _start_in_batch(self, robot_index: int, config: RunConfig, description: RobotDescription) -> bool:
         """Start a robot among those that are stepped together. Return False if it cannot be stepped with them."""
         if not can_arm(config):
             return False
         if self._batch is None:
             self._batch = ArmedRobots(
-                self._robot_count, config, description, safe=self._uses_limiter, threads=self._threads
+                self._robot_count, config, description, safe=self._uses_limiter, thread_count=self._threads
             )
-        return self._batch.can_start(config) and self._batch.start(robot, config, description)
+        return self._batch.can_start(config) and self._batch.start(robot_index, config, description)
 
     def _update_arrays(self) -> None:
         """Copy the newest values of all robots into `joints`, `is_armed` and `is_limited`."""

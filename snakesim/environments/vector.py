@@ -33,7 +33,7 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         self,
         num_envs: int = 1,
         *,
-        threads: int | None = None,
+        thread_count: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **arguments: Any,
     ) -> None:
@@ -41,8 +41,8 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             num_envs: Number of environments.
-            threads: Number of threads that step the physics. None takes one for each processor that this process may
-                use. The results do not depend on it.
+            thread_count: Number of threads that step the physics. None takes one for each processor that this process
+                may use. The results do not depend on it.
             autoreset_mode: When an environment whose episode is over is reset: in the next step, in the same step, or
                 ("Disabled") only by `reset` with the option `reset_mask`.
             **arguments: Those of `SnakeEnv`.
@@ -50,9 +50,9 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             ConfigError: An argument is wrong.
         """
-        for name, number in (("num_envs", num_envs), ("threads", threads)):
+        for name, number in (("num_envs", num_envs), ("thread_count", thread_count)):
             is_count = type(number) is int and number >= 1
-            if not is_count and (name != "threads" or number is not None):
+            if not is_count and (name != "thread_count" or number is not None):
                 raise ConfigError(
                     f"{name}={number!r:.60}: give a whole number, 1 or more", code="python/invalid-argument"
                 )
@@ -65,13 +65,13 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             ) from None
         self._arguments = {
             "num_envs": num_envs,
-            "threads": threads,
+            "thread_count": thread_count,
             "autoreset_mode": self._autoreset_mode,
             **arguments,
         }
         setup = SnakeEnv(**arguments).setup
         self._setup = setup
-        self._episodes = EpisodeBatch(setup, num_envs, threads or len(os.sched_getaffinity(0)))
+        self._episodes = EpisodeBatch(setup, num_envs, thread_count or len(os.sched_getaffinity(0)))
         if setup.config.backend == "sim" and num_envs > 1 and (cost := describe_loop_cost()):
             logger.warn(cost)
         self._rngs: list[Generator] = [np_random(None)[0] for _ in range(num_envs)]

@@ -109,7 +109,7 @@ def _run_train(arguments: argparse.Namespace) -> int:
         arguments.begin,
         effort,
         arguments.out,
-        workers=arguments.workers,
+        worker_count=arguments.workers,
         cluster=arguments.cluster,
         again=["snakesim", "policy", "train", arguments.scenario, *_list_search_options(arguments)],
         resume=arguments.resume,

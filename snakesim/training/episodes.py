@@ -56,19 +56,19 @@ class EpisodeRunner:
     The same policies and fields give the same numbers with any number of processes.
     """
 
-    def __init__(self, arguments: Arguments, workers: int | None = None, cluster: str | None = None) -> None:
+    def __init__(self, arguments: Arguments, worker_count: int | None = None, cluster: str | None = None) -> None:
         """Load the scenario in this process. The `with` block starts the workers.
 
         Args:
             arguments: Arguments of `SnakeEnv`, by name.
-            workers: Number of processes on this computer. None starts one for each processor.
+            worker_count: Number of processes on this computer. None starts one for each processor.
             cluster: Address of a Dask scheduler, whose workers run the episodes instead. None uses this computer.
 
         Raises:
             ConfigError: An argument of `SnakeEnv` is wrong.
         """
         self._arguments = dict(arguments)
-        self._workers = workers
+        self._workers = worker_count
         self._cluster = cluster
         self._exit_stack = ExitStack()
         self._batch_count = 1  # into how many batches the episodes are divided: one for each worker
@@ -136,7 +136,9 @@ def _get_cached_environments(arguments: Arguments) -> tuple[EnvironmentSetup, En
     """Return the environments of this process, MAX_BATCH_SIZE. They are made anew when the arguments change."""
     if not _ENVIRONMENT_CACHE or _ENVIRONMENT_CACHE[-1].arguments != arguments:
         setup = _make_setup(arguments)
-        _ENVIRONMENT_CACHE[:] = [_CachedEnvironments(arguments, setup, Environments(setup, MAX_BATCH_SIZE, threads=1))]
+        _ENVIRONMENT_CACHE[:] = [
+            _CachedEnvironments(arguments, setup, Environments(setup, MAX_BATCH_SIZE, thread_count=1))
+        ]
     return _ENVIRONMENT_CACHE[-1].setup, _ENVIRONMENT_CACHE[-1].environments
 
 

@@ -28,7 +28,7 @@ def train_policy(
     effort: SearchEffort,
     folder: Path,
     *,
-    workers: int | None,
+    worker_count: int | None,
     cluster: str | None,
     again: Sequence[str],
     resume: bool = False,
@@ -42,7 +42,7 @@ def train_policy(
             of the form.
         effort: Number of generations, policies and fields, and the seed of the search.
         folder: Folder to write to.
-        workers: Number of processes on this computer. None starts one for each processor.
+        worker_count: Number of processes on this computer. None starts one for each processor.
         cluster: Address of a Dask scheduler, whose workers are used instead. None uses this computer.
         again: Command line of the same search.
         resume: If True, continue the search that was stopped in `folder`.
@@ -60,7 +60,7 @@ def train_policy(
     with raise_on_stop_signals():
         try:
             with (
-                EpisodeRunner({**arguments, "frame_skip": FRAME_SKIP}, workers, cluster) as episodes,
+                EpisodeRunner({**arguments, "frame_skip": FRAME_SKIP}, worker_count, cluster) as episodes,
                 kept_search.open_search_file(folder, again, resume=resume) as kept,
             ):
                 known_count = len(kept.generations)

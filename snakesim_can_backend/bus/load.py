@@ -87,11 +87,11 @@ class FrameStream:
         return self.frames_per_s * compute_max_frame_bits(load_layouts()[self.opcode].length)
 
 
-def list_streams(joints: int, reports: ReportSchedule) -> list[FrameStream]:
+def list_streams(joint_count: int, reports: ReportSchedule) -> list[FrameStream]:
     """Return all kinds of frames on one bus while the robot runs, each with its mean rate.
 
     Args:
-        joints: Number of joints on the bus.
+        joint_count: Number of joints on the bus.
         reports: Which reports the modules send, and how often.
     """
     rate_hz = reports.rate_hz
@@ -100,35 +100,35 @@ def list_streams(joints: int, reports: ReportSchedule) -> list[FrameStream]:
     tail_contact_hz = contact_hz if reports.tail else 0.0
     return [
         FrameStream(Opcode.SYNC, rate_hz),
-        FrameStream(Opcode.SET_POINT, joints * rate_hz),
-        FrameStream(Opcode.JOINT_STATE, joints * rate_hz),
-        FrameStream(Opcode.CONTACT, joints * contact_hz),
+        FrameStream(Opcode.SET_POINT, joint_count * rate_hz),
+        FrameStream(Opcode.JOINT_STATE, joint_count * rate_hz),
+        FrameStream(Opcode.CONTACT, joint_count * contact_hz),
         FrameStream(Opcode.TAIL_CONTACT, tail_contact_hz),
-        FrameStream(Opcode.GYRO, joints * imu_hz),
-        FrameStream(Opcode.ACCELEROMETER, joints * imu_hz),
-        FrameStream(Opcode.SHAFT_LOAD, joints * imu_hz),
-        FrameStream(Opcode.HEARTBEAT, joints / HEARTBEAT_PERIOD_S),
-        FrameStream(Opcode.HEALTH, joints / HEALTH_PERIOD_S),
+        FrameStream(Opcode.GYRO, joint_count * imu_hz),
+        FrameStream(Opcode.ACCELEROMETER, joint_count * imu_hz),
+        FrameStream(Opcode.SHAFT_LOAD, joint_count * imu_hz),
+        FrameStream(Opcode.HEARTBEAT, joint_count / HEARTBEAT_PERIOD_S),
+        FrameStream(Opcode.HEALTH, joint_count / HEALTH_PERIOD_S),
     ]
 
 
-def compute_bus_load(joints: int, reports: ReportSchedule) -> float:
+def compute_bus_load(joint_count: int, reports: ReportSchedule) -> float:
     """Return the worst-case load of a bus, as a fraction of its time."""
-    return sum(stream.bits_per_s for stream in list_streams(joints, reports)) / reports.bit_rate
+    return sum(stream.bits_per_s for stream in list_streams(joint_count, reports)) / reports.bit_rate
 
 
-def busiest_period_s(joints: int, reports: ReportSchedule) -> float:
+def busiest_period_s(joint_count: int, reports: ReportSchedule) -> float:
     """Return the bus time of a period with force reports: Sync, all answers and all setpoints, at worst."""
     one_period = ReportSchedule(1.0, min(reports.contact_every, 1), 0, reports.tail)
     in_each_period = (Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.CONTACT, Opcode.TAIL_CONTACT)
-    streams = [stream for stream in list_streams(joints, one_period) if stream.opcode in in_each_period]
+    streams = [stream for stream in list_streams(joint_count, one_period) if stream.opcode in in_each_period]
     return sum(stream.bits_per_s for stream in streams) / reports.bit_rate
 
 
-def is_feasible(joints: int, reports: ReportSchedule) -> bool:
+def is_feasible(joint_count: int, reports: ReportSchedule) -> bool:
     """Return whether a bus can carry this many joints, on average and in the longest period."""
-    fits_on_average = compute_bus_load(joints, reports) <= MAX_LOAD
-    return fits_on_average and busiest_period_s(joints, reports) * reports.rate_hz <= 1
+    fits_on_average = compute_bus_load(joint_count, reports) <= MAX_LOAD
+    return fits_on_average and busiest_period_s(joint_count, reports) * reports.rate_hz <= 1
 
 
 # --- the reports of a run -----------------------------------------------------------------------------------------
@@ -258,14 +258,14 @@ def validate_bus_load(config: RunConfig, settings: CanSettings) -> list[float]:
     return loads
 
 
-def _describe_bus(settings: CanSettings, bus: int) -> str:
-    return settings.channels[bus] if settings.channels else "the virtual bus"
+def _describe_bus(settings: CanSettings, bus_index: int) -> str:
+    return settings.channels[bus_index] if settings.channels else "the virtual bus"
 
 
-def explain_load(joints: int, reports: ReportSchedule) -> list[str]:
+def explain_load(joint_count: int, reports: ReportSchedule) -> list[str]:
     """Return the sum of a bus's load, one line for each kind of frame."""
     lines: list[str] = []
-    for stream in list_streams(joints, reports):
+    for stream in list_streams(joint_count, reports):
         if not stream.frames_per_s:
             continue
         layout = load_layouts()[stream.opcode]
@@ -275,7 +275,7 @@ def explain_load(joints: int, reports: ReportSchedule) -> list[str]:
             f"  {layout.name:<14}{stream.frames_per_s:7.0f} frames/s x {bits:3d} bits ({layout.length} bytes)"
             f" = {percent:5.1f} %"
         )
-    total_percent = 100 * compute_bus_load(joints, reports)
+    total_percent = 100 * compute_bus_load(joint_count, reports)
     bit_rate = format_bit_rate(reports.bit_rate)
     lines.append(f"  together {total_percent:.1f} % of {bit_rate} at worst-case stuffing; at most {MAX_LOAD:.0%}")
     return lines
@@ -317,12 +317,12 @@ def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: Can
     return f"What would fit: {text}."
 
 
-def max_rate_hz(joints: int, config: RunConfig, settings: CanSettings) -> int | None:
+def max_rate_hz(joint_count: int, config: RunConfig, settings: CanSettings) -> int | None:
     """Return the highest integer rate below the run's at which this many joints fit on a bus; None if there is none.
 
     Bisection does not work: at some lower rate reports may come at every Sync instead of every second one.
     """
     for rate_hz in range(ceil(config.rate_hz) - 1, MIN_RATE_HZ - 1, -1):
-        if is_feasible(joints, plan_reports_at(rate_hz, config, settings)):
+        if is_feasible(joint_count, plan_reports_at(rate_hz, config, settings)):
             return rate_hz
     return None

@@ -77,13 +77,13 @@ def list_fault_reset_steps() -> list[Step]:
     ]
 
 
-def list_configuration_steps(node: int, settings: Cia402Settings, period_s: float) -> list[Step]:
+def list_configuration_steps(node_id: int, settings: Cia402Settings, period_s: float) -> list[Step]:
     """Return the steps that make a drive ready for control cycles; required values are read back and compared.
 
     The drive is pre-operational while it is configured, and operational after the last step.
 
     Args:
-        node: Node id of the drive.
+        node_id: Node id of the drive.
         settings: Settings of the driver type.
         period_s: Duration from one setpoint to the next.
     """
@@ -99,9 +99,9 @@ def list_configuration_steps(node: int, settings: Cia402Settings, period_s: floa
     steps.append(WriteStep(CYCLE_VALUE, value, optional=True))
     steps.append(WriteStep(CYCLE_INDEX, exponent, optional=True))
     for pdo in PDOS:
-        steps += _list_pdo_steps(pdo, node)
+        steps += _list_pdo_steps(pdo, node_id)
     for pdo in UNUSED_PDOS:
-        steps.append(WriteStep(pdo.cob_id_entry(), PDO_OFF | pdo.base | node, optional=True))
+        steps.append(WriteStep(pdo.cob_id_entry(), PDO_OFF | pdo.base | node_id, optional=True))
     steps.append(NmtStep(NmtCommand.START))
     return steps
 
@@ -134,9 +134,9 @@ def _write_and_check(entry: ObjectEntry, value: int, *, optional: bool = False) 
     yield ReadStep(entry, expected=value, optional=optional)
 
 
-def _list_pdo_steps(pdo: Pdo, node: int) -> Iterator[Step]:
+def _list_pdo_steps(pdo: Pdo, node_id: int) -> Iterator[Step]:
     """Yield the steps that map a PDO: a drive allows it only while the PDO is off and its number of entries is 0."""
-    cob_id = pdo.base | node
+    cob_id = pdo.base | node_id
     yield WriteStep(pdo.cob_id_entry(), PDO_OFF | cob_id)
     yield WriteStep(pdo.mapping_entry(0), 0)
     for sub, entry in enumerate(pdo.entries, start=1):

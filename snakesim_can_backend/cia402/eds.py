@@ -44,12 +44,12 @@ class EdsObject:
     mappable: bool
     default: str  # a number, perhaps with $NODEID; empty: none
 
-    def default_value(self, node: int) -> int:
+    def default_value(self, node_id: int) -> int:
         """Return the default as a number; 0 if there is none, or if it is text."""
         total = 0
         for part in self.default.replace(" ", "").split("+"):
             if part.upper() == NODE_ID:
-                total += node
+                total += node_id
                 continue
             try:
                 total += int(part, 0)

@@ -153,19 +153,19 @@ def split_id(frame: CanFrame) -> tuple[int, int]:
     return frame.id & ~NODE_MASK, frame.id & NODE_MASK
 
 
-def encode_nmt(command: NmtCommand, node: int) -> CanFrame:
+def encode_nmt(command: NmtCommand, node_id: int) -> CanFrame:
     """Return an NMT command to a node; node 0 means all."""
-    return CanFrame(FunctionCode.NMT, bytes([command, node]))
+    return CanFrame(FunctionCode.NMT, bytes([command, node_id]))
 
 
-def encode_heartbeat(node: int, state: NmtState) -> CanFrame:
+def encode_heartbeat(node_id: int, state: NmtState) -> CanFrame:
     """Return a heartbeat; with the state `BOOT_UP` it is the boot-up message."""
-    return CanFrame(FunctionCode.HEARTBEAT | node, bytes([state]))
+    return CanFrame(FunctionCode.HEARTBEAT | node_id, bytes([state]))
 
 
-def encode_emergency(node: int, emergency: EmergencyMessage) -> CanFrame:
+def encode_emergency(node_id: int, emergency: EmergencyMessage) -> CanFrame:
     """Return an emergency message."""
-    return CanFrame(FunctionCode.EMERGENCY | node, EMERGENCY_LAYOUT.pack(emergency.code, emergency.register, b""))
+    return CanFrame(FunctionCode.EMERGENCY | node_id, EMERGENCY_LAYOUT.pack(emergency.code, emergency.register, b""))
 
 
 def decode_emergency(data: bytes) -> EmergencyMessage:

@@ -95,18 +95,18 @@ def read_nodes(wire: Wire) -> dict[int, Values]:
     return values_by_node
 
 
-def make_scan_row(channel: str, node: int, values: Values) -> dict[str, str]:
+def make_scan_row(channel: str, node_id: int, values: Values) -> dict[str, str]:
     """Return the row of the scan for one node, by the names in `COLUMNS`.
 
     Args:
         channel: Bus of the node.
-        node: Node id.
+        node_id: Node id.
         values: Values of each entry that responses with this id had. Several values of one entry come from several
             nodes with the same id.
     """
     row: dict[str, str] = {}
     row |= dict.fromkeys(COLUMNS, UNKNOWN)
-    row |= {"channel": channel, "node": str(node)}
+    row |= {"channel": channel, "node": str(node_id)}
     for number in values.get(DEVICE_TYPE, ()):
         row["profile"] = str(number & 0xFFFF)
     for entry, column in ((VENDOR_ID, "vendor"), (PRODUCT_CODE, "product"), (SERIAL, "serial")):

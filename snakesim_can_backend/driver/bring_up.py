@@ -102,9 +102,9 @@ def _parse_identity(channel: str, frame: CanFrame) -> ModuleIdentity | None:
     return _make_identity(channel, parse_node(frame.id), layout.decode(frame.data))
 
 
-def _make_identity(channel: str, node: int, values: Mapping[str, float]) -> ModuleIdentity:
+def _make_identity(channel: str, node_id: int, values: Mapping[str, float]) -> ModuleIdentity:
     return ModuleIdentity(
-        node=node,
+        node=node_id,
         channel=channel,
         serial=int(values["serial"]),
         firmware=f"{values['firmware_major']:.0f}.{values['firmware_minor']:.0f}",
@@ -262,15 +262,15 @@ def configure_modules(
     return current_values
 
 
-def _make_request(node: int, parameter: ModuleParameter, value: float | None) -> CanFrame:
+def _make_request(node_id: int, parameter: ModuleParameter, value: float | None) -> CanFrame:
     """Return a request to write a parameter, or to read it if there is no value."""
     layout = load_layouts()[Opcode.PARAMETER_REQUEST]
     if value is None:
-        return layout.encode(node, index=parameter, operation=ParameterOperation.READ, value=0.0)
-    return layout.encode(node, index=parameter, operation=ParameterOperation.WRITE, value=value)
+        return layout.encode(node_id, index=parameter, operation=ParameterOperation.READ, value=0.0)
+    return layout.encode(node_id, index=parameter, operation=ParameterOperation.WRITE, value=value)
 
 
-def _raise_if_refused(node: int, parameter: ModuleParameter, value: float | None, result: int) -> None:
+def _raise_if_refused(node_id: int, parameter: ModuleParameter, value: float | None, result: int) -> None:
     """Raise BackendError if a module refused a request."""
     if result == ParameterResult.DONE:
         return
@@ -279,7 +279,7 @@ def _raise_if_refused(node: int, parameter: ModuleParameter, value: float | None
     if result < len(ParameterResult):
         reason = ParameterResult(result).name.lower().replace("_", " ")
     raise BackendError(
-        f"node {node} refuses parameter {parameter.name.lower()} = {value} {allowed.unit}: "
+        f"node {node_id} refuses parameter {parameter.name.lower()} = {value} {allowed.unit}: "
         f"{reason} (allowed: {allowed.low:g} to {allowed.high:g})",
         code="drive/parameter-refused",
     )

@@ -138,31 +138,35 @@ class ModuleMonitor:
     # --- one module -------------------------------------------------------------------------------------------
 
     def _make_finding(
-        self, joint: int, module: ModuleStatus, what: str, cause: str, also: Sequence[str] = ()
+        self, joint_index: int, module: ModuleStatus, what: str, cause: str, also: Sequence[str] = ()
     ) -> FaultFinding:
         """Return a finding about a module; `also` names further kinds that apply."""
-        subject = f"{self._joint_names[joint]} (node {module.node} on {self._channels[joint]})"
+        subject = f"{self._joint_names[joint_index]} (node {module.node} on {self._channels[joint_index]})"
         concerns_only_this_joint = ROBOT_FAULT_KINDS.isdisjoint((what, *also))
-        return FaultFinding(what, f"{subject} {cause}", joint, affects_only_joint=concerns_only_this_joint)
+        return FaultFinding(what, f"{subject} {cause}", joint_index, affects_only_joint=concerns_only_this_joint)
 
-    def _find_frame_faults(self, joint: int, module: ModuleStatus, module_reports: ModuleReports) -> list[FaultFinding]:
+    def _find_frame_faults(
+        self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports
+    ) -> list[FaultFinding]:
         """Return findings about the frames of a module, or about their absence."""
         findings: list[FaultFinding] = []
 
         def report(what: str, cause: str) -> None:
-            findings.append(self._make_finding(joint, module, what, cause))
+            findings.append(self._make_finding(joint_index, module, what, cause))
 
-        self._report_restart(joint, module, module_reports, report)
+        self._report_restart(joint_index, module, module_reports, report)
         self._report_wrong_frames(module, module_reports, report)
         if not findings:
-            self._report_silence(joint, module, module_reports, report)
+            self._report_silence(joint_index, module, module_reports, report)
         return findings
 
-    def _report_restart(self, joint: int, module: ModuleStatus, module_reports: ModuleReports, report: Report) -> None:
-        if self._has_restarted(joint, module, module_reports):
-            self._restarted_joints.add(joint)
-            self._changed_joints.add(joint)
-        if joint in self._restarted_joints:
+    def _report_restart(
+        self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports, report: Report
+    ) -> None:
+        if self._has_restarted(joint_index, module, module_reports):
+            self._restarted_joints.add(joint_index)
+            self._changed_joints.add(joint_index)
+        if joint_index in self._restarted_joints:
             uptime_s = module.uptime_ms / 1000
             report(
                 "module_restarted",
@@ -185,11 +189,13 @@ class ModuleMonitor:
         if module.frame_count > MAX_FRAMES_PER_CYCLE:
             report("module_babbling", f"floods the bus: {module.frame_count} frames within one period")
 
-    def _report_silence(self, joint: int, module: ModuleStatus, module_reports: ModuleReports, report: Report) -> None:
+    def _report_silence(
+        self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports, report: Report
+    ) -> None:
         wrong_answers = module.corrupt_state_count + max(module.repeated_state_count, module.wrong_counter_count)
         without_answer = module_reports.sync - module.sync - wrong_answers
         # A Sync that the bus rejected did not reach the module.
-        since_unsent = module_reports.sync - self._last_rejected_sync_by_channel.get(self._channels[joint], -1)
+        since_unsent = module_reports.sync - self._last_rejected_sync_by_channel.get(self._channels[joint_index], -1)
         unanswered = min(without_answer, since_unsent)
         if unanswered >= MIN_UNANSWERED_SYNCS:
             silence_ms = unanswered * self._period_s * 1000
@@ -200,7 +206,7 @@ class ModuleMonitor:
 
     def _find_state_faults(
         self,
-        joint: int,
+        joint_index: int,
         module: ModuleStatus,
         module_reports: ModuleReports,
         lifecycle: LifecycleState,
@@ -212,65 +218,66 @@ class ModuleMonitor:
         stopped_on_command = lifecycle == "estop" and module.state == ModuleState.EMERGENCY and not module.faults
         may_report = module_reports.sync >= self._grace_end_sync
         if module.is_clear_required and not stopped_on_command and may_report:
-            return [self._make_fault_finding(joint, module)]
-        if isolated or not self._has_failed_to_arm(joint, module, module_reports):
+            return [self._make_fault_finding(joint_index, module)]
+        if isolated or not self._has_failed_to_arm(joint_index, module, module_reports):
             return []
         state = module.state.name.lower()
-        if joint in self._armed_joints:
-            return [self._make_finding(joint, module, "module_not_armed", f"is not armed any more: it is {state}")]
+        if joint_index in self._armed_joints:
+            return [
+                self._make_finding(joint_index, module, "module_not_armed", f"is not armed any more: it is {state}")
+            ]
         cause = f"does not arm: it is {state}"
-        return [self._make_finding(joint, module, "module_not_armed", cause, [NEVER_ARMED])]
+        return [self._make_finding(joint_index, module, "module_not_armed", cause, [NEVER_ARMED])]
 
-    def _make_fault_finding(self, joint: int, module: ModuleStatus) -> FaultFinding:
+    def _make_fault_finding(self, joint_index: int, module: ModuleStatus) -> FaultFinding:
         """Return the finding about a module that is in a latched state."""
         state = module.state.name.lower()
         faults = module.fault_names()
         kinds = [f"module_{name}" for name in (*faults, state)]
         reported = ", ".join(faults) or state
         cause = f"reports {reported}; it stopped because of {module.last_stop.name.lower()}"
-        return self._make_finding(joint, module, kinds[0], cause, kinds)
+        return self._make_finding(joint_index, module, kinds[0], cause, kinds)
 
-    def _has_restarted(self, joint: int, module: ModuleStatus, module_reports: ModuleReports) -> bool:
+    def _has_restarted(self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports) -> bool:
         """Return whether a module has restarted, once for every restart.
 
         A second module with the same id also makes the uptime decrease, but then every Sync is answered twice. So the
         decision waits for IN_A_ROW Syncs.
         """
-        if module.restarts > self._restart_counts[joint]:
-            self._restart_counts[joint] = module.restarts
-            self._restart_sync_by_joint.setdefault(joint, module_reports.sync)
-        restart_sync = self._restart_sync_by_joint.get(joint, module_reports.sync)
+        if module.restarts > self._restart_counts[joint_index]:
+            self._restart_counts[joint_index] = module.restarts
+            self._restart_sync_by_joint.setdefault(joint_index, module_reports.sync)
+        restart_sync = self._restart_sync_by_joint.get(joint_index, module_reports.sync)
         if (
             module.count_double_answers(module_reports.sync)
             or module_reports.sync - restart_sync <= MIN_CONSECUTIVE_ERRORS
         ):
             return False
-        del self._restart_sync_by_joint[joint]
+        del self._restart_sync_by_joint[joint_index]
         return True
 
-    def _has_failed_to_arm(self, joint: int, module: ModuleStatus, module_reports: ModuleReports) -> bool:
+    def _has_failed_to_arm(self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports) -> bool:
         """Return whether a module is not armed although the robot has been for long enough."""
         if self._arm_session_start_sync is None:
             return False
         if module.state == ModuleState.ARMED:
-            self._armed_joints.add(joint)
-        was_armed = joint in self._armed_joints
+            self._armed_joints.add(joint_index)
+        was_armed = joint_index in self._armed_joints
         had_time = module_reports.sync - self._arm_session_start_sync > ARM_GRACE_SYNCS or was_armed
         answered = module_reports.sync == module.sync and not module.count_double_answers(module_reports.sync)
         if had_time and answered and module.state != ModuleState.ARMED:
-            self._unarmed_sync_counts[joint] += 1
+            self._unarmed_sync_counts[joint_index] += 1
         else:
-            self._unarmed_sync_counts[joint] = 0
+            self._unarmed_sync_counts[joint_index] = 0
         # A module that was armed and is passive now has stopped: no further Sync is needed to be sure.
         fell_back = was_armed and module.state in (ModuleState.BOOT, ModuleState.DISARMED)
         needed_syncs = 1 if fell_back else MIN_CONSECUTIVE_ERRORS
-        return self._unarmed_sync_counts[joint] >= needed_syncs
+        return self._unarmed_sync_counts[joint_index] >= needed_syncs
 
-    def _make_unconfigured_finding(self, joint: int) -> FaultFinding:
-        cause = (
-            f"{self._joint_names[joint]} has not accepted its parameters, and is not armed; reset, or power-cycle it"
-        )
-        return FaultFinding("module_not_configured", cause, joint)
+    def _make_unconfigured_finding(self, joint_index: int) -> FaultFinding:
+        name = self._joint_names[joint_index]
+        cause = f"{name} has not accepted its parameters, and is not armed; reset, or power-cycle it"
+        return FaultFinding("module_not_configured", cause, joint_index)
 
     # --- the buses --------------------------------------------------------------------------------------------
 

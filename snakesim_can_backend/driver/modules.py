@@ -420,8 +420,8 @@ class JointModules(Drives):
 
     # --- sending ----------------------------------------------------------------------------------------------
 
-    def _send_command(self, action: CommandAction, joint: int) -> None:
-        self._wire_by_joint[joint].send(commands.make_command(action, joint + 1))
+    def _send_command(self, action: CommandAction, joint_index: int) -> None:
+        self._wire_by_joint[joint_index].send(commands.make_command(action, joint_index + 1))
 
     def _broadcast(self, frame: CanFrame) -> None:
         """Send a frame to all buses; an error of one does not prevent sending on the others."""
@@ -451,27 +451,27 @@ class JointModules(Drives):
             else:
                 self._repeat_command(lifecycle, joint, module)
 
-    def _repeat_arm_or_disarm(self, joint: int, module: ModuleStatus) -> None:
+    def _repeat_arm_or_disarm(self, joint_index: int, module: ModuleStatus) -> None:
         """Disarm an isolated module, and arm any other that missed the Arm of this session.
 
         A module that was armed in this session, and no longer is, has been stopped: it is not armed again.
         """
-        if joint in self._isolated_joints:
+        if joint_index in self._isolated_joints:
             if module.state in (ModuleState.ARMED, ModuleState.STOPPING):
-                self._send_command(CommandAction.DISARM, joint)
+                self._send_command(CommandAction.DISARM, joint_index)
             return
         session = self._arm_session
         if module.state == ModuleState.ARMED:
-            session.armed_joints.add(joint)
+            session.armed_joints.add(joint_index)
         in_time = self.module_reports.sync - session.sync <= ARM_GRACE_SYNCS
         unconfigured_joints = self._unconfigured_joints - self._isolated_joints
-        if in_time and not unconfigured_joints and joint not in session.armed_joints:
-            self._repeat_command("armed", joint, module)
+        if in_time and not unconfigured_joints and joint_index not in session.armed_joints:
+            self._repeat_command("armed", joint_index, module)
 
-    def _repeat_command(self, lifecycle: LifecycleState, joint: int, module: ModuleStatus) -> None:
+    def _repeat_command(self, lifecycle: LifecycleState, joint_index: int, module: ModuleStatus) -> None:
         frame = commands.make_repeated_command(lifecycle, module.state, module.node)
         if frame is not None:
-            self._wire_by_joint[joint].send(frame)
+            self._wire_by_joint[joint_index].send(frame)
 
 
 def compute_response_timeout_s(config: RunConfig, settings: CanSettings) -> float:

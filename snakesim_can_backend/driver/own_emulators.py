@@ -77,16 +77,18 @@ def validate_fault_plan(config: RunConfig, settings: CanSettings) -> None:
     if not has_virtual_bus:
         supported -= {"full"}
         reason += "; and a program cannot fill the queue of a kernel interface"
-    validate_faults_for_backend(config, supported_kinds=supported, buses=max(len(settings.channels), 1), reason=reason)
+    validate_faults_for_backend(
+        config, supported_kinds=supported, bus_count=max(len(settings.channels), 1), reason=reason
+    )
 
 
-def supports_fault(injection: FaultInjection, joints: int) -> bool:
+def supports_fault(injection: FaultInjection, joint_count: int) -> bool:
     """Return whether emulated joint modules support a fault. Raises ConfigError for an unknown joint."""
     from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS, validate_fault
 
     if injection.target_type != "joint" or injection.kind not in FAULT_DESCRIPTIONS:
         return False
-    validate_fault(injection, joints)
+    validate_fault(injection, joint_count)
     return True
 
 

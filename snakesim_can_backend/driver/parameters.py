@@ -155,9 +155,9 @@ def _validate_contact_range(robot: RobotFile) -> None:
         )
 
 
-def _validate_module_ratings(robot: RobotFile, node: int, values: Mapping[ModuleParameter, float]) -> None:
+def _validate_module_ratings(robot: RobotFile, node_id: int, values: Mapping[ModuleParameter, float]) -> None:
     """Raise BackendError if the robot file needs more torque or speed than a module is rated for."""
-    joint = robot.joint_table[node - 1]
+    joint = robot.joint_table[node_id - 1]
     gear = joint.drive.gear
     for parameter, required_value, unit in (
         (ModuleParameter.RATED_TORQUE, joint.limits.torque_nm / gear, "N·m"),
@@ -166,7 +166,7 @@ def _validate_module_ratings(robot: RobotFile, node: int, values: Mapping[Module
         is_sufficient = values[parameter] >= required_value * RATING_TOLERANCE  # False for NaN, which the bus can carry
         if not is_sufficient:
             raise BackendError(
-                f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "
+                f"joint_{node_id} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "
                 f"{required_value:g}: lower the limit in the robot file",
                 code="drive/unsupported-setting",
             )

@@ -101,19 +101,19 @@ class ModuleStatus:
 class ModuleReports:
     """The newest reports of all modules of a robot. Joint i is node i + 1."""
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, joint_count: int) -> None:
         """Prepare to read the frames of all modules of a robot, none of which has sent a report yet.
 
         Functions that read each kind of frame are compiled here, because they run for every frame.
 
         Args:
-            joints: Number of joints. Joint i has node i + 1.
+            joint_count: Number of joints. Joint i has node i + 1.
         """
-        self.modules = [ModuleStatus(node) for node in range(1, joints + 1)]
+        self.modules = [ModuleStatus(node) for node in range(1, joint_count + 1)]
 
         # What is still missing of the answers to the newest Sync.
         self.sync = -1  # number of the newest Sync; -1: none was sent
-        self.states_missing = joints
+        self.states_missing = joint_count
         self.contacts_missing = 0
         self.answers_missing = 0  # to parameter requests
 
@@ -123,12 +123,12 @@ class ModuleReports:
         self.malformed = 0  # frames of known modules with a wrong length
 
         # Raw numbers of the newest reports, by joint or link; None: no report yet.
-        self._raw_shaft_values = [(0,) * len(STATE_SIGNALS) for _ in range(joints)]
-        self._contacts: list[bytes | None] = [None] * (joints + 1)
-        self._gyro: list[tuple[int, ...] | None] = [None] * joints
-        self._acceleration: list[tuple[int, ...] | None] = [None] * joints
-        self._health: list[tuple[int, ...] | None] = [None] * joints
-        self.shaft_raw: list[int | None] = [None] * joints
+        self._raw_shaft_values = [(0,) * len(STATE_SIGNALS) for _ in range(joint_count)]
+        self._contacts: list[bytes | None] = [None] * (joint_count + 1)
+        self._gyro: list[tuple[int, ...] | None] = [None] * joint_count
+        self._acceleration: list[tuple[int, ...] | None] = [None] * joint_count
+        self._health: list[tuple[int, ...] | None] = [None] * joint_count
+        self.shaft_raw: list[int | None] = [None] * joint_count
 
         # Frame layouts.
         layouts = load_layouts()
@@ -330,12 +330,12 @@ class ModuleReports:
     def _handle_tail_contact(self, module: ModuleStatus, frame: CanFrame) -> None:
         self._store_contact(module, module.node - 1, frame.data)
 
-    def _store_contact(self, module: ModuleStatus, link: int, data: bytes) -> None:
+    def _store_contact(self, module: ModuleStatus, link_index: int, data: bytes) -> None:
         """Store the first contact report of a link that answers the newest Sync."""
         count, touched = self._read_touch(data)
         answers_this_sync = (self.sync - count) % COUNTER_MODULUS == 0
-        if answers_this_sync and self._contacts[link] is None:
-            self._contacts[link] = data if touched else NO_CONTACT
+        if answers_this_sync and self._contacts[link_index] is None:
+            self._contacts[link_index] = data if touched else NO_CONTACT
             self.contacts_missing -= module.is_awaited
 
     def _handle_heartbeat(self, module: ModuleStatus, frame: CanFrame) -> None:

@@ -132,11 +132,11 @@ class SampleBuilder:
             measured_force_n=self._mean_force.max_n,
         )
 
-    def _make_contact(self, link: int, raw: tuple[int, ...]) -> Contact:
+    def _make_contact(self, link_index: int, raw: tuple[int, ...]) -> Contact:
         """Return the contact of a link as a message.
 
         Args:
-            link: Index of the link, 0 at the tail.
+            link_index: Index of the link, 0 at the tail.
             raw: Raw numbers of the contact report: force x, y and z, position along the link, and bearing.
         """
         force_x, force_y, force_z, along, bearing = raw
@@ -144,13 +144,13 @@ class SampleBuilder:
         outward, position = locate_on_capsule(
             along * self._axial_position_step_m,
             bearing * self._bearing_step_rad,
-            self._lengths_m[link],
+            self._lengths_m[link_index],
             self._radius_m,
         )
         normal = (-outward[0], -outward[1], -outward[2])
         tangent_1, tangent_2 = compute_contact_tangents(normal)
         return Contact(
-            link=link,
+            link=link_index,
             obstacle=None,  # unknown to a force sensor
             position_l=position,
             normal_l=normal,

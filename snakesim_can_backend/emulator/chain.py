@@ -137,23 +137,23 @@ class ModuleChain:
             self._sensors.append(ModuleSensors(robot, physics_model, mounting, first, (config.seed, channel)))
         self._poll_modules(0.0)
 
-    def _add_module(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
+    def _add_module(self, joint_index: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
         """Put a module of a joint on a bus; drives: whether a motor of its own moves the joint."""
-        joint_model = self._joints[joint]
+        joint_model = self._joints[joint_index]
         limits = joint_model.limits
         # The manufacturer sets the ratings, and does not know which gear the module will get.
-        gear = self._configured_joints[joint].drive.gear
+        gear = self._configured_joints[joint_index].drive.gear
         firmware = ModuleFirmware(
-            self._node_ids[joint],
+            self._node_ids[joint_index],
             serial,
             ParameterStore(make_factory_defaults(limits.torque_nm / gear, limits.speed_rad_s * gear)),
-            self.thermal.limits[joint],
+            self.thermal.limits[joint_index],
             min_voltage_v=limits.min_voltage_v,
             stepped=self.stepped,
             now_us=now_us,
         )
-        has_motor = drives and joint not in self._unconnected_joints
-        self.slots.append(ModuleSlot(len(self.slots), channel, joint, firmware, joint_model, drives=has_motor))
+        has_motor = drives and joint_index not in self._unconnected_joints
+        self.slots.append(ModuleSlot(len(self.slots), channel, joint_index, firmware, joint_model, drives=has_motor))
 
     # --- time ----------------------------------------------------------------------------------------------
 
@@ -174,12 +174,12 @@ class ModuleChain:
             return inf
         return min(self._next_poll_us, *(bus.next_us() for bus in self.buses))
 
-    def _run_physics(self, until_us: float, steps: int) -> None:
+    def _run_physics(self, until_us: float, step_count: int) -> None:
         """Advance the physics model by some steps, and the modules to a time."""
         physics_model = self.physics_model
         motors = self.motors
         step_us = self._step_us
-        for _ in range(steps):
+        for _ in range(step_count):
             physics_model.advance(motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s))
             self._step_count += 1
             if self._step_count % THERMAL_DECIMATION == 0:
@@ -298,13 +298,13 @@ class ModuleChain:
             slot.module.receive(frame, self.now_us)
             self._apply_module_outputs(slot)
 
-    def _find_slots(self, channel: int, node: int) -> list[ModuleSlot]:
+    def _find_slots(self, channel: int, node_id: int) -> list[ModuleSlot]:
         """Return the modules with a node id on a bus: one, or several if there are duplicates."""
         slots: list[ModuleSlot] = []
-        if 1 <= node <= self.module_count:
-            slots.append(self.slots[self._node_ids.index(node)])
+        if 1 <= node_id <= self.module_count:
+            slots.append(self.slots[self._node_ids.index(node_id)])
         if len(self.slots) > self.module_count:
-            slots += [slot for slot in self.slots[self.module_count :] if slot.module.node == node]
+            slots += [slot for slot in self.slots[self.module_count :] if slot.module.node == node_id]
         return [slot for slot in slots if slot.channel == channel]
 
     # --- a Sync --------------------------------------------------------------------------------------------

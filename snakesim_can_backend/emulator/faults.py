@@ -20,20 +20,20 @@ FAULT_DESCRIPTIONS: Mapping[str, str] = {
 FAULT_NOTATION = "KIND:JOINT@START or KIND:JOINT@START-END, in seconds, such as mute:joint_3@2.0 or leak:joint_1@1-4"
 
 
-def parse_fault(text: str, joints: int) -> FaultInjection:
+def parse_fault(text: str, joint_count: int) -> FaultInjection:
     """Return the fault that a text describes in the notation of FORM.
 
     Args:
         text: The description.
-        joints: Number of joints of the robot.
+        joint_count: Number of joints of the robot.
 
     Raises:
         ConfigError: The text has another form, or modules of this robot do not support the fault.
     """
-    return validate_fault(injection.parse_injection(text), joints)
+    return validate_fault(injection.parse_injection(text), joint_count)
 
 
-def validate_fault(fault: FaultInjection, joints: int) -> FaultInjection:
+def validate_fault(fault: FaultInjection, joint_count: int) -> FaultInjection:
     """Return the same fault. Raises ConfigError if modules of a robot with this many joints do not support it."""
     if fault.target_type != "joint" or fault.kind not in FAULT_DESCRIPTIONS:
         raise ConfigError(
@@ -41,7 +41,7 @@ def validate_fault(fault: FaultInjection, joints: int) -> FaultInjection:
             f"kinds into the scenario's `faults`",
             code="injection/unknown-fault",
         )
-    injection.validate_injection_targets([fault], services=(), joints=joints, buses=0)
+    injection.validate_injection_targets([fault], services=(), joint_count=joint_count, bus_count=0)
     return fault
 
 

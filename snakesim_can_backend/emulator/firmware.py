@@ -82,7 +82,7 @@ class ModuleFirmware:
 
     def __init__(
         self,
-        node: int,
+        node_id: int,
         serial: int,
         parameters: ParameterStore,
         heat: HeatLimits,
@@ -94,7 +94,7 @@ class ModuleFirmware:
         """Start to boot the firmware of one emulated module.
 
         Args:
-            node: Node id of the module on its bus.
+            node_id: Node id of the module on its bus.
             serial: Serial number, reported in Identity.
             parameters: Parameters of the module, and its flash.
             heat: Winding temperature that stops the module, and the one below which a clear is possible again.
@@ -103,7 +103,7 @@ class ModuleFirmware:
             now_us: Current time.
         """
         # What the module is.
-        self.node = node
+        self.node = node_id
         self.serial = serial
         self.parameters = parameters
         self.heat = heat

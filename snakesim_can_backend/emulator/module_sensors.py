@@ -35,7 +35,7 @@ class ModuleSensors:
         robot: RobotFile,
         physics_model: PhysicsModel,
         mounting: DriveMounting,
-        first_joint: int,
+        first_joint_index: int,
         seed: Sequence[int],
     ) -> None:
         """Create the emulated sensors of the modules on one bus, with a noise generator of their own.
@@ -44,15 +44,15 @@ class ModuleSensors:
             robot: Robot file, with noise and thresholds.
             physics_model: Physics model whose motion and contacts are measured.
             mounting: Sign, gear and zero from each joint to the shaft of its module.
-            first_joint: Index in the robot of the first joint on this bus, 0 at the tail.
+            first_joint_index: Index in the robot of the first joint on this bus, 0 at the tail.
             seed: Entropy for `numpy.random.default_rng`, from which the noise is drawn.
         """
         # The joints of this bus.
         self._physics_model = physics_model
         self._mounting = mounting
-        self._first_joint = first_joint
+        self._first_joint = first_joint_index
         self._joint_count = len(mounting.sign)
-        self._joints = slice(first_joint, first_joint + self._joint_count)
+        self._joints = slice(first_joint_index, first_joint_index + self._joint_count)
 
         # Sensors and their noise.
         self._draw_standard_normal = np.random.default_rng(seed).standard_normal
@@ -136,14 +136,14 @@ class ModuleSensors:
                 continue
             reading.shaft_load = shaft_loads[i]
             if imu is not None:
-                self._add_imu(reading, imu, link=self._first_joint + i + 1)
+                self._add_imu(reading, imu, link_index=self._first_joint + i + 1)
 
-    def _add_imu(self, reading: ModuleReadings, imu: Imu, link: int) -> None:
+    def _add_imu(self, reading: ModuleReadings, imu: Imu, link_index: int) -> None:
         """Add the IMU of a link, if it has one."""
         sensor = self._imu_sensor
-        if sensor is None or link not in imu.link:
+        if sensor is None or link_index not in imu.link:
             return
-        index = imu.link.index(link)
+        index = imu.link.index(link_index)
         rate_rad_s = np.array(imu.angular_velocity_rad_s[index])
         acceleration_m_s2 = np.array(imu.acceleration_m_s2[index])
         reading.gyro = RATE.to_raw_array(

@@ -53,11 +53,11 @@ class ParameterStore:
         """Load the saved values."""
         self.values = dict(self._flash)
 
-    def handle_request(self, node: int, data: bytes, is_armed: bool) -> CanFrame:
+    def handle_request(self, node_id: int, data: bytes, is_armed: bool) -> CanFrame:
         """Read, write or save a parameter as a ParameterRequest demands, and return the response.
 
         Args:
-            node: Node id of the module.
+            node_id: Node id of the module.
             data: Data bytes of the request.
             is_armed: Whether the module drives its motor; if so, no parameter can be changed.
 
@@ -73,7 +73,7 @@ class ParameterStore:
             value = self.values[parameter]
         # On the bus, a value is the bits of a float32 as an unsigned integer.
         current_raw_value = int.from_bytes(FLOAT32_STRUCT.pack(value), "little")
-        return _encode_response(node, (index, operation, result, current_raw_value))
+        return _encode_response(node_id, (index, operation, result, current_raw_value))
 
     def _execute_operation(
         self, parameter: ModuleParameter, operation: int, raw_value: int, is_armed: bool

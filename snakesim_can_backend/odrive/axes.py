@@ -149,7 +149,7 @@ class OdriveAxes(CanDrives):
             case MessageId.TEMPERATURE:
                 self.readings.set_temperatures(i, values[1], values[0])
             case MessageId.HEARTBEAT:
-                self._handle_heartbeat(i, errors=values[0], state=values[1])
+                self._handle_heartbeat(i, error_count=values[0], state=values[1])
             case MessageId.ERROR:
                 self._store_errors(i, values[0])
             case MessageId.VERSION:
@@ -160,20 +160,20 @@ class OdriveAxes(CanDrives):
             case _:
                 pass
 
-    def _handle_heartbeat(self, i: int, errors: int, state: int) -> None:
+    def _handle_heartbeat(self, i: int, error_count: int, state: int) -> None:
         self.states.record_report(i, enabled=state == AxisState.CLOSED_LOOP, state=f"in state {state}")
-        self._store_errors(i, errors)
+        self._store_errors(i, error_count)
         if state == AxisState.IDLE and not self.states.drives[i].should_be_enabled:
             # A driver that is killed while its motors are off then leaves no lowered limits behind.
             self.restore_settings(i)
 
-    def _store_errors(self, i: int, errors: int) -> None:
+    def _store_errors(self, i: int, error_count: int) -> None:
         self.readings.mark_checked(i)
-        self.axes[i].errors = errors
+        self.axes[i].errors = error_count
         drive = self.states.drives[i]
         if drive.is_emergency_stopped:  # this driver has requested it, so it is no fault of the drive
-            errors &= ~AxisError.ESTOP_REQUESTED
-        drive.errors = describe_errors(errors)
+            error_count &= ~AxisError.ESTOP_REQUESTED
+        drive.errors = describe_errors(error_count)
 
     def _store_version(self, i: int, hardware: tuple[int, ...], firmware: tuple[int, ...]) -> None:
         self.firmware[i] = firmware

@@ -113,24 +113,24 @@ SETTERS = frozenset(message_id for message_id in MessageId if message_id.name.st
 FROM_HOST = SETTERS | {MessageId.ESTOP, MessageId.CLEAR_ERRORS}  # messages that only a host sends
 
 
-def encode_message(node: int, message_id: MessageId, *values: float | bytes) -> CanFrame:
+def encode_message(node_id: int, message_id: MessageId, *values: float | bytes) -> CanFrame:
     """Return a message of, or to, an axis."""
-    return CanFrame(node << NODE_BITS | message_id, PAYLOADS[message_id].pack(*values))
+    return CanFrame(node_id << NODE_BITS | message_id, PAYLOADS[message_id].pack(*values))
 
 
-def encode_request(node: int, message_id: MessageId) -> CanFrame:
+def encode_request(node_id: int, message_id: MessageId) -> CanFrame:
     """Return the request for a message: the message without data."""
-    return CanFrame(node << NODE_BITS | message_id, b"")
+    return CanFrame(node_id << NODE_BITS | message_id, b"")
 
 
-def encode_setting_request(node: int, endpoint: int) -> CanFrame:
+def encode_setting_request(node_id: int, endpoint: int) -> CanFrame:
     """Return the request for the setting with an endpoint id."""
-    return CanFrame(node << NODE_BITS | MessageId.RX_SDO, SDO_HEADER.pack(READ_SETTING, endpoint, 0))
+    return CanFrame(node_id << NODE_BITS | MessageId.RX_SDO, SDO_HEADER.pack(READ_SETTING, endpoint, 0))
 
 
-def encode_setting_answer(node: int, endpoint: int, value: bytes) -> CanFrame:
+def encode_setting_answer(node_id: int, endpoint: int, value: bytes) -> CanFrame:
     """Return an axis' answer to the request for a setting."""
-    return CanFrame(node << NODE_BITS | MessageId.TX_SDO, SDO_HEADER.pack(0, endpoint, 0) + value)
+    return CanFrame(node_id << NODE_BITS | MessageId.TX_SDO, SDO_HEADER.pack(0, endpoint, 0) + value)
 
 
 def decode_setting_answer(data: bytes) -> tuple[int, bytes]:
@@ -148,9 +148,9 @@ def split_id(frame: CanFrame) -> tuple[int, int]:
     return frame.id >> NODE_BITS, frame.id & ((1 << NODE_BITS) - 1)
 
 
-def describe_errors(errors: int) -> str:
+def describe_errors(error_count: int) -> str:
     """Return the error bits in words; empty if there are none."""
-    known = [error.name.lower() for error in AxisError if errors & error and error.name]
+    known = [error.name.lower() for error in AxisError if error_count & error and error.name]
     if known:
         return ", ".join(known)
-    return f"0x{errors:x}" if errors else ""
+    return f"0x{error_count:x}" if error_count else ""

@@ -140,11 +140,11 @@ class MessageLayout:
         has_checksum = self._has_checksum
         payload_bytes = self.length - 1 if has_checksum else self.length
 
-        def write(node: int, raw: Sequence[int]) -> CanFrame:
+        def write(node_id: int, raw: Sequence[int]) -> CanFrame:
             bits = 0
             for (shift, mask), number in zip(bit_fields, raw, strict=True):
                 bits |= (number & mask) << shift
-            identifier = frame_id(opcode, node)
+            identifier = frame_id(opcode, node_id)
             data = bits.to_bytes(payload_bytes, "little")
             if has_checksum:
                 data += bytes((checksum(identifier, data),))
@@ -152,18 +152,18 @@ class MessageLayout:
 
         return write
 
-    def encode(self, node: int, **values: float) -> CanFrame:
+    def encode(self, node_id: int, **values: float) -> CanFrame:
         """Return the frame of a node with some values.
 
         Args:
-            node: Sender or receiver.
+            node_id: Sender or receiver.
             values: By signal, in the signal's unit. Signals that are not named are 0.
 
         Raises:
             CodecError: A value is out of range.
         """
         raw = [self.signals[name].encode(value) for name, value in values.items()]
-        return self.make_writer(*values)(node, raw)
+        return self.make_writer(*values)(node_id, raw)
 
     def decode(self, data: bytes) -> Mapping[str, float]:
         """Return the values of all signals in a frame's data, in their units.

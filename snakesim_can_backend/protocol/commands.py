@@ -36,11 +36,11 @@ SYNC_TIME_MASK = 0xFFFFFFFF
 class SetpointWriter:
     """Makes the setpoint frames of all joints, and tracks the counter that each module expects next."""
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, joint_count: int) -> None:
         layout = load_layouts()[Opcode.SET_POINT]
         # Position, velocity and torque share their bits, so that writing one of them writes the target of every mode.
         self._write = layout.make_writer("mode", "count", "position", "torque_limit")
-        self._count = [0] * joints
+        self._count = [0] * joint_count
         scales = [layout.signals[name].scale for name in ("position", "velocity", "torque")]
         self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; a passive joint has no target
         self._limit_steps_per_nm = 1.0 / layout.signals["torque_limit"].scale
@@ -59,9 +59,9 @@ class SetpointWriter:
         rows = zip(modes, self._count, targets_raw.tolist(), limits_raw.tolist(), strict=True)
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
 
-    def confirm_sent(self, joint: int) -> None:
+    def confirm_sent(self, joint_index: int) -> None:
         """Advance the counter of a joint. Call it only for setpoints that the bus has accepted."""
-        self._count[joint] = (self._count[joint] + 1) % COUNTER_MODULUS
+        self._count[joint_index] = (self._count[joint_index] + 1) % COUNTER_MODULUS
 
 
 def _round_steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
@@ -96,15 +96,15 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     return frames
 
 
-def make_repeated_command(lifecycle: LifecycleState, state: ModuleState, node: int) -> CanFrame | None:
+def make_repeated_command(lifecycle: LifecycleState, state: ModuleState, node_id: int) -> CanFrame | None:
     """Return the frame to repeat to a module in an unexpected state, because an earlier one may have been lost."""
     match lifecycle, state:
         case "armed", ModuleState.DISARMED:
-            return make_command(CommandAction.ARM, node)
+            return make_command(CommandAction.ARM, node_id)
         case "estop", ModuleState.DISARMED | ModuleState.ARMED | ModuleState.STOPPING | ModuleState.FAULT:
             return make_emergency()
         case (("disarmed" | "fault"), ModuleState.ARMED):
-            return make_command(CommandAction.STOP, node)
+            return make_command(CommandAction.STOP, node_id)
     return None
 
 
@@ -113,15 +113,15 @@ def is_arm_command(frame: CanFrame) -> bool:
     return frame == make_command(CommandAction.ARM)
 
 
-def make_command(action: CommandAction, node: int = BROADCAST) -> CanFrame:
+def make_command(action: CommandAction, node_id: int = BROADCAST) -> CanFrame:
     """Return a Command to one module, or to all."""
-    return load_layouts()[Opcode.COMMAND].encode(node, action=action, key=COMMAND_KEY)
+    return load_layouts()[Opcode.COMMAND].encode(node_id, action=action, key=COMMAND_KEY)
 
 
-def make_query(node: int) -> CanFrame:
+def make_query(node_id: int) -> CanFrame:
     """Return a request for a constant parameter. Its answer comes after all earlier frames of the module."""
     layout = load_layouts()[Opcode.PARAMETER_REQUEST]
-    return layout.encode(node, index=ModuleParameter.TAIL, operation=ParameterOperation.READ, value=0.0)
+    return layout.encode(node_id, index=ModuleParameter.TAIL, operation=ParameterOperation.READ, value=0.0)
 
 
 def make_emergency() -> CanFrame:

@@ -191,9 +191,9 @@ class CanFrame(NamedTuple):
     data: bytes
 
 
-def frame_id(opcode: Opcode, node: int) -> int:
+def frame_id(opcode: Opcode, node_id: int) -> int:
     """Return the id of a message to or from a node; node 0 is broadcast."""
-    return opcode << NODE_BITS | node
+    return opcode << NODE_BITS | node_id
 
 
 def parse_opcode(identifier: int) -> int:

@@ -106,7 +106,9 @@ def validate_body_settings(
         reason += "; and in lockstep no bus is slow"
     else:
         possible_fault_kinds.add("slow")
-    validate_faults_for_backend(config, supported_kinds=possible_fault_kinds, buses=max(bus_count, 1), reason=reason)
+    validate_faults_for_backend(
+        config, supported_kinds=possible_fault_kinds, bus_count=max(bus_count, 1), reason=reason
+    )
 
 
 def validate_bus_settings(

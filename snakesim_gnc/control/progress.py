@@ -146,7 +146,9 @@ class PathProgress:
             # The body is as fast on the new path as it was on the old one.
             self._s_m = body_on_path.find_tail_s_m(self._body_points_w)
         elif last_pose_ns is None:
-            self._s_m = body_on_path.refine_tail_s_m(self._body_points_w, self._s_m, steps=RELOCALIZATION_ITERATIONS)
+            self._s_m = body_on_path.refine_tail_s_m(
+                self._body_points_w, self._s_m, step_count=RELOCALIZATION_ITERATIONS
+            )
             self._speed_m_s = 0.0
         elif pose_ns > last_pose_ns:
             self._update_filter(
@@ -165,7 +167,7 @@ class PathProgress:
             v = v + (1 - k)^2 r / T
         """
         predicted_s_m = self._s_m + self._speed_m_s * dt_s
-        residual_m = body_on_path.refine_tail_s_m(self._body_points_w, predicted_s_m, steps=1) - predicted_s_m
+        residual_m = body_on_path.refine_tail_s_m(self._body_points_w, predicted_s_m, step_count=1) - predicted_s_m
         k = 0.0
         if self._speed_filter_s > 0:
             k = float(np.exp(-dt_s / self._speed_filter_s))

@@ -74,10 +74,10 @@ class BodyOnPath:
             measured_points_w: (2, n_points) tail end, joints that bend and head end of the measured body, m.
         """
         first_guess_m = self.route.project_point(measured_points_w[:, 0])
-        return self.refine_tail_s_m(measured_points_w, first_guess_m, steps=FIRST_ITERATIONS)
+        return self.refine_tail_s_m(measured_points_w, first_guess_m, step_count=FIRST_ITERATIONS)
 
     def refine_tail_s_m(
-        self, measured_points_w: Floats, first_guess_s_m: float, *, steps: int = REFINE_ITERATIONS
+        self, measured_points_w: Floats, first_guess_s_m: float, *, step_count: int = REFINE_ITERATIONS
     ) -> float:
         """Return the arc length of the tail at which the body on the path is closest to a measured body.
 
@@ -87,11 +87,11 @@ class BodyOnPath:
         Args:
             measured_points_w: (2, n_points) tail end, joints that bend and head end of the measured body, m.
             first_guess_s_m: First guess of the arc length.
-            steps: Number of Gauss-Newton steps.
+            step_count: Number of Gauss-Newton steps.
         """
         measured_xy = measured_points_w.ravel()
         s_m = first_guess_s_m
-        for _ in range(steps):
+        for _ in range(step_count):
             pose, pose_derivative = self._interpolate_pose(s_m)
             points_derivative = pose_derivative[self._points_slice]
             step_m = float(

@@ -24,13 +24,13 @@ def resample_evenly(points_w: Floats) -> Floats:
     return _interpolate_points(points_w, s_m, np.linspace(0.0, s_m[-1], count))
 
 
-def sample_back_from_end(points_w: Floats, spacing_m: float, steps: int) -> Floats:
+def sample_back_from_end(points_w: Floats, spacing_m: float, step_count: int) -> Floats:
     """Return points (steps + 1, 2) along a curve through points (n, 2), of which the last is its end.
 
     Where the curve is too short, the points are at its beginning.
     """
     s_m = _compute_arc_lengths_m(points_w)
-    return _interpolate_points(points_w, s_m, s_m[-1] - spacing_m * np.arange(steps, -1, -1.0))
+    return _interpolate_points(points_w, s_m, s_m[-1] - spacing_m * np.arange(step_count, -1, -1.0))
 
 
 def _compute_arc_lengths_m(points_w: Floats) -> Floats:

@@ -323,15 +323,15 @@ def _unknown_kind_error(injection: FaultInjection, text: str) -> ConfigError:
 
 
 def validate_injection_targets(
-    injections: Iterable[FaultInjection], *, services: Iterable[str], joints: int, buses: int
+    injections: Iterable[FaultInjection], *, services: Iterable[str], joint_count: int, bus_count: int
 ) -> None:
     """Raise ConfigError unless a run has every target of its injected faults.
 
     Args:
         injections: Injected faults.
         services: Names of the services that the run starts.
-        joints: Number of joints of the robot.
-        buses: Number of buses of the backend.
+        joint_count: Number of joints of the robot.
+        bus_count: Number of buses of the backend.
 
     Raises:
         ConfigError: The run has no such joint, bus, process or key, or the router does not support the fault.
@@ -340,9 +340,9 @@ def validate_injection_targets(
     for injection in injections:
         match injection.target_type:
             case "joint":
-                _validate_target_index(injection, "joint", joints)
+                _validate_target_index(injection, "joint", joint_count)
             case "bus":
-                _validate_target_index(injection, "bus", buses)
+                _validate_target_index(injection, "bus", bus_count)
             case "process":
                 _validate_target_process(injection, processes)
             case "key":

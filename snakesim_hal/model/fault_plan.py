@@ -30,7 +30,7 @@ def parse_planned_faults(config: RunConfig, table: ConfigTable | None = None) ->
 
 
 def validate_faults_for_backend(
-    config: RunConfig, *, supported_kinds: Collection[str], buses: int, reason: str
+    config: RunConfig, *, supported_kinds: Collection[str], bus_count: int, reason: str
 ) -> None:
     """Raise ConfigError unless a backend can inject the planned faults of joints, buses and the simulator.
 
@@ -39,13 +39,13 @@ def validate_faults_for_backend(
     Args:
         config: Run configuration.
         supported_kinds: Kinds of fault that the backend injects itself. The host injects some kinds for any backend.
-        buses: Number of buses of the backend.
+        bus_count: Number of buses of the backend.
         reason: Why the backend injects no other kinds, for the error.
 
     Raises:
         ConfigError: The backend cannot inject a planned fault, or the run does not have its target.
     """
-    for i, injection in enumerate(parse_and_validate_planned_faults(config, buses=buses)):
+    for i, injection in enumerate(parse_and_validate_planned_faults(config, bus_count=bus_count)):
         is_backend_fault = injection.executing_part == HAL and injection.target_type not in ("process", "key")
         can_host_inject = "host" in injection.kind_info.executors or "samples" in injection.kind_info.executors
         if is_backend_fault and not can_host_inject and injection.kind not in supported_kinds:
@@ -72,14 +72,14 @@ def validate_faults_without_supervisor(config: RunConfig, table: ConfigTable | N
 
 
 def parse_and_validate_planned_faults(
-    config: RunConfig, table: ConfigTable | None = None, buses: int = MAX_BUSES
+    config: RunConfig, table: ConfigTable | None = None, bus_count: int = MAX_BUSES
 ) -> list[FaultInjection]:
     """Parse the injected faults that a run configuration plans, and check that the run has all their targets.
 
     Args:
         config: Run configuration.
         table: Values as read with their origins, to name the file or flag in errors. None if they are not known.
-        buses: Number of buses of the backend, if it is known.
+        bus_count: Number of buses of the backend, if it is known.
 
     Raises:
         ConfigError: A text is not valid, or the run has no such process, key, joint or bus.
@@ -88,7 +88,10 @@ def parse_and_validate_planned_faults(
     for i, injection in enumerate(injections):
         try:
             validate_injection_targets(
-                [injection], services=config.internal_services, joints=config.robot.chain.modules, buses=buses
+                [injection],
+                services=config.internal_services,
+                joint_count=config.robot.chain.modules,
+                bus_count=bus_count,
             )
             if injection.executing_part == RUN and injection.target in config.in_host_services:
                 raise ConfigError(

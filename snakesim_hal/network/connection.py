@@ -82,12 +82,12 @@ class ConnectionSettings:
 
 
 def open_zenoh(
-    link: ConnectionSettings, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
+    connection: ConnectionSettings, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
 ) -> zenoh.Session:
     """Open a session of Zenoh with the settings that SnakeSIM needs.
 
     Args:
-        link: Endpoint, and whether to connect to it or listen on it.
+        connection: Endpoint, and whether to connect to it or listen on it.
         connect_timeout_s: Time in s within which a client must be connected.
         change: Function that edits the settings of this session just before it is opened. None to keep them.
 
@@ -95,38 +95,38 @@ def open_zenoh(
         NotConnectedError: The endpoint does not answer, or cannot be listened on.
         RefusedError: The endpoint is on loopback, and that interface is down.
     """
-    if link.session is None:  # a session file may name other endpoints, too
-        require_loopback_up(link.endpoint)
+    if connection.session is None:  # a session file may name other endpoints, too
+        require_loopback_up(connection.endpoint)
     zenoh.init_log_from_env_or("off")
-    config = _build_config(link, connect_timeout_s)
+    config = _build_config(connection, connect_timeout_s)
     if change is not None:
         change(config)
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise _make_connection_error(link, error) from error
+        raise _make_connection_error(connection, error) from error
 
 
-def _build_config(link: ConnectionSettings, connect_timeout_s: float) -> zenoh.Config:
+def _build_config(connection: ConnectionSettings, connect_timeout_s: float) -> zenoh.Config:
     """Return the settings of a session file, if there is one, with the settings of every session on top."""
-    config = _build_base_config(link)
+    config = _build_base_config(connection)
     settings = {**REQUIRED_SETTINGS, "connect/timeout_ms": round(connect_timeout_s * 1000)}
-    if link.namespace is not None:
-        settings["namespace"] = link.namespace
+    if connection.namespace is not None:
+        settings["namespace"] = connection.namespace
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
-    size_limit = {"transport/link/rx/max_message_size": link.max_bytes + ENVELOPE_BYTES}
+    size_limit = {"transport/link/rx/max_message_size": connection.max_bytes + ENVELOPE_BYTES}
     set_if_default(config, DEFAULT_SETTINGS | size_limit)
     return config
 
 
-def _build_base_config(link: ConnectionSettings) -> zenoh.Config:
+def _build_base_config(connection: ConnectionSettings) -> zenoh.Config:
     """Return the settings of the session file; without one, Zenoh's defaults with the link's endpoint alone."""
-    if link.session is not None:
-        return zenoh.Config.from_json5(link.session.text)
-    endpoints = json.dumps([link.endpoint])
+    if connection.session is not None:
+        return zenoh.Config.from_json5(connection.session.text)
+    endpoints = json.dumps([connection.endpoint])
     config = zenoh.Config()
-    if link.listen:
+    if connection.listen:
         config.insert_json5("mode", json.dumps("router"))
         config.insert_json5("listen/endpoints", endpoints)
         config.insert_json5("connect/endpoints", "[]")
@@ -137,22 +137,22 @@ def _build_base_config(link: ConnectionSettings) -> zenoh.Config:
     return config
 
 
-def _make_connection_error(link: ConnectionSettings, error: zenoh.ZError) -> NotConnectedError:
+def _make_connection_error(connection: ConnectionSettings, error: zenoh.ZError) -> NotConnectedError:
     """Return the error that explains to a user why Zenoh could not open the session."""
-    if link.listen:
+    if connection.listen:
         return NotConnectedError(
-            f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
+            f"cannot listen on {connection.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
             f"choose one with --endpoint tcp/127.0.0.1:PORT",
             code="network/port-in-use",
         )
-    if link.session is not None:
+    if connection.session is not None:
         return NotConnectedError(
-            f"nothing on {', '.join(link.session.endpoints)} lets {link.session.path} in: no router runs there, or "
-            f"it does not accept the certificate; set RUST_LOG=zenoh=warn for details",
+            f"nothing on {', '.join(connection.session.endpoints)} lets {connection.session.path} in: no router runs "
+            f"there, or it does not accept the certificate; set RUST_LOG=zenoh=warn for details",
             code="certificate/rejected",
         )
     return NotConnectedError(
-        f"nothing listens on {link.endpoint}; start a run or a router there first", code="network/nothing-listens"
+        f"nothing listens on {connection.endpoint}; start a run or a router there first", code="network/nothing-listens"
     )
 
 

@@ -34,19 +34,19 @@ class LocalRobot:
 
     @staticmethod
     def from_connection(
-        link: "ConnectionSettings", robot: str, backend: str, stop_port: socket.socket, config: str | None = None
+        connection: "ConnectionSettings", robot: str, backend: str, stop_port: socket.socket, config: str | None = None
     ) -> "LocalRobot":
         """Return the entry of a robot for which this process is responsible."""
         stop_host, port = stop_port.getsockname()[:2]
         return LocalRobot(
-            namespace=link.namespace or robot,
+            namespace=connection.namespace or robot,
             robot=robot,
             backend=backend,
-            endpoint=link.endpoint,
+            endpoint=connection.endpoint,
             stop_host=stop_host,
             stop_port=port,
             pid=os.getpid(),
-            session=str(link.session.path) if link.session else "",
+            session=str(connection.session.path) if connection.session else "",
             config=config,
         )
 

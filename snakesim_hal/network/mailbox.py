@@ -32,16 +32,16 @@ class Mailbox(Generic[ItemT]):
         self._item_signal = threading.Lock()  # released by `put`, and acquired by the thread that waits for an item
         self._item_signal.acquire()
 
-    def put(self, item: ItemT, lane: int = 0) -> None:
+    def put(self, item: ItemT, lane_index: int = 0) -> None:
         """Add an item, from any thread; never waits."""
-        self._lanes[lane].append(item)
+        self._lanes[lane_index].append(item)
         if self._item_signal.locked():
             with contextlib.suppress(RuntimeError):  # another thread has just released it
                 self._item_signal.release()
 
-    def is_full(self, lane: int = 0) -> bool:
+    def is_full(self, lane_index: int = 0) -> bool:
         """Return whether one more item would displace the oldest of a lane."""
-        return len(self._lanes[lane]) == self._lanes[lane].maxlen
+        return len(self._lanes[lane_index]) == self._lanes[lane_index].maxlen
 
     def get(self, timeout: float | None = None) -> ItemT:
         """Wait for an item if there is none, then remove and return the oldest item of the most urgent lane.

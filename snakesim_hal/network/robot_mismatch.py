@@ -149,12 +149,12 @@ def _check_mount(message: MountedSample, robot: RobotDescription) -> WireError |
     return error or _find_wrong_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)
 
 
-def _find_wrong_link(label: str, link: int, robot: RobotDescription) -> WireError | None:
+def _find_wrong_link(label: str, link_index: int, robot: RobotDescription) -> WireError | None:
     """Return the error of a link number that the robot does not have; None for an existing link."""
     last_link = len(robot.links) - 1
-    if link <= last_link:
+    if link_index <= last_link:
         return None
-    return WireError("wrong_length", f"{label} is {link}, must be 0 (tail) to {last_link} (head)")
+    return WireError("wrong_length", f"{label} is {link_index}, must be 0 (tail) to {last_link} (head)")
 
 
 def _is_path(points_w: NDArray[np.float64]) -> bool:

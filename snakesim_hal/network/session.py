@@ -355,11 +355,11 @@ class Session:
 
 
 @contextmanager
-def open_session(link: ConnectionSettings, connect_timeout_s: float = 5.0) -> Iterator[Session]:
+def open_session(connection: ConnectionSettings, connect_timeout_s: float = 5.0) -> Iterator[Session]:
     """Connect to the network of a robot, or listen for its clients, and close the session when the context ends.
 
     Args:
-        link: Endpoint, and whether to connect to it or listen on it.
+        connection: Endpoint, and whether to connect to it or listen on it.
         connect_timeout_s: Time in s within which a client must be connected.
 
     Raises:
@@ -367,16 +367,16 @@ def open_session(link: ConnectionSettings, connect_timeout_s: float = 5.0) -> It
         RefusedError: The endpoint is on loopback, and that interface is down.
         ConfigError: Listening there would let other machines command the robot.
     """
-    if link.listen:
-        require_safe_listening_endpoint(link.endpoint, "endpoint", insecure=link.insecure)
+    if connection.listen:
+        require_safe_listening_endpoint(connection.endpoint, "endpoint", insecure=connection.insecure)
         raise_open_file_limit(MAX_OPEN_FILES)
         receiving_threads = ROUTER_RECEIVING_THREADS
         open_for_images = None
     else:
         receiving_threads = CLIENT_RECEIVING_THREADS
-        open_for_images = partial(open_zenoh, link, connect_timeout_s, configure_for_images)
+        open_for_images = partial(open_zenoh, connection, connect_timeout_s, configure_for_images)
     with limit_receiving_threads(receiving_threads):
-        session = Session(open_zenoh(link, connect_timeout_s), open_for_images)
+        session = Session(open_zenoh(connection, connect_timeout_s), open_for_images)
     with closing(session):
         yield session
 

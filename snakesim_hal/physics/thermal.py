@@ -90,17 +90,17 @@ class ThermalModel:
         if self._is_any_kept_hot:
             np.copyto(self.winding_temperature_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._is_kept_hot)
 
-    def inject_heat(self, motor: int, *, heat: bool, hold: bool) -> None:
+    def inject_heat(self, motor_index: int, *, heat: bool, hold: bool) -> None:
         """Inject an overheating fault into one winding, or remove it.
 
         Args:
-            motor: Index of the joint, from 0 at the tail.
+            motor_index: Index of the joint, from 0 at the tail.
             heat: If True, the winding is heated above its `stop_at_c` now.
             hold: If True, it keeps that temperature until a call with False. If False, it cools down.
         """
         if heat:
-            self.winding_temperature_c[motor] = self.stop_at_c[motor] + INJECTED_ABOVE_STOP_K
-        self._is_kept_hot[motor] = hold
+            self.winding_temperature_c[motor_index] = self.stop_at_c[motor_index] + INJECTED_ABOVE_STOP_K
+        self._is_kept_hot[motor_index] = hold
         self._is_any_kept_hot = bool(self._is_kept_hot.any())
 
     def compute_remaining_fractions(self) -> Floats | None:

@@ -169,13 +169,13 @@ def _create_host(
     return Host(config, backend_with_faults, session, options)
 
 
-def refuse_second_host(session: Session, link: ConnectionSettings) -> None:
+def refuse_second_host(session: Session, connection: ConnectionSettings) -> None:
     """Raise RefusedError if another HAL host has the robot's name. A dead host stays visible for a while."""
     deadline = time.monotonic() + TOKEN_EXPIRY_TIMEOUT_S
     while other_hosts := session.list_tokens(keys.HOST_ALL):
         if time.monotonic() > deadline:
             raise RefusedError(
-                f"another HAL host is on {link.endpoint} as {link.namespace}: "
+                f"another HAL host is on {connection.endpoint} as {connection.namespace}: "
                 f"{keys.parse_service(other_hosts[0])}. End it, or "
                 f"give this robot another --namespace",
                 code="robot/already-running",

@@ -123,17 +123,17 @@ class StartupWait:
         return now_s - self._start_time_s < SERVICE_START_LIMIT_S
 
 
-def connect_process(link: ConnectionSettings, name: str) -> AbstractContextManager[Session]:
+def connect_process(connection: ConnectionSettings, name: str) -> AbstractContextManager[Session]:
     """Connect a process as soon as there is a network, and report the wait on the terminal.
 
     Args:
-        link: Endpoint, namespace and options of the network.
+        connection: Endpoint, namespace and options of the network.
         name: Name of the process, for the report.
 
     Raises:
         NotConnectedError: There was no network within SERVICE_START_LIMIT_S.
     """
-    return open_session_when_ready(link, StartupWait(name, f"the network: {link.endpoint}").keeps_waiting)
+    return open_session_when_ready(connection, StartupWait(name, f"the network: {connection.endpoint}").keeps_waiting)
 
 
 if __name__ == "__main__":

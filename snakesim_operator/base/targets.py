@@ -16,17 +16,17 @@ SEARCH_TIMEOUT_S = 3.0  # to connect, and to answer: a busy computer takes more 
 ALL_HALS_KEY = f"**/{keys.alive_key('hal')}"
 
 
-def make_robot_flags(link: ConnectionSettings, robot: str | None) -> str:
+def make_robot_flags(connection: ConnectionSettings, robot: str | None) -> str:
     """Make the command-line flags that address a robot; empty for the defaults.
 
     Args:
-        link: Link to the robot.
+        connection: Link to the robot.
         robot: Name of the robot, which is its default namespace; None to always name the namespace.
     """
-    flags = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
-    if link.session is not None:
-        flags = f" --session {shlex.quote(str(link.session.path))}"
-    return flags + (f" --namespace {link.namespace}" if link.namespace != robot else "")
+    flags = f" --endpoint {connection.endpoint}" if connection.endpoint != DEFAULT_ENDPOINT else ""
+    if connection.session is not None:
+        flags = f" --session {shlex.quote(str(connection.session.path))}"
+    return flags + (f" --namespace {connection.namespace}" if connection.namespace != robot else "")
 
 
 def find_namespaces(session: Session) -> list[str]:

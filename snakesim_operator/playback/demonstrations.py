@@ -117,8 +117,8 @@ def record_demonstrations(selection: RobotSelection, folder: Path, task: str, li
 class _DemonstrationRecorder:
     """Records episodes one after another into a folder, each with its label."""
 
-    def __init__(self, link: ConnectionSettings, folder: Path, task: str, keyboard: _LineReader) -> None:
-        self._link = link
+    def __init__(self, connection: ConnectionSettings, folder: Path, task: str, keyboard: _LineReader) -> None:
+        self._link = connection
         self._folder = folder
         self._task = task
         self._keyboard = keyboard

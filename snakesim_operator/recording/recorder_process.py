@@ -159,7 +159,7 @@ class RobotRecorder:
 
 
 def record_to_file(
-    link: ConnectionSettings,
+    connection: ConnectionSettings,
     path: Path,
     should_continue: Callable[[], bool],
     on_viewer_message: OnViewerMessage | None = None,
@@ -171,7 +171,7 @@ def record_to_file(
     """Record a robot until the caller ends it or the disk is full.
 
     Args:
-        link: How to reach the robot.
+        connection: How to reach the robot.
         path: The new file.
         should_continue: Returns whether to continue; called in each cycle.
         on_viewer_message: Gets each message that is made for viewers.
@@ -186,10 +186,10 @@ def record_to_file(
         ConfigError: The file exists or cannot be created.
         NotConnectedError: There was no network at the link until the end. No file is created.
     """
-    with _connect_when_ready(link, should_continue) as session:
+    with _connect_when_ready(connection, should_continue) as session:
         return _record_until_stopped(
             session,
-            link,
+            connection,
             path,
             should_continue,
             on_viewer_message,
@@ -201,12 +201,12 @@ def record_to_file(
 
 @contextlib.contextmanager
 def _connect_when_ready(
-    link: ConnectionSettings, should_continue: Callable[[], bool] = lambda: True
+    connection: ConnectionSettings, should_continue: Callable[[], bool] = lambda: True
 ) -> Iterator[Session]:
     """Connect as soon as the robot's network can be reached, and yield the session.
 
     Args:
-        link: How to reach the robot.
+        connection: How to reach the robot.
         should_continue: Returns whether to continue; called while the network is awaited.
 
     Raises:
@@ -222,12 +222,12 @@ def _connect_when_ready(
 
     with contextlib.ExitStack() as stack:
         try:
-            session = stack.enter_context(open_session_when_ready(link, should_keep_waiting))
+            session = stack.enter_context(open_session_when_ready(connection, should_keep_waiting))
         except NotConnectedError as error:
             if not is_stopped:
                 raise
             raise NotConnectedError(
-                f"nothing listened on {link.endpoint} until the recording was ended: nothing is recorded",
+                f"nothing listened on {connection.endpoint} until the recording was ended: nothing is recorded",
                 code="network/nothing-listens",
             ) from error
         yield session
@@ -235,7 +235,7 @@ def _connect_when_ready(
 
 def _record_until_stopped(
     session: Session,
-    link: ConnectionSettings,
+    connection: ConnectionSettings,
     path: Path,
     should_continue: Callable[[], bool],
     on_viewer_message: OnViewerMessage | None = None,
@@ -248,7 +248,7 @@ def _record_until_stopped(
 
     Args:
         session: Session on the robot's network.
-        link: How to reach the robot, with its namespace.
+        connection: How to reach the robot, with its namespace.
         path: The new file.
         should_continue: Called in every cycle; returns whether to continue.
         on_viewer_message: Gets each message that is made for viewers.
@@ -264,7 +264,7 @@ def _record_until_stopped(
     """
     viewer_robot_name = None
     if not raw_only:
-        viewer_robot_name = link.namespace or "robot"
+        viewer_robot_name = connection.namespace or "robot"
     try:
         recorder = RobotRecorder(path, viewer_robot_name, on_viewer_message, log_time_clock)
     except OSError as error:

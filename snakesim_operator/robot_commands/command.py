@@ -196,14 +196,14 @@ def control_simulator(order: SimulatorOrder, selection: RobotSelection, print_te
 
 
 def _request_from_robot(
-    link: ConnectionSettings,
+    connection: ConnectionSettings,
     key: str,
     request: LifecycleRequest | SimulatorRequest,
     done_text: str,
     print_text: PrintLine,
 ) -> int:
-    with open_session(link, CONNECT_TIMEOUT_S) as session:
-        return request_from_host(session, key, request, done_text, link, print_text)
+    with open_session(connection, CONNECT_TIMEOUT_S) as session:
+        return request_from_host(session, key, request, done_text, connection, print_text)
 
 
 def request_from_host(
@@ -211,7 +211,7 @@ def request_from_host(
     key: str,
     request: LifecycleRequest | SimulatorRequest,
     done_text: str,
-    link: ConnectionSettings,
+    connection: ConnectionSettings,
     print_text: PrintLine,
 ) -> int:
     """Send a request to the robot's host, confirm the answer by the robot's status, and print it.
@@ -221,7 +221,7 @@ def request_from_host(
         key: Key at which the host answers.
         request: The request.
         done_text: What is done if the host accepts, in words, such as "armed".
-        link: How the session reaches the robot, for messages.
+        connection: How the session reaches the robot, for messages.
         print_text: Prints a line for the operator.
 
     Returns:
@@ -234,10 +234,10 @@ def request_from_host(
     status_reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
     answers = [answer for _, answer in session.send_request_to_all(key, request, ANSWER_TIMEOUT_S)]
     verification = verify_answers(answers, status_reader)
-    name = link.namespace
+    name = connection.namespace
     if not answers:
         raise NotConnectedError(
-            f"{name}: NO ANSWER on {link.endpoint}: its host hangs, or your role may not do this; if the "
+            f"{name}: NO ANSWER on {connection.endpoint}: its host hangs, or your role may not do this; if the "
             "robot moves, `snakesim estop`"
         )
     if verification.problem is not None:
@@ -346,12 +346,12 @@ def _wait_for_status(status_reader: SampleReader[RobotStatus], expected_lifecycl
     return newest_status
 
 
-def _read_description(session: Session, link: ConnectionSettings) -> RobotDescription:
+def _read_description(session: Session, connection: ConnectionSettings) -> RobotDescription:
     """Wait for the description that the host of a robot publishes, and check that there is only one host.
 
     Args:
         session: Session on the robot's network.
-        link: How to reach the robot, for messages.
+        connection: How to reach the robot, for messages.
 
     Raises:
         NotConnectedError: No host publishes a description.
@@ -365,13 +365,13 @@ def _read_description(session: Session, link: ConnectionSettings) -> RobotDescri
         descriptions = reader.drain()
     if not descriptions:
         raise NotConnectedError(
-            f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?",
+            f"{connection.namespace} publishes no description on {connection.endpoint}; is its HAL host running?",
             code="network/no-robot",
         )
     if len({description.host for description in descriptions}) > 1:
         host_count = len(descriptions)
         raise RefusedError(
-            f"{link.namespace}: {host_count} hosts describe it; at least one is an impostor. Not armed",
+            f"{connection.namespace}: {host_count} hosts describe it; at least one is an impostor. Not armed",
             code="robot/several-hosts",
         )
     return descriptions[-1]

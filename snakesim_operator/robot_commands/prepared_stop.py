@@ -85,18 +85,18 @@ class PreparedStop:
     def __init__(
         self,
         selection: RobotSelection,
-        link: ConnectionSettings,
+        connection: ConnectionSettings,
         on_result: Callable[[str, str], None] = lambda *_: None,
     ):
         """Prepare an emergency stop, which then needs no time to open sockets or to start threads.
 
         Args:
             selection: Selects the robot for the search of `snakesim estop`.
-            link: How this process connects to the robot.
+            connection: How this process connects to the robot.
             on_result: Called after each stop with its requesters and its result in words, by another thread.
         """
         self._selection = selection
-        self._link = link
+        self._link = connection
         self._on_result = on_result
         self._user = get_user_name()  # looked up in a file
         # Threads.

@@ -101,8 +101,8 @@ def _print_robot(robot: _NewestMessages) -> None:
 class _NetworkMessages:
     """Collects the messages of all robots on one network."""
 
-    def __init__(self, link: ConnectionSettings) -> None:
-        self._link = link
+    def __init__(self, connection: ConnectionSettings) -> None:
+        self._link = connection
         self._decoders = {
             keys.STATUS: MessageDecoder(RobotStatus),
             keys.PROCESS_ALL: MessageDecoder(ProcessInfo),
@@ -146,40 +146,44 @@ class _NetworkMessages:
                     self.processes.setdefault(name, []).append(message)
 
 
-def _choose_connect_timeout_s(link: ConnectionSettings, local_endpoints: Collection[str]) -> float:
+def _choose_connect_timeout_s(connection: ConnectionSettings, local_endpoints: Collection[str]) -> float:
     """Return the time in s for which to try to connect to a network.
 
     On loopback Zenoh reports at once whether a process listens, so one attempt is enough. Attempts are repeated where
     a run on this computer is about to listen, and where packets may be lost on the way.
 
     Args:
-        link: How to reach the network.
+        connection: How to reach the network.
         local_endpoints: Endpoints of the robots that run on this computer.
     """
-    if link.session is None and link.endpoint not in local_endpoints and not is_exposed(link.endpoint):
+    if (
+        connection.session is None
+        and connection.endpoint not in local_endpoints
+        and not is_exposed(connection.endpoint)
+    ):
         return SINGLE_ATTEMPT_TIMEOUT_S
     return CONNECT_TIMEOUT_S
 
 
-def _find_robots(link: ConnectionSettings, connect_timeout_s: float) -> list[_NewestMessages]:
+def _find_robots(connection: ConnectionSettings, connect_timeout_s: float) -> list[_NewestMessages]:
     """Return the robots on a network with their newest messages, sorted by name.
 
     Args:
-        link: How to reach the network.
+        connection: How to reach the network.
         connect_timeout_s: Time for which to try to connect.
 
     Raises:
         NotConnectedError: The network cannot be reached.
     """
-    messages = _NetworkMessages(link)
-    with open_session(link, connect_timeout_s) as session:
+    messages = _NetworkMessages(connection)
+    with open_session(connection, connect_timeout_s) as session:
         messages.read(session)
     robots: list[_NewestMessages] = []
     for name, status_by_host in sorted(messages.statuses.items()):
         statuses = list(status_by_host.values())
         description = messages.descriptions.get((name, statuses[-1].host))
         processes = messages.processes.get(name, [])
-        robots.append(_NewestMessages(replace(link, namespace=name), statuses, processes, description))
+        robots.append(_NewestMessages(replace(connection, namespace=name), statuses, processes, description))
     return robots
 
 
@@ -275,14 +279,14 @@ def _describe_faults(status: RobotStatus) -> list[str]:
     return lines
 
 
-def _suggest_next_commands(link: ConnectionSettings, status: RobotStatus) -> list[str]:
+def _suggest_next_commands(connection: ConnectionSettings, status: RobotStatus) -> list[str]:
     """Return lines with the commands that the operator may type next, which depend on the state of the robot.
 
     Args:
-        link: How to reach the robot. The suggested commands get the same options.
+        connection: How to reach the robot. The suggested commands get the same options.
         status: Newest status of the robot.
     """
-    flags = make_robot_flags(link, status.robot)
+    flags = make_robot_flags(connection, status.robot)
     reset = f"`snakesim robot reset{flags}`"
     arm = f"`snakesim robot arm {status.robot} {status.backend}{flags}`"
     if status.lifecycle in ("fault", "estop"):

@@ -17,13 +17,13 @@ from snakesim_operator.robot_commands.stop_result import StopResult
 QUERY_TIMEOUT_S = 1.0  # for the answers to one query
 
 
-def request_stop_on_network(link: ConnectionSettings, timeout_s: float) -> list[StopResult]:
+def request_stop_on_network(connection: ConnectionSettings, timeout_s: float) -> list[StopResult]:
     """Connect to a network, and stop its robots by queries to their hosts.
 
     Connecting is repeated while a program listens at the endpoint but accepts no session.
 
     Args:
-        link: How to connect. With a namespace, only the host of that robot is queried.
+        connection: How to connect. With a namespace, only the host of that robot is queried.
         timeout_s: Time to connect, and then again for the answers.
 
     Returns:
@@ -32,16 +32,16 @@ def request_stop_on_network(link: ConnectionSettings, timeout_s: float) -> list[
     deadline = time.monotonic() + timeout_s
     while True:
         try:
-            with open_session(link, CONNECT_TIMEOUT_S) as session:
-                return request_stop_over_session(session, link, timeout_s)
+            with open_session(connection, CONNECT_TIMEOUT_S) as session:
+                return request_stop_over_session(session, connection, timeout_s)
         except NotConnectedError:
-            if time.monotonic() > deadline or not _has_listener(link):
+            if time.monotonic() > deadline or not _has_listener(connection):
                 return []
 
 
-def _has_listener(link: ConnectionSettings) -> bool:
+def _has_listener(connection: ConnectionSettings) -> bool:
     """Return whether a program listens at the endpoint, even if it accepts no session."""
-    host, port = find_stop_address(link.endpoint, listens=True)
+    host, port = find_stop_address(connection.endpoint, listens=True)
     try:
         with socket.create_connection((host, port), timeout=QUERY_TIMEOUT_S):
             return bool(port)
@@ -49,55 +49,55 @@ def _has_listener(link: ConnectionSettings) -> bool:
         return False
 
 
-def request_stop_over_session(session: Session, link: ConnectionSettings, timeout_s: float) -> list[StopResult]:
+def request_stop_over_session(session: Session, connection: ConnectionSettings, timeout_s: float) -> list[StopResult]:
     """Stop robots by queries to their hosts, and check the answers against the status that the hosts publish.
 
     The status subscriptions stay until the session is closed.
 
     Args:
         session: Session on the network of the robots.
-        link: How the session reaches the robots. With a namespace, only the host of that robot is queried.
+        connection: How the session reaches the robots. With a namespace, only the host of that robot is queried.
         timeout_s: Time in which the query is repeated until a host answers.
 
     Returns:
         One result for each robot that is known or that has answered.
     """
-    robot_names = [link.namespace] if link.namespace is not None else find_namespaces(session)
-    status_reader_by_robot = {name: _subscribe_to_status(session, link, name) for name in robot_names}
-    answers_by_robot = _request_stop_from_hosts(session, link, timeout_s, should_repeat=bool(robot_names))
+    robot_names = [connection.namespace] if connection.namespace is not None else find_namespaces(session)
+    status_reader_by_robot = {name: _subscribe_to_status(session, connection, name) for name in robot_names}
+    answers_by_robot = _request_stop_from_hosts(session, connection, timeout_s, should_repeat=bool(robot_names))
     results: list[StopResult] = []
     for name in dict.fromkeys([*robot_names, *answers_by_robot]):
         if name not in answers_by_robot:
             text = f"NO ANSWER for {timeout_s:g} s: use its own emergency stop"
-            results.append(StopResult(name, link.endpoint, is_stopped=False, text=text))
+            results.append(StopResult(name, connection.endpoint, is_stopped=False, text=text))
             continue
-        status_reader = status_reader_by_robot.get(name) or _subscribe_to_status(session, link, name)
-        results.append(_make_verified_result(name, link, answers_by_robot[name], status_reader))
+        status_reader = status_reader_by_robot.get(name) or _subscribe_to_status(session, connection, name)
+        results.append(_make_verified_result(name, connection, answers_by_robot[name], status_reader))
     return results
 
 
 def _request_stop_from_hosts(
-    session: Session, link: ConnectionSettings, timeout_s: float, *, should_repeat: bool
+    session: Session, connection: ConnectionSettings, timeout_s: float, *, should_repeat: bool
 ) -> dict[str, list[Answer]]:
     """Send the stop query to the hosts until at least one answers.
 
     Args:
         session: Session on the network of the robots.
-        link: How the session reaches the robots. With a namespace, only the host of that robot is queried.
+        connection: How the session reaches the robots. With a namespace, only the host of that robot is queried.
         timeout_s: Time in which the query is repeated.
         should_repeat: Whether to query more than once. Without any known robot, once is enough.
 
     Returns:
         The answers by name of the robot.
     """
-    key = keys.ESTOP if link.namespace is not None else f"**/{keys.ESTOP}"
+    key = keys.ESTOP if connection.namespace is not None else f"**/{keys.ESTOP}"
     answers_by_robot: dict[str, list[Answer]] = {}
     deadline = time.monotonic() + timeout_s
     while not answers_by_robot and time.monotonic() < deadline:
         for answer_key, answer in session.send_request_to_all(
             key, EstopRequest(requester=get_user_name()), QUERY_TIMEOUT_S
         ):
-            name = link.namespace or get_namespace(answer_key)
+            name = connection.namespace or get_namespace(answer_key)
             answers_by_robot.setdefault(name, []).append(answer)
         if not should_repeat:
             break
@@ -105,13 +105,13 @@ def _request_stop_from_hosts(
 
 
 def _make_verified_result(
-    name: str, link: ConnectionSettings, answers: list[Answer], status_reader: SampleReader[RobotStatus]
+    name: str, connection: ConnectionSettings, answers: list[Answer], status_reader: SampleReader[RobotStatus]
 ) -> StopResult:
     """Return the result for one robot, which is stopped only if its status confirms the answer and no host refused.
 
     Args:
         name: Name of the robot.
-        link: How the robot was reached.
+        connection: How the robot was reached.
         answers: All answers of hosts with this name.
         status_reader: Reads the status that the robot's host publishes.
     """
@@ -120,14 +120,14 @@ def _make_verified_result(
     problem = doubt or refusal
     return StopResult(
         name,
-        link.endpoint,
+        connection.endpoint,
         is_stopped=problem is None,
         text=problem or answers[0].reason,
         is_doubtful=doubt is not None,
     )
 
 
-def _subscribe_to_status(session: Session, link: ConnectionSettings, name: str) -> SampleReader[RobotStatus]:
+def _subscribe_to_status(session: Session, connection: ConnectionSettings, name: str) -> SampleReader[RobotStatus]:
     """Subscribe to the status of one robot, and return the reader."""
-    key = keys.STATUS if link.namespace is not None else f"{name}/{keys.STATUS}"
+    key = keys.STATUS if connection.namespace is not None else f"{name}/{keys.STATUS}"
     return session.declare_latched_reader(key, RobotStatus)

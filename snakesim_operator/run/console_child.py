@@ -28,19 +28,19 @@ def require_console() -> None:
 
 @contextlib.contextmanager
 def run_console(
-    common_arguments: Sequence[str], link: ConnectionSettings, files: RunFiles, report: Callable[[str], None]
+    common_arguments: Sequence[str], connection: ConnectionSettings, files: RunFiles, report: Callable[[str], None]
 ) -> Iterator[None]:
     """Run the console in two child processes, the front process and the page server, while the context is active.
 
     Args:
         common_arguments: Command-line arguments of every process of the run, such as its scenario and endpoint.
-        link: Connection of the console to the robot.
+        connection: Connection of the console to the robot.
         files: Files of the run, which receive the output of the console.
         report: Called with the address of the page, and with warnings.
     """
     on_output = partial(files.append, LOG_FILENAME)
     with open_console_ports(port=None) as ports:
-        front_process = start_console_front(ports, link, on_output)
+        front_process = start_console_front(ports, connection, on_output)
         pages_fd = ports.pages.fileno()
         arguments = [CONSOLE_MODULE, *common_arguments, "--listening", str(pages_fd)]
         page_server_process = children.start_child("console", arguments, on_output, pass_fds=[pages_fd])

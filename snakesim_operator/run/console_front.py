@@ -10,13 +10,13 @@ FRONT_MODULE = "snakesim_operator.features.console.front"
 
 
 def start_console_front(
-    ports: ConsolePorts, link: ConnectionSettings | None, on_output: Callable[[bytes], object]
+    ports: ConsolePorts, connection: ConnectionSettings | None, on_output: Callable[[bytes], object]
 ) -> children.ChildProcess:
     """Start the front server of a console as a child process.
 
     Args:
         ports: Sockets of the console, and the path of the page server.
-        link: Connection to the robot that its stop button stops; None for a recording.
+        connection: Connection to the robot that its stop button stops; None for a recording.
         on_output: Called with each piece of output of the server, in another thread.
     """
     browsers_fd = ports.browsers.fileno()
@@ -26,17 +26,17 @@ def start_console_front(
         str(browsers_fd),
         "--pages",
         str(ports.pages_path),
-        *_make_robot_arguments(link),
+        *_make_robot_arguments(connection),
     ]
     token = {TOKEN_VARIABLE: ports.token}
     return children.start_child("console front", arguments, on_output, pass_fds=[browsers_fd], extra_env=token)
 
 
-def _make_robot_arguments(link: ConnectionSettings | None) -> list[str]:
+def _make_robot_arguments(connection: ConnectionSettings | None) -> list[str]:
     """Return the command-line arguments by which the front server finds the robot."""
-    if link is None:
+    if connection is None:
         return ["--recording"]
-    robot = [] if link.namespace is None else ["--namespace", link.namespace]
-    if link.session is not None:
-        return ["--session", str(link.session.path), *robot]
-    return ["--endpoint", link.endpoint, *robot]
+    robot = [] if connection.namespace is None else ["--namespace", connection.namespace]
+    if connection.session is not None:
+        return ["--session", str(connection.session.path), *robot]
+    return ["--endpoint", connection.endpoint, *robot]

@@ -37,6 +37,6 @@ def run_host(arguments: argparse.Namespace) -> int:
         return run_host_program(options, partial(_report_network, link))
 
 
-def _report_network(link: ConnectionSettings) -> None:
+def _report_network(connection: ConnectionSettings) -> None:
     """Print where the host can be reached, once it can."""
-    print_line(f"network: {link.endpoint}, namespace {link.namespace}; Ctrl-C ends it")
+    print_line(f"network: {connection.endpoint}, namespace {connection.namespace}; Ctrl-C ends it")

@@ -209,19 +209,19 @@ class _RunProcesses:
         self,
         request: RunRequest,
         supervisor: RunSupervisor,
-        link: ConnectionSettings,
+        connection: ConnectionSettings,
         files: RunFiles,
         config_file: Path,
     ) -> None:
         self.request = request
         self.supervisor = supervisor
-        self.link = link
+        self.link = connection
         self._files = files
         self._scenario = [str(config_file), "--namespace", request.robot_namespace]
-        if link.session:
-            self._network = ["--session", str(link.session.path)]
+        if connection.session:
+            self._network = ["--session", str(connection.session.path)]
         else:
-            self._network = ["--endpoint", link.endpoint]
+            self._network = ["--endpoint", connection.endpoint]
         self._listening = ["--insecure"] if request.insecure else []
 
     @property
@@ -290,21 +290,23 @@ def _run_until_over(processes: _RunProcesses, ending: RunEnding) -> None:
         supervisor.end_all_processes()
 
 
-def _print_start(config: RunConfig, link: ConnectionSettings) -> None:
+def _print_start(config: RunConfig, connection: ConnectionSettings) -> None:
     print_line(
         f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander_name}, {config.clock_mode}"
     )
-    print_line(f"network: {link.endpoint}, namespace {link.namespace}")
+    print_line(f"network: {connection.endpoint}, namespace {connection.namespace}")
     if not config.has_internal_control:
         print_line("no control service of its own: a client that takes the lease commands and arms the robot")
 
 
 @contextlib.contextmanager
-def _open_run_session(link: ConnectionSettings, supervisor: RunSupervisor, ending: RunEnding) -> Iterator[Session]:
+def _open_run_session(
+    connection: ConnectionSettings, supervisor: RunSupervisor, ending: RunEnding
+) -> Iterator[Session]:
     """Connect to the network of the run, and retry until the host has opened it.
 
     Args:
-        link: Link to the network of the run.
+        connection: Link to the network of the run.
         supervisor: Supervisor of the processes; if one of them ends, connecting is given up.
         ending: Shows whether the operator has interrupted the run.
 
@@ -319,7 +321,7 @@ def _open_run_session(link: ConnectionSettings, supervisor: RunSupervisor, endin
     with contextlib.ExitStack() as stack:
         while True:
             try:
-                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_TIMEOUT_S))
+                session = stack.enter_context(open_session(connection, connect_timeout_s=CONNECT_TIMEOUT_S))
                 break
             except NotConnectedError:
                 ended_process = supervisor.describe_first_end()

@@ -12,12 +12,12 @@ PACKET_OVERHEAD = 10  # bytes around the parameters: header, id, length, instruc
 REGISTERS = 4  # bytes of the address and the size in a request
 
 
-def count_cycle_bytes(servos: int) -> int:
+def count_cycle_bytes(servo_count: int) -> int:
     """Return the number of bytes on the wire, in both directions, without stuffing."""
-    read_request = PACKET_OVERHEAD + REGISTERS + servos
-    read_answer = PACKET_OVERHEAD + servos * (registers.present_form.size + 4)  # each with error, id and CRC
+    read_request = PACKET_OVERHEAD + REGISTERS + servo_count
+    read_answer = PACKET_OVERHEAD + servo_count * (registers.present_form.size + 4)  # each with error, id and CRC
     health = PACKET_OVERHEAD + REGISTERS + PACKET_OVERHEAD + 1 + registers.HEALTH_SIZE  # request, and answer with error
-    goals = PACKET_OVERHEAD + REGISTERS + servos * (1 + registers.goals_form.size)  # each with id
+    goals = PACKET_OVERHEAD + REGISTERS + servo_count * (1 + registers.goals_form.size)  # each with id
     return read_request + read_answer + health + goals
 
 

@@ -127,10 +127,10 @@ def find_model_number(name: str) -> int | None:
     return None
 
 
-def describe_errors(errors: int) -> str:
+def describe_errors(error_count: int) -> str:
     """Return the names of the bits of a hardware error."""
-    names = [error.name.lower().replace("_", " ") for error in HardwareError if errors & error and error.name]
-    return ", ".join(names) or f"0x{errors:02x}"
+    names = [error.name.lower().replace("_", " ") for error in HardwareError if error_count & error and error.name]
+    return ", ".join(names) or f"0x{error_count:02x}"
 
 
 def gains(stiffness: float, damping: float, torque_unit_nm: float) -> tuple[int, int, int]:

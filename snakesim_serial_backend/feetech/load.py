@@ -11,12 +11,12 @@ from snakesim_serial_backend.port_load import PortLoad
 REGISTERS = 2  # bytes of the address and the size in a request
 
 
-def count_cycle_bytes(servos: int) -> int:
+def count_cycle_bytes(servo_count: int) -> int:
     """Return the number of bytes on the wire, in both directions."""
-    read_request = OVERHEAD + REGISTERS + servos
-    read_answers = servos * (OVERHEAD + registers.present_form.size)
+    read_request = OVERHEAD + REGISTERS + servo_count
+    read_answers = servo_count * (OVERHEAD + registers.present_form.size)
     state = OVERHEAD + REGISTERS + OVERHEAD + registers.STATE_SIZE
-    goals = OVERHEAD + REGISTERS + servos * (1 + registers.goals_form.size)  # each with id
+    goals = OVERHEAD + REGISTERS + servo_count * (1 + registers.goals_form.size)  # each with id
     return read_request + read_answers + state + goals
 
 

@@ -83,10 +83,10 @@ def get_model_name(number: int) -> str:
     return MODELS.get(number, f"model {number}")
 
 
-def describe_errors(errors: int) -> str:
+def describe_errors(error_count: int) -> str:
     """Return the names of the bits of an error."""
-    names = [error.name.lower().replace("_", " ") for error in ServoError if errors & error and error.name]
-    return ", ".join(names) or f"0x{errors:02x}"
+    names = [error.name.lower().replace("_", " ") for error in ServoError if error_count & error and error.name]
+    return ", ".join(names) or f"0x{error_count:02x}"
 
 
 def to_angle_rad(position: int) -> float:

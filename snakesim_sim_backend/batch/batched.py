@@ -39,30 +39,30 @@ PLUGIN = mujoco.mjtObj.mjOBJ_PLUGIN
 class BatchedSimulations(SimulationBatch):
     """The states of all robots are rows of a batch."""
 
-    def __init__(self, robots: int, joints: int, threads: int) -> None:
-        self._count = robots
-        self._joints = joints
-        self._threads = threads
-        self._placed: list[PlacedRobot | None] = [None] * robots
+    def __init__(self, robot_count: int, joint_count: int, thread_count: int) -> None:
+        self._count = robot_count
+        self._joints = joint_count
+        self._threads = thread_count
+        self._placed: list[PlacedRobot | None] = [None] * robot_count
         self._batch: Batch | None = None
-        self.motors = [NO_MOTORS] * robots
+        self.motors = [NO_MOTORS] * robot_count
 
-    def load(self, robot: int, placed: PlacedRobot) -> bool:
+    def load(self, robot_index: int, placed: PlacedRobot) -> bool:
         if self._batch is None:
             self._allocate_batch(placed)
-        elif not self._try_model(robot, placed):
+        elif not self._try_model(robot_index, placed):
             return False
         batch = self._require_batch()
         data = placed.data
-        self._placed[robot] = placed
-        self.motors[robot] = placed.motors
-        mujoco.mj_getState(placed.sim.model, data, batch.state[robot], COMPLETE_STATE)
-        self._good_states[robot] = batch.state[robot]
-        batch.warning[robot] = 0
-        self.torque_nm[robot] = data.actuator_force[: self._joints]
-        self._start_rotations[robot] = view_link_rotations(placed)
-        self._is_at_start[robot] = True
-        placed.motors.bind_state(MotorArrays(self, robot, batch.bind("history")[robot]))
+        self._placed[robot_index] = placed
+        self.motors[robot_index] = placed.motors
+        mujoco.mj_getState(placed.sim.model, data, batch.state[robot_index], COMPLETE_STATE)
+        self._good_states[robot_index] = batch.state[robot_index]
+        batch.warning[robot_index] = 0
+        self.torque_nm[robot_index] = data.actuator_force[: self._joints]
+        self._start_rotations[robot_index] = view_link_rotations(placed)
+        self._is_at_start[robot_index] = True
+        placed.motors.bind_state(MotorArrays(self, robot_index, batch.bind("history")[robot_index]))
         return True
 
     def _allocate_batch(self, placed: PlacedRobot) -> None:
@@ -114,13 +114,13 @@ class BatchedSimulations(SimulationBatch):
         self._numbers_before_contacts = numbers_before_plugins + friction + MEMORY_NUMBERS + FOOT_NUMBERS * feet
         self._good_states = np.empty_like(batch.state)
 
-    def _try_model(self, robot: int, placed: PlacedRobot) -> bool:
+    def _try_model(self, robot_index: int, placed: PlacedRobot) -> bool:
         """Use the model of a robot in its row. Returns False if it has other sizes than the others."""
         sim = placed.sim
         if sim.steps_per_tick != self._steps or sim.first_link_body != self._links.start:
             return False
         models = [*self._models]
-        models[robot] = sim.model
+        models[robot_index] = sim.model
         try:
             self._require_batch().set_models(models)
         except mujoco.FatalError:
@@ -178,28 +178,28 @@ class BatchedSimulations(SimulationBatch):
             & (warnings.sum(axis=1) == 0)
         )
 
-    def _restore_diverged_state(self, robot: int, tick: int) -> str:
+    def _restore_diverged_state(self, robot_index: int, tick: int) -> str:
         """Restore the last good state of a simulation that has diverged, and return the reason of the divergence.
 
         To find the reason, the step is repeated from the last good state in a separate simulation.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             tick: Number of the control cycle, for the message.
         """
-        placed = self._placed[robot]
+        placed = self._placed[robot_index]
         assert placed is not None
         batch = self._require_batch()
         model = placed.sim.model
         data = placed.data
-        bad_state = batch.state[robot].copy()
-        batch.state[robot] = self._good_states[robot]
-        mujoco.mj_setState(model, data, batch.state[robot], COMPLETE_STATE)
+        bad_state = batch.state[robot_index].copy()
+        batch.state[robot_index] = self._good_states[robot_index]
+        mujoco.mj_setState(model, data, batch.state[robot_index], COMPLETE_STATE)
         watch = DivergenceWatch(model, data, placed.physics, self._steps)  # stores the good state of `data`
         mujoco.mj_setState(model, data, bad_state, COMPLETE_STATE)
-        data.qacc[:] = self._qacc[robot]
-        data.warning.number[:] = batch.warning[robot, :, 1]
-        batch.warning[robot] = 0
+        data.qacc[:] = self._qacc[robot_index]
+        data.warning.number[:] = batch.warning[robot_index, :, 1]
+        batch.warning[robot_index] = 0
         try:
             watch.check(tick)
         except BackendError as error:

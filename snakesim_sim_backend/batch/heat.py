@@ -16,8 +16,8 @@ class HeatArrays:
         winding_c: (robots, joints), the temperatures.
     """
 
-    def __init__(self, robots: int, joints: int, period_s: float) -> None:
-        shape = (robots, joints)
+    def __init__(self, robot_count: int, joint_count: int, period_s: float) -> None:
+        shape = (robot_count, joint_count)
         self._period_s = period_s
         self.winding_c: Floats = np.zeros(shape)
         # Parameters.
@@ -28,16 +28,16 @@ class HeatArrays:
         self._stop_at_c = np.full(shape, 2.0)
         self._derated = set[int]()  # robots with a hot motor when `find_robots_to_derate` was called
 
-    def restart(self, robot: int, joints: Sequence[Joint]) -> None:
+    def restart(self, robot_index: int, joints: Sequence[Joint]) -> None:
         """Start a robot with every winding at the ambient temperature."""
         time_s = np.array([-joint.heat.time_constant_s for joint in joints])
-        self._ambient_c[robot] = [joint.heat.ambient_c for joint in joints]
-        self._rise[robot] = [joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints]
-        self._approach[robot] = -np.expm1(self._period_s / time_s)
-        self._derate_from_c[robot] = [joint.limits.derate_from_c for joint in joints]
-        self._stop_at_c[robot] = [joint.limits.stop_at_c for joint in joints]
-        self.winding_c[robot] = self._ambient_c[robot]
-        self._derated.discard(robot)
+        self._ambient_c[robot_index] = [joint.heat.ambient_c for joint in joints]
+        self._rise[robot_index] = [joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints]
+        self._approach[robot_index] = -np.expm1(self._period_s / time_s)
+        self._derate_from_c[robot_index] = [joint.limits.derate_from_c for joint in joints]
+        self._stop_at_c[robot_index] = [joint.limits.stop_at_c for joint in joints]
+        self.winding_c[robot_index] = self._ambient_c[robot_index]
+        self._derated.discard(robot_index)
 
     def advance_period(self, torque_nm: Floats) -> None:
         """Heat and cool the windings for a control period under these torques, (robots, joints)."""

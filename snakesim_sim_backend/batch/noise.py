@@ -28,11 +28,11 @@ class NoiseStreams:
         self._first = BLOCK * np.arange(robots)  # position of each robot's block in the flat array
         self._left = 0  # numbers that every robot has left at least
 
-    def restart(self, robot: int, seed: int) -> None:
+    def restart(self, robot_index: int, seed: int) -> None:
         """Start the stream of a robot with a seed."""
-        self._random[robot] = np.random.default_rng(seed)
-        self._numbers[robot] = self._random[robot].standard_normal(BLOCK)
-        self._next[robot] = -self._skipped
+        self._random[robot_index] = np.random.default_rng(seed)
+        self._numbers[robot_index] = self._random[robot_index].standard_normal(BLOCK)
+        self._next[robot_index] = -self._skipped
 
     def peek(self, count: int) -> Floats:
         """Return the next numbers of every robot, (robots, count), and leave them in the streams."""

@@ -19,11 +19,11 @@ from snakesim_sim_backend.batch.simulations import LoopedSimulations, Simulation
 from snakesim_sim_backend.laws.version import choose_laws
 
 
-def _open_simulations(robots: int, joints: int, threads: int) -> SimulationBatch:
+def _open_simulations(robot_count: int, joint_count: int, thread_count: int) -> SimulationBatch:
     """Return a batch of simulations, or a loop over one or where the laws run in Python."""
-    if robots == 1 or choose_laws() == "python":
-        return LoopedSimulations(robots, joints)
-    return BatchedSimulations(robots, joints, threads)
+    if robot_count == 1 or choose_laws() == "python":
+        return LoopedSimulations(robot_count, joint_count)
+    return BatchedSimulations(robot_count, joint_count, thread_count)
 
 
 class SimulatedRobots:
@@ -36,45 +36,45 @@ class SimulatedRobots:
         all_robots: The mask of all robots. A call with this object is faster than one with an equal mask.
     """
 
-    def __init__(self, robots: int, config: RunConfig, *, threads: int) -> None:
+    def __init__(self, robot_count: int, config: RunConfig, *, thread_count: int) -> None:
         """Allocate the simulations, motors and sensors of many robots; each is placed in its scene later.
 
         Args:
-            robots: Number of robots.
+            robot_count: Number of robots.
             config: Configuration of one robot. Those of the other robots have the same joints and sensors.
-            threads: Number of threads that step the simulations.
+            thread_count: Number of threads that step the simulations.
         """
         joints = config.robot.chain.modules
         self._period_ns = config.period_ns
         self._joints = joints
         self._timing = encode_sensor_timing(config)
         self._models_winding_temperature = config.robot.sensors.power is not None
-        self._simulations = _open_simulations(robots, joints, threads)
-        self.all_robots: Mask = np.ones(robots, dtype=np.bool_)
+        self._simulations = _open_simulations(robot_count, joints, thread_count)
+        self.all_robots: Mask = np.ones(robot_count, dtype=np.bool_)
         self._noise = NoiseStreams(self.all_robots)
-        self._heat = HeatArrays(robots, joints, config.period_ns * 1e-9)
+        self._heat = HeatArrays(robot_count, joints, config.period_ns * 1e-9)
         self.sensors = SensorArrays(self.all_robots, config, self._noise)
 
         # Motors.
-        self._min_torque_nm = np.zeros((robots, joints))
-        self._max_torque_nm = np.zeros((robots, joints))
-        self._torque_limit_nm = np.zeros((robots, joints))  # of the last setpoints
+        self._min_torque_nm = np.zeros((robot_count, joints))
+        self._max_torque_nm = np.zeros((robot_count, joints))
+        self._torque_limit_nm = np.zeros((robot_count, joints))  # of the last setpoints
         self._last_limit_nm: Floats | None = None  # the same array in many ticks
         self._robots_with_pending_limits = set[
             int
         ]()  # robots whose torque limits have not reached their new values yet
         # Supply voltages in V and idle currents in A of the joints, for each robot.
-        self._supplies: list[tuple[list[float], list[float]]] = [([], [])] * robots
+        self._supplies: list[tuple[list[float], list[float]]] = [([], [])] * robot_count
 
     def can_simulate(self, config: RunConfig) -> bool:
         """Return whether a robot of this configuration can be a row."""
         return encode_sensor_timing(config) == self._timing
 
-    def load_robot(self, robot: int, config: RunConfig) -> bool:
+    def load_robot(self, robot_index: int, config: RunConfig) -> bool:
         """Replace the simulation of a row by a robot at the start of an episode, and read its sensors at tick 0.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             config: Configuration of the episode.
 
         Returns:
@@ -85,22 +85,22 @@ class SimulatedRobots:
             ConfigError: The settings do not match the robot or the scene.
         """
         placed = create_settled_robot(config)
-        if not self._simulations.load(robot, placed):
+        if not self._simulations.load(robot_index, placed):
             return False
         joint_table = config.robot.joint_table
-        self._heat.restart(robot, joint_table)
-        self._noise.restart(robot, config.seed)
-        self.sensors.restart(robot, config)
-        self._supplies[robot] = (
+        self._heat.restart(robot_index, joint_table)
+        self._noise.restart(robot_index, config.seed)
+        self.sensors.restart(robot_index, config)
+        self._supplies[robot_index] = (
             [joint.supply.voltage_v for joint in joint_table],
             [joint.supply.idle_a for joint in joint_table],
         )
-        self._robots_with_pending_limits.discard(robot)
-        self._read_motor_range(robot)
-        self._torque_limit_nm[robot] = [joint.limits.torque_nm for joint in joint_table]
+        self._robots_with_pending_limits.discard(robot_index)
+        self._read_motor_range(robot_index)
+        self._torque_limit_nm[robot_index] = [joint.limits.torque_nm for joint in joint_table]
         self._last_limit_nm = None
         only_this_robot = np.zeros(len(self._supplies), dtype=np.bool_)
-        only_this_robot[robot] = True
+        only_this_robot[robot_index] = True
         ticks = np.zeros(len(self._supplies), dtype=np.int64)
         self.sensors.sample(ticks, only_this_robot, self._simulations, self._heat.winding_c, is_reset=True)
         return True
@@ -129,12 +129,12 @@ class SimulatedRobots:
             self._torque_limit_nm[robot] = torque_limit_nm[robot]
             self._robots_with_pending_limits.add(robot)
 
-    def enact_one(self, robot: int, setpoints: SafeSetpoints) -> None:
+    def enact_one(self, robot_index: int, setpoints: SafeSetpoints) -> None:
         """Set the mode, target and torque limit of each motor of one robot."""
-        self._simulations.motors[robot].enact(setpoints)
-        self._torque_limit_nm[robot] = setpoints.torque_limit_nm
+        self._simulations.motors[robot_index].enact(setpoints)
+        self._torque_limit_nm[robot_index] = setpoints.torque_limit_nm
         self._last_limit_nm = None
-        self._robots_with_pending_limits.add(robot)
+        self._robots_with_pending_limits.add(robot_index)
 
     def advance(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
         """Step the physics of some robots through one control period.
@@ -174,11 +174,11 @@ class SimulatedRobots:
         assert self.sensors.windings is not None
         return self._heat.remaining_fractions(self.sensors.windings.values)
 
-    def make_joint_state(self, robot: int, tick: int, joints_of_robot: Floats) -> JointState:
+    def make_joint_state(self, robot_index: int, tick: int, joints_of_robot: Floats) -> JointState:
         """Return the joint states of one robot as the message that a backend would send.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             tick: Number of the control cycle in which the states were delivered.
             joints_of_robot: (3 * joints,) angles in rad, velocities in rad/s and torques in N·m.
         """
@@ -195,21 +195,21 @@ class SimulatedRobots:
             age_ns=[age_ticks * self._period_ns] * joint_count,
         )
 
-    def make_power(self, robot: int, tick: int) -> Power | None:
+    def make_power(self, robot_index: int, tick: int) -> Power | None:
         """Return the newest power sample of one robot as a message, or None before the first sample.
 
         Only the values that a limiter reads are exact. The currents are those of idle joints, and the boards have the
         temperatures of the windings.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             tick: Number of the control cycle in which the sample was delivered.
         """
         windings = self.sensors.windings
-        if windings is None or not windings.is_known[robot]:
+        if windings is None or not windings.is_known[robot_index]:
             return None
-        voltage_v, idle_a = self._supplies[robot]
-        winding_temperatures_c = windings.values[robot].tolist()
+        voltage_v, idle_a = self._supplies[robot_index]
+        winding_temperatures_c = windings.values[robot_index].tolist()
         return Power(
             tick=tick,
             timestamp_ns=tick * self._period_ns,
@@ -243,8 +243,8 @@ class SimulatedRobots:
             self._simulations.motors[robot].derate(fractions[robot])
             self._robots_with_pending_limits.add(robot)
 
-    def _read_motor_range(self, robot: int) -> None:
+    def _read_motor_range(self, robot_index: int) -> None:
         """Read the torque range of the motors of one robot from its model."""
-        low_nm, high_nm = self._simulations.motors[robot].torque_range_nm
-        self._min_torque_nm[robot] = low_nm
-        self._max_torque_nm[robot] = high_nm
+        low_nm, high_nm = self._simulations.motors[robot_index].torque_range_nm
+        self._min_torque_nm[robot_index] = low_nm
+        self._max_torque_nm[robot_index] = high_nm

@@ -63,14 +63,14 @@ class DelayedValues:
         self.is_known: Mask = np.zeros(robots, dtype=np.bool_)
         self.is_new: Mask = np.zeros(robots, dtype=np.bool_)
 
-    def restart(self, robot: int) -> None:
+    def restart(self, robot_index: int) -> None:
         """Remove all samples of a robot."""
         self.is_known = self.is_known.copy()
-        self.is_known[robot] = False
+        self.is_known[robot_index] = False
         self.is_new = self.no_robots
         for queue_index, (values, due) in enumerate(self._delay_queue):
             other_robots_due = due.copy()
-            other_robots_due[robot] = False
+            other_robots_due[robot_index] = False
             self._delay_queue[queue_index] = (values, other_robots_due)
 
     def add(self, values: Floats, due: Mask, *, is_reset: bool = False) -> None:

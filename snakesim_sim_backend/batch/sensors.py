@@ -121,35 +121,35 @@ class SensorArrays:
             self._power_schedule = due_ticks(sensors.power.rate_hz)
             self.windings = DelayedValues(all_robots, joints, sensors.power.delay_s, config.period_ns)
 
-    def restart(self, robot: int, config: RunConfig) -> None:
+    def restart(self, robot_index: int, config: RunConfig) -> None:
         """Remove all samples of a robot that starts a new episode, and use the noise of its new configuration.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             config: Configuration of the new episode.
         """
         sensors = config.robot.sensors
         joints = self._joint_count
         # Columns: angles, velocities and torques of all joints.
         sigma = [sensors.joints.angle_noise_rad, sensors.joints.velocity_noise_rad_s, sensors.joints.torque_noise_nm]
-        self._joint_sigma[robot] = np.repeat(sigma, joints)
+        self._joint_sigma[robot_index] = np.repeat(sigma, joints)
         for i, joint in enumerate(config.robot.joint_table):
-            self._is_measured[robot, 2 * joints + i] = "torque" in joint.drive.measures
+            self._is_measured[robot_index, 2 * joints + i] = "torque" in joint.drive.measures
         self._all_are_measured = bool(self._is_measured.all())
         if sensors.contacts is not None:
-            self._contact_sigma_n[robot] = sensors.contacts.force_noise_n
-            self._contact_threshold_n[robot] = sensors.contacts.threshold_n
-            self._contacts = _remove_robot_contacts(self._contacts, robot)
+            self._contact_sigma_n[robot_index] = sensors.contacts.force_noise_n
+            self._contact_threshold_n[robot_index] = sensors.contacts.threshold_n
+            self._contacts = _remove_robot_contacts(self._contacts, robot_index)
             for queue_index, (sample, due) in enumerate(self._contact_delay_queue):
                 other_robots_due = due.copy()
-                other_robots_due[robot] = False
+                other_robots_due[robot_index] = False
                 self._contact_delay_queue[queue_index] = (sample, other_robots_due)
         if sensors.pose is not None:
             pose_sigma = [sensors.pose.position_noise_m, 0.5 * sensors.pose.angle_noise_rad]  # of a quaternion
-            self._pose_sigma[robot] = np.repeat(pose_sigma, 3)
-            self._raw_poses.restart(robot)
+            self._pose_sigma[robot_index] = np.repeat(pose_sigma, 3)
+            self._raw_poses.restart(robot_index)
         if self.windings is not None:
-            self.windings.restart(robot)
+            self.windings.restart(robot_index)
 
     def sample(
         self, ticks: Ticks, active: Mask, simulations: SimulationBatch, winding_c: Floats, *, is_reset: bool = False
@@ -343,9 +343,9 @@ def _select_contacts(contacts: ContactArrays, mask: Mask) -> ContactArrays:
     return ContactArrays(contacts.robot[mask], contacts.link[mask], contacts.force_w[mask], contacts.rotation[mask])
 
 
-def _remove_robot_contacts(sample: ContactSample, robot: int) -> ContactSample:
+def _remove_robot_contacts(sample: ContactSample, robot_index: int) -> ContactSample:
     """Return a sample of contacts without those of one robot."""
-    is_other_robot = sample.arrays.robot != robot
+    is_other_robot = sample.arrays.robot != robot_index
     return ContactSample(_select_contacts(sample.arrays, is_other_robot), sample.noise[is_other_robot])
 
 

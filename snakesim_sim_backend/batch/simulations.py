@@ -69,11 +69,11 @@ class SimulationBatch(ABC):
     motors: list[ModelMotors]
 
     @abstractmethod
-    def load(self, robot: int, placed: PlacedRobot) -> bool:
+    def load(self, robot_index: int, placed: PlacedRobot) -> bool:
         """Replace the simulation of a row.
 
         Args:
-            robot: Row of the robot.
+            robot_index: Row of the robot.
             placed: New simulation, at the start of an episode.
 
         Returns:
@@ -101,11 +101,11 @@ class SimulationBatch(ABC):
 class MotorArrays:
     """The arrays of one robot that its motors read and write, with the names that MjData gives them."""
 
-    def __init__(self, simulations: SimulationBatch, robot: int, history: Floats) -> None:
+    def __init__(self, simulations: SimulationBatch, robot_index: int, history: Floats) -> None:
         self.history = history
-        self.act = simulations.motor_state[robot]
-        self.actuator_force = simulations.torque_nm[robot]
-        self.ctrl = simulations.motor_inputs[robot]
+        self.act = simulations.motor_state[robot_index]
+        self.actuator_force = simulations.torque_nm[robot_index]
+        self.ctrl = simulations.motor_inputs[robot_index]
 
 
 NO_MOTORS: ModelMotors = None  # pyright: ignore[reportAssignmentType] - of rows that are not loaded yet
@@ -117,34 +117,34 @@ class LoopedSimulations(SimulationBatch):
     For a single robot the arrays are views of MuJoCo's.
     """
 
-    def __init__(self, robots: int, joints: int) -> None:
-        self._joints = joints
-        self._placed: list[PlacedRobot | None] = [None] * robots
-        self._watches: list[DivergenceWatch | None] = [None] * robots
-        self.motors = [NO_MOTORS] * robots
-        self.base_pose = np.zeros((robots, FREE_QPOS))
-        self.base_velocity = np.zeros((robots, FREE_DOFS))
-        self.angle_rad = np.zeros((robots, joints))
-        self.velocity_rad_s = np.zeros((robots, joints))
-        self.torque_nm = np.zeros((robots, joints))
-        self.motor_state = np.zeros((robots, 0))
-        self.motor_inputs = np.zeros((robots, INPUTS_PER_MOTOR * joints))
+    def __init__(self, robot_count: int, joint_count: int) -> None:
+        self._joints = joint_count
+        self._placed: list[PlacedRobot | None] = [None] * robot_count
+        self._watches: list[DivergenceWatch | None] = [None] * robot_count
+        self.motors = [NO_MOTORS] * robot_count
+        self.base_pose = np.zeros((robot_count, FREE_QPOS))
+        self.base_velocity = np.zeros((robot_count, FREE_DOFS))
+        self.angle_rad = np.zeros((robot_count, joint_count))
+        self.velocity_rad_s = np.zeros((robot_count, joint_count))
+        self.torque_nm = np.zeros((robot_count, joint_count))
+        self.motor_state = np.zeros((robot_count, 0))
+        self.motor_inputs = np.zeros((robot_count, INPUTS_PER_MOTOR * joint_count))
 
-    def load(self, robot: int, placed: PlacedRobot) -> bool:
+    def load(self, robot_index: int, placed: PlacedRobot) -> bool:
         data = placed.data
         if self.motor_state.shape[1] != len(data.act):
-            if any(other is not None for i, other in enumerate(self._placed) if i != robot):
+            if any(other is not None for i, other in enumerate(self._placed) if i != robot_index):
                 return False
             self.motor_state = np.zeros((len(self._placed), len(data.act)))
-        self._placed[robot] = placed
-        self.motors[robot] = placed.motors
-        self._watches[robot] = DivergenceWatch(placed.sim.model, data, placed.physics, placed.sim.steps_per_tick)
+        self._placed[robot_index] = placed
+        self.motors[robot_index] = placed.motors
+        self._watches[robot_index] = DivergenceWatch(placed.sim.model, data, placed.physics, placed.sim.steps_per_tick)
         if len(self._placed) == 1:
             self._bind_views(data)
             return True
-        placed.motors.bind_state(MotorArrays(self, robot, data.history))
-        self.motor_state[robot] = data.act
-        self._copy_state(data, robot)
+        placed.motors.bind_state(MotorArrays(self, robot_index, data.history))
+        self.motor_state[robot_index] = data.act
+        self._copy_state(data, robot_index)
         return True
 
     def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
@@ -198,14 +198,14 @@ class LoopedSimulations(SimulationBatch):
             return NO_CONTACT_ARRAYS
         return ContactArrays(np.array(rows), np.array(links), np.array(forces_w), np.array(rotations))
 
-    def _copy_state(self, data: mujoco.MjData, robot: int) -> None:
+    def _copy_state(self, data: mujoco.MjData, robot_index: int) -> None:
         """Copy what a step has changed into the row of a robot."""
         joints = self._joints
-        self.base_pose[robot] = data.qpos[:FREE_QPOS]
-        self.base_velocity[robot] = data.qvel[:FREE_DOFS]
-        self.angle_rad[robot] = data.qpos[FREE_QPOS : FREE_QPOS + joints]
-        self.velocity_rad_s[robot] = data.qvel[FREE_DOFS : FREE_DOFS + joints]
-        self.torque_nm[robot] = data.actuator_force[:joints]
+        self.base_pose[robot_index] = data.qpos[:FREE_QPOS]
+        self.base_velocity[robot_index] = data.qvel[:FREE_DOFS]
+        self.angle_rad[robot_index] = data.qpos[FREE_QPOS : FREE_QPOS + joints]
+        self.velocity_rad_s[robot_index] = data.qvel[FREE_DOFS : FREE_DOFS + joints]
+        self.torque_nm[robot_index] = data.actuator_force[:joints]
 
     def _bind_views(self, data: mujoco.MjData) -> None:
         """Make the arrays of a single robot views of MuJoCo's."""

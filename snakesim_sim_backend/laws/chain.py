@@ -20,10 +20,10 @@ class LinkChain:
         generalized force of a degree of freedom = its axis of motion . sum of these wrenches
     """
 
-    def __init__(self, data: mujoco.MjData, first_body: int, links: int) -> None:
-        dofs = FREE_DOFS + links - 1
+    def __init__(self, data: mujoco.MjData, first_body: int, link_count: int) -> None:
+        dofs = FREE_DOFS + link_count - 1
         self._first_body = first_body
-        self._link_count = links
+        self._link_count = link_count
         self._wrenches: Floats | None = None  # (6, n_links), collected in this step
 
         # Views of MuJoCo's arrays.
@@ -34,7 +34,7 @@ class LinkChain:
         self._joint_forces = data.qfrc_passive[FREE_DOFS:dofs]
 
         # Sums of wrenches from the head to each link, head first, and views of them.
-        self._sums = np.empty((links, 6))
+        self._sums = np.empty((link_count, 6))
         self._sum_of_all = self._sums[-1]
         self._sums_beyond_joints = self._sums[-2::-1]  # tail to head
 

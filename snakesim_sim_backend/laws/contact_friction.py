@@ -55,9 +55,9 @@ NO_TORQUE = np.zeros(3)
 NO_STRETCH = (0.0, 0.0, 0.0)
 
 
-def count_contact_values(links: int) -> int:
+def count_contact_values(link_count: int) -> int:
     """Return how many numbers in `userdata` the contacts of a snake need."""
-    return 1 + VALUES_PER_CONTACT * CONTACTS_PER_LINK * links
+    return 1 + VALUES_PER_CONTACT * CONTACTS_PER_LINK * link_count
 
 
 class _FrictionContact(NamedTuple):
@@ -202,10 +202,10 @@ class ContactFriction:
                 self._apply_reaction_force(other_body, force_w, point_w)
         self._chain.push(forces_w, points_w, link_bodies)
 
-    def _apply_reaction_force(self, body: int, force_w: Vector, point_w: Vector) -> None:
+    def _apply_reaction_force(self, body_id: int, force_w: Vector, point_w: Vector) -> None:
         """Apply the opposite of a link's friction force to the body that it touches."""
         passive = self._data.qfrc_passive
-        mujoco.mj_applyFT(self._model, self._data, -np.array(force_w), NO_TORQUE, np.array(point_w), body, passive)
+        mujoco.mj_applyFT(self._model, self._data, -np.array(force_w), NO_TORQUE, np.array(point_w), body_id, passive)
 
     def update_contacts(self) -> None:
         """Store the contacts of the step that was just made. `apply` uses them in the next step."""
@@ -322,20 +322,20 @@ class ContactFriction:
             forward, backward, sideways, viscous_along, viscous_across, self.min_friction, separate_limits
         )
 
-    def _to_world(self, body: int, x: float, y: float, z: float) -> Vector:
+    def _to_world(self, body_id: int, x: float, y: float, z: float) -> Vector:
         """Return the world coordinates of a point that is given in a body's frame, in m."""
-        if body == WORLD_BODY:
+        if body_id == WORLD_BODY:
             return x, y, z
-        a, b, c, d, e, f, g, h, i = self._body_rotations[body].tolist()
-        px, py, pz = self._body_positions[body].tolist()
+        a, b, c, d, e, f, g, h, i = self._body_rotations[body_id].tolist()
+        px, py, pz = self._body_positions[body_id].tolist()
         return px + a * x + b * y + c * z, py + d * x + e * y + f * z, pz + g * x + h * y + i * z
 
-    def _to_body(self, body: int, x: float, y: float, z: float) -> Vector:
+    def _to_body(self, body_id: int, x: float, y: float, z: float) -> Vector:
         """Return the coordinates in a body's frame of a point that is given in the world frame, in m."""
-        if body == WORLD_BODY:
+        if body_id == WORLD_BODY:
             return x, y, z
-        a, b, c, d, e, f, g, h, i = self._body_rotations[body].tolist()
-        px, py, pz = self._body_positions[body].tolist()
+        a, b, c, d, e, f, g, h, i = self._body_rotations[body_id].tolist()
+        px, py, pz = self._body_positions[body_id].tolist()
         x, y, z = x - px, y - py, z - pz
         return a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
 

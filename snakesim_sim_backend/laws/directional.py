@@ -112,33 +112,33 @@ class LinkUndersides:
         self._last_body = first_body + len(lengths_m) - 1
         self._lengths_m = lengths_m
 
-    def find_neighbor(self, body: int, along_m: float) -> tuple[int, float]:
+    def find_neighbor(self, body_id: int, along_m: float) -> tuple[int, float]:
         """Return the link that a point of a link is nearest to besides its own, and the weight of its direction.
 
         Args:
-            body: MuJoCo's number of the link's body.
+            body_id: MuJoCo's number of the link's body.
             along_m: Distance of the point from the link's rear joint.
 
         Returns:
             MuJoCo's number of the neighbor's body, and its weight: 0 in the middle of the link, 0.5 at a joint.
         """
-        length_m = self._lengths_m[body - self._first_body]
+        length_m = self._lengths_m[body_id - self._first_body]
         from_middle = along_m / length_m - 0.5
-        neighbor = body + 1 if from_middle > 0.0 else body - 1
+        neighbor = body_id + 1 if from_middle > 0.0 else body_id - 1
         if neighbor < self._first_body or neighbor > self._last_body:
-            return body, 0.0
+            return body_id, 0.0
         return neighbor, min(abs(from_middle), 0.5)
 
-    def faces(self, body: int, neighbor: int, weight: float, normal_w: Vector) -> bool:
+    def faces(self, body_id: int, neighbor: int, weight: float, normal_w: Vector) -> bool:
         """Return whether a surface with this normal, which points into the link, touches the underside."""
         nx, ny, nz = normal_w
-        ux, uy, uz = self._average_axes(body, neighbor, weight, 2)
+        ux, uy, uz = self._average_axes(body_id, neighbor, weight, 2)
         return ux * nx + uy * ny + uz * nz > UNDERSIDE_COSINE
 
-    def find_axis(self, body: int, neighbor: int, weight: float, normal_w: Vector) -> Vector:
+    def find_axis(self, body_id: int, neighbor: int, weight: float, normal_w: Vector) -> Vector:
         """Return the direction of the underside in the plane of contact, a unit vector, or `NO_AXIS`."""
         nx, ny, nz = normal_w
-        x, y, z = self._average_axes(body, neighbor, weight, 0)
+        x, y, z = self._average_axes(body_id, neighbor, weight, 0)
         along = x * nx + y * ny + z * nz
         x, y, z = x - along * nx, y - along * ny, z - along * nz
         length = math.sqrt(x * x + y * y + z * z)
@@ -146,9 +146,9 @@ class LinkUndersides:
             return NO_AXIS
         return x / length, y / length, z / length
 
-    def _average_axes(self, body: int, neighbor: int, weight: float, column: int) -> Vector:
+    def _average_axes(self, body_id: int, neighbor: int, weight: float, column: int) -> Vector:
         """Return the weighted mean of one axis of two links. `column` is 0 for the x axis, and 2 for the z axis."""
-        x, y, z = _read_axis(self._rotations, body, column)
+        x, y, z = _read_axis(self._rotations, body_id, column)
         ox, oy, oz = _read_axis(self._rotations, neighbor, column)
         own_weight = 1.0 - weight
         return own_weight * x + weight * ox, own_weight * y + weight * oy, own_weight * z + weight * oz
@@ -261,7 +261,7 @@ def _compute_limit_scale(limit: float, size: float) -> float:
     return 1.0
 
 
-def _read_axis(rotations: Floats, body: int, column: int) -> Vector:
+def _read_axis(rotations: Floats, body_id: int, column: int) -> Vector:
     """Return one axis of a body's frame in the world frame."""
-    rotation = rotations[body].tolist()
+    rotation = rotations[body_id].tolist()
     return rotation[column], rotation[column + 3], rotation[column + 6]

@@ -65,10 +65,10 @@ class GroundFeet:
         return any(numbers[FORWARD:] != same for numbers in self.directions)
 
 
-def find_feet(model: mujoco.MjModel, first_body: int, links: int, radius_m: float) -> GroundFeet:
+def find_feet(model: mujoco.MjModel, first_body: int, link_count: int, radius_m: float) -> GroundFeet:
     """Return the feet of a compiled model, whose geoms are called `foot_0` onwards."""
-    masses_kg = model.body_mass[first_body : first_body + links]
-    geoms = np.array([model.geom(f"foot_{i}").id for i in range(links + 1)])
+    masses_kg = model.body_mass[first_body : first_body + link_count]
+    geoms = np.array([model.geom(f"foot_{i}").id for i in range(link_count + 1)])
     carried_kg = 0.5 * (np.append(masses_kg, 0.0) + np.append(0.0, masses_kg))
     friction = float(model.geom_friction[geoms[0], 0])
     return GroundFeet(geoms, first_body, carried_kg, radius_m, friction, model.geom_user[geoms].tolist())

@@ -50,7 +50,7 @@ def load_library() -> ctypes.CDLL:
 def add_laws(
     spec: mujoco.MjSpec,
     laws: LawsVersion,
-    links: int,
+    link_count: int,
     yielding_bodies: list[str],
     *,
     keeps_touches: bool,
@@ -61,7 +61,7 @@ def add_laws(
     Args:
         spec: Model, which is changed.
         laws: Version of the laws that computes the forces.
-        links: Number of links.
+        link_count: Number of links.
         yielding_bodies: Names of the bodies of obstacles that yield.
         keeps_touches: Whether the C version writes the forces between links and obstacles into MuJoCo's state.
         measures_force: Whether the force between links and obstacles can be measured.
@@ -70,7 +70,9 @@ def add_laws(
     spec.nuser_body = VALUES_PER_SPRING
     match laws:
         case "python":
-            spec.nuserdata = VALUES_PER_FOOT * (links + 1) + count_contact_values(links) + DOFS * len(yielding_bodies)
+            spec.nuserdata = (
+                VALUES_PER_FOOT * (link_count + 1) + count_contact_values(link_count) + DOFS * len(yielding_bodies)
+            )
         case "c":
             load_library()
             _add_plugin(spec, FRICTION_PLUGIN, FRICTION_INSTANCE, ["link_0"])

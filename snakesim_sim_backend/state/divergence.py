@@ -31,7 +31,12 @@ class DivergenceWatch:
     """Checks the state once a tick, or once per other counted unit."""
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, physics: PhysicsStepper, steps: int, counted: str = "tick"
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        physics: PhysicsStepper,
+        step_count: int,
+        counted: str = "tick",
     ) -> None:
         """Store the current state as the last good one, to which a diverged simulation returns.
 
@@ -39,13 +44,13 @@ class DivergenceWatch:
             model: Compiled model.
             data: State of the simulation.
             physics: Physics that repeats steps to find the cause of a divergence.
-            steps: Number of physics steps from one check to the next, under the same inputs.
+            step_count: Number of physics steps from one check to the next, under the same inputs.
             counted: Unit in which checks are counted, such as "tick", for messages.
         """
         self._model = model
         self._data = data
         self._physics = physics
-        self._steps_per_check = steps
+        self._steps_per_check = step_count
         self._check_unit = counted
         self._good_state = np.empty(mujoco.mj_stateSize(model, COMPLETE_STATE))
         self._error: str | None = None  # the message about the divergence

@@ -58,14 +58,14 @@ class LinkLoadReader:
                 sums[touch.link].add(touch, force_n)
         return [self._make_load(link, sums[link]) for link in sorted(sums)]
 
-    def _make_load(self, link: int, total: _WeightedSum) -> LinkLoad:
+    def _make_load(self, link_index: int, total: _WeightedSum) -> LinkLoad:
         """Return a link's load: the sum of the forces, at the mean position weighted by their sizes."""
-        rotation = self._rotations[link].tolist()  # world_from_link, row by row
-        ox, oy, oz = self._origins[link].tolist()
+        rotation = self._rotations[link_index].tolist()  # world_from_link, row by row
+        ox, oy, oz = self._origins[link_index].tolist()
         weight_n = total.weight_n
         offset_w = (total.x / weight_n - ox, total.y / weight_n - oy, total.z / weight_n - oz)
         return LinkLoad(
-            link=link,
+            link=link_index,
             position_l=rotate_into_frame(rotation, offset_w),
             force_l=rotate_into_frame(rotation, (total.fx, total.fy, total.fz)),
         )

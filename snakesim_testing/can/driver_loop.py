@@ -22,9 +22,9 @@ from snakesim_testing.hal.small_robots import make_run_config
 JOINTS = 4
 
 
-def config(joints: int = JOINTS, **dotted: Any) -> RunConfig:
+def config(joint_count: int = JOINTS, **dotted: Any) -> RunConfig:
     """So many joints at 100 Hz, without an obstacle."""
-    return make_run_config(**{"backend": "can", "robot__chain__modules": joints, "rate_hz": 100, **dotted})
+    return make_run_config(**{"backend": "can", "robot__chain__modules": joint_count, "rate_hz": 100, **dotted})
 
 
 @dataclass

@@ -8,30 +8,30 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import CanFrame, ModuleState, Opcode, parse_opcode
 
 
-def joint_state(node: int, count: int, angle: float = 0.1, **other: float) -> CanFrame:
+def joint_state(node_id: int, count: int, angle: float = 0.1, **other: float) -> CanFrame:
     values: dict[str, float] = {"state": ModuleState.DISARMED, **other}
-    return load_layouts()[Opcode.JOINT_STATE].encode(node, angle=angle, count=count % 16, **values)
+    return load_layouts()[Opcode.JOINT_STATE].encode(node_id, angle=angle, count=count % 16, **values)
 
 
-def heartbeat(node: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float) -> CanFrame:
-    return load_layouts()[Opcode.HEARTBEAT].encode(node, uptime=uptime_s, state=state, **other)
+def heartbeat(node_id: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float) -> CanFrame:
+    return load_layouts()[Opcode.HEARTBEAT].encode(node_id, uptime=uptime_s, state=state, **other)
 
 
-def contact(node: int, count: int, *, tail: bool = False, touched: bool = True, **other: float) -> CanFrame:
+def contact(node_id: int, count: int, *, tail: bool = False, touched: bool = True, **other: float) -> CanFrame:
     layout = load_layouts()[Opcode.TAIL_CONTACT if tail else Opcode.CONTACT]
-    return layout.encode(node, count=count % 16, touched=touched, **other)
+    return layout.encode(node_id, count=count % 16, touched=touched, **other)
 
 
-def gyro(node: int, count: int, rate_x: float) -> CanFrame:
-    return load_layouts()[Opcode.GYRO].encode(node, rate_x=rate_x, count=count % 256)
+def gyro(node_id: int, count: int, rate_x: float) -> CanFrame:
+    return load_layouts()[Opcode.GYRO].encode(node_id, rate_x=rate_x, count=count % 256)
 
 
-def accelerometer(node: int, count: int, acceleration_z: float) -> CanFrame:
-    return load_layouts()[Opcode.ACCELEROMETER].encode(node, acceleration_z=acceleration_z, count=count % 256)
+def accelerometer(node_id: int, count: int, acceleration_z: float) -> CanFrame:
+    return load_layouts()[Opcode.ACCELEROMETER].encode(node_id, acceleration_z=acceleration_z, count=count % 256)
 
 
-def health(node: int, **values: float) -> CanFrame:
-    return load_layouts()[Opcode.HEALTH].encode(node, **values)
+def health(node_id: int, **values: float) -> CanFrame:
+    return load_layouts()[Opcode.HEALTH].encode(node_id, **values)
 
 
 def read(frame: CanFrame) -> dict[str, float]:

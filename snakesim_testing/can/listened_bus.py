@@ -221,14 +221,14 @@ def first_in(received: Sequence[ReceivedFrame], states: set[ModuleState], since_
     return first
 
 
-def uptimes_ms(received: Sequence[ReceivedFrame], node: int) -> list[tuple[int, float]]:
+def uptimes_ms(received: Sequence[ReceivedFrame], node_id: int) -> list[tuple[int, float]]:
     """(kernel's time, module's uptime) of its heartbeats."""
-    beats = [h for h in received if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node]
+    beats = [h for h in received if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node_id]
     return [(h.at_ns, 1e3 * h.decode()["uptime"]) for h in beats]
 
 
-def passed_for_module_ms(received: Sequence[ReceivedFrame], node: int, from_ns: int, to_ns: int) -> float:
+def passed_for_module_ms(received: Sequence[ReceivedFrame], node_id: int, from_ns: int, to_ns: int) -> float:
     """How long a stretch of the kernel's time took in a module's own; heartbeats around it give both."""
-    at_ns, uptime_ms = zip(*uptimes_ms(received, node), strict=True)
+    at_ns, uptime_ms = zip(*uptimes_ms(received, node_id), strict=True)
     from_ms, to_ms = np.interp([from_ns - at_ns[0], to_ns - at_ns[0]], [ns - at_ns[0] for ns in at_ns], uptime_ms)
     return float(to_ms - from_ms)

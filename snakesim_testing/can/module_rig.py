@@ -38,7 +38,7 @@ QUIET = ModuleReadings(0, 0, 0)
 
 
 def setpoint(
-    count: int, mode: JointMode = JointMode.TORQUE, target: float = 1.0, limit: float = 3.0, node: int = NODE
+    count: int, mode: JointMode = JointMode.TORQUE, target: float = 1.0, limit: float = 3.0, node_id: int = NODE
 ) -> CanFrame:
     signal = {
         JointMode.POSITION: "position",
@@ -47,18 +47,20 @@ def setpoint(
         JointMode.PASSIVE: "torque",
     }[mode]
     values: dict[str, float] = {"mode": mode, "count": count % 16, signal: target, "torque_limit": limit}
-    return load_layouts()[Opcode.SET_POINT].encode(node, **values)
+    return load_layouts()[Opcode.SET_POINT].encode(node_id, **values)
 
 
-def parameter(index: int, value: float = 0.0, operation: int = ParameterOperation.WRITE, node: int = NODE) -> CanFrame:
-    frame = load_layouts()[Opcode.PARAMETER_REQUEST].encode(node, index=index, value=value)
+def parameter(
+    index: int, value: float = 0.0, operation: int = ParameterOperation.WRITE, node_id: int = NODE
+) -> CanFrame:
+    frame = load_layouts()[Opcode.PARAMETER_REQUEST].encode(node_id, index=index, value=value)
     return CanFrame(
         frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:]
     )  # also operations that there are not
 
 
-def only(frames: Sequence[CanFrame], opcode: Opcode, node: int | None = None) -> list[dict[str, float]]:
-    return [read(f) for f in frames if parse_opcode(f.id) == opcode and node in (None, parse_node(f.id))]
+def only(frames: Sequence[CanFrame], opcode: Opcode, node_id: int | None = None) -> list[dict[str, float]]:
+    return [read(f) for f in frames if parse_opcode(f.id) == opcode and node_id in (None, parse_node(f.id))]
 
 
 def new_module(**flash: float) -> ModuleFirmware:
@@ -158,7 +160,7 @@ def measure_bus_traffic(
                 lateness_periods.append(((tick - 1) - sync_count) % 16)
         emulators.receive(0, make_sync(tick, 0))
         for node in range(1, joint_count + 1):
-            emulators.receive(0, setpoint(tick, node=node, target=0.0))
+            emulators.receive(0, setpoint(tick, node_id=node, target=0.0))
         waiting_frames = sum(map(len, emulators.buses[0]._waiting_frame_by_mailbox_by_sender.values()))
         max_waiting_frames = max(max_waiting_frames, waiting_frames)
     return lateness_periods, traffic_before, emulators.traffic()[0], max_waiting_frames

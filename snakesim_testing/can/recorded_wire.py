@@ -79,8 +79,8 @@ def words(frames: list[CanFrame]) -> list[str]:
     return found
 
 
-def module_of(run: DriverLoop, node: int) -> ModuleFirmware:
-    return chain_of(run.backend).slots[node - 1].module
+def module_of(run: DriverLoop, node_id: int) -> ModuleFirmware:
+    return chain_of(run.backend).slots[node_id - 1].module
 
 
 def go(run: DriverLoop, lifecycle: LifecycleState, ticks: int = 1) -> list[CanFrame]:

@@ -13,9 +13,9 @@ from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_testing.contract.bench import TorqueSwitch
 
 
-def mute_joint(backend: Any, joint: int) -> None:
+def mute_joint(backend: Any, joint_index: int) -> None:
     """Let the emulated drive of a joint send nothing from now on."""
-    assert backend.inject(parse_injection(f"mute:joint_{joint + 1}@0"), begins=True)
+    assert backend.inject(parse_injection(f"mute:joint_{joint_index + 1}@0"), begins=True)
 
 
 class KitDrives:

@@ -105,7 +105,7 @@ class PlannedController:
     arm_session: int = 0  # arm session of the newest command that was sent
     stop_event: threading.Event = field(default_factory=threading.Event)
 
-    def run(self, link: ConnectionSettings) -> None:
+    def run(self, connection: ConnectionSettings) -> None:
         """Connect to the host, and command it until `stop_event` is set.
 
         In every tick the controller acquires or renews the lease, and sends setpoints. Before an arming, these are the
@@ -113,9 +113,9 @@ class PlannedController:
         are the last positions that were measured before it, with the changes of the plan.
 
         Args:
-            link: How to reach the host.
+            connection: How to reach the host.
         """
-        with open_session(link) as session:
+        with open_session(connection) as session:
             client = HostClient(session, LEASE_HOLDER)
             robot = client.wait_for_description()
             joint_state_subscription = client.subscribe(keys.JOINTS, JointState)

@@ -112,13 +112,13 @@ class BackendRig:
 
     # --- capabilities --------------------------------------------------------------------------------------
 
-    def supports_mode(self, joint: int, mode: JointMode) -> bool:
+    def supports_mode(self, joint_index: int, mode: JointMode) -> bool:
         """Return whether the description of a joint has a mode."""
-        return self.robot.joints[joint].supports_mode(mode)
+        return self.robot.joints[joint_index].supports_mode(mode)
 
-    def measures_torque(self, joint: int = 0) -> bool:
+    def measures_torque(self, joint_index: int = 0) -> bool:
         """Return whether a joint measures its torque, by its description."""
-        return "torque" in self.robot.joints[joint].measures
+        return "torque" in self.robot.joints[joint_index].measures
 
     @property
     def joints_without_watchdog(self) -> list[str]:
@@ -140,11 +140,11 @@ class BackendRig:
             if torque and not self.measures_torque(joint):
                 pytest.skip(f"{name} is described without measured torque")
 
-    def _next_position_rad(self, joint: int, speed_rad_s: float) -> float:
+    def _next_position_rad(self, joint_index: int, speed_rad_s: float) -> float:
         """Return the next position target of a joint that follows a speed, for joints without velocity mode."""
-        position_rad = self._position_targets_rad.get(joint, self.newest_joints.angle_rad[joint])
+        position_rad = self._position_targets_rad.get(joint_index, self.newest_joints.angle_rad[joint_index])
         position_rad = position_rad + speed_rad_s * self.period_ns * 1e-9
-        self._position_targets_rad[joint] = position_rad
+        self._position_targets_rad[joint_index] = position_rad
         return position_rad
 
     # --- readings ------------------------------------------------------------------------------------------
@@ -186,34 +186,34 @@ class BackendRig:
             self._wait_for_deadline()
         self._sample()
 
-    def wait_periods(self, periods: int = 1) -> RigRecord:
+    def wait_periods(self, period_count: int = 1) -> RigRecord:
         """Run some control periods without a new command. The last command stays active while its lease lasts.
 
         Returns:
             The record of these periods.
         """
         first_tick = self.tick
-        for _ in range(periods):
+        for _ in range(period_count):
             decision = self._control_cycle.compute_setpoints(self._now_ns, self.tick)
             self._control_cycle.enact(decision)
             self.advance_period(decision.setpoints)
         return self.record_since(first_tick)
 
     def command_joints(
-        self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None
+        self, targets: JointTargets, period_count: int = 1, *, torque_limit_nm: list[float] | None = None
     ) -> RigRecord:
         """Command some joints while the others hold the start pose, through lease, command limiter and lifecycle.
 
         Args:
             targets: Mode and target by joint index.
-            periods: Number of control periods; the command is sent in each of them.
+            period_count: Number of control periods; the command is sent in each of them.
             torque_limit_nm: Torque limits of all joints. If None, each joint may use its full torque.
 
         Returns:
             The record of these periods.
         """
         first_tick = self.tick
-        for _ in range(periods):
+        for _ in range(period_count):
             self._send(self.make_setpoints(targets, torque_limit_nm))
             self.wait_periods()
         return self.record_since(first_tick)
@@ -226,20 +226,20 @@ class BackendRig:
         return self.record_since(first_tick)
 
     def command_without_limiter(
-        self, targets: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None
+        self, targets: JointTargets, period_count: int = 1, *, torque_limit_nm: list[float] | None = None
     ) -> RigRecord:
         """Command some joints without the command limiter, which would not drive a joint against its end stop.
 
         Args:
             targets: Mode and target by joint index.
-            periods: Number of control periods; the command is sent in each of them.
+            period_count: Number of control periods; the command is sent in each of them.
             torque_limit_nm: Torque limits of all joints. If None, each joint may use its full torque.
 
         Returns:
             The record of these periods.
         """
         first_tick = self.tick
-        for _ in range(periods):
+        for _ in range(period_count):
             self._send(self.make_setpoints(dict.fromkeys(targets, (JointMode.PASSIVE, 0.0))))
             self._control_cycle.compute_setpoints(self._now_ns, self.tick)
             self.enact_without_limiter(
@@ -329,30 +329,30 @@ class BackendRig:
         self._control_cycle = usual_cycle
         self.wait_periods()
 
-    def isolate_joint(self, joint: int) -> None:
+    def isolate_joint(self, joint_index: int) -> None:
         """Isolate a joint, by reporting a fault of this joint alone."""
-        name = self.robot.joints[joint].name
+        name = self.robot.joints[joint_index].name
         cause = f"the contract tests isolate {name}"
         self.authority.latch_fault(Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint"))
 
-    def arm_and_move_joint(self, joint: int = 0) -> RigRecord:
+    def arm_and_move_joint(self, joint_index: int = 0) -> RigRecord:
         """Arm the robot, and move one joint at constant speed. Fails if the joint does not move.
 
         Args:
-            joint: Index of the joint.
+            joint_index: Index of the joint.
 
         Returns:
             The record of the motion.
         """
         self.arm()
         record = self.command_joints(
-            {joint: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)},
+            {joint_index: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)},
             self.count_periods(tolerances.MOTION_DURATION_S),
         )
         self.assert_armed()
-        moved_rad = record.angle_rad[-1, joint] - record.angle_rad[0, joint]
+        moved_rad = record.angle_rad[-1, joint_index] - record.angle_rad[0, joint_index]
         assert moved_rad > tolerances.STANDSTILL_RAD, (
-            f"joint {joint} does not move in velocity mode, so stopping cannot be tested"
+            f"joint {joint_index} does not move in velocity mode, so stopping cannot be tested"
         )
         return record
 

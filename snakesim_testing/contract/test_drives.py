@@ -77,9 +77,9 @@ def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: BackendRi
     assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
 
 
-def assert_drives_stay_off(rig: BackendRig, drives: EmulatedDrives, periods: int) -> None:
+def assert_drives_stay_off(rig: BackendRig, drives: EmulatedDrives, period_count: int) -> None:
     """Fail if a drive is enabled after any of some periods without a command."""
-    for _ in range(periods):
+    for _ in range(period_count):
         rig.wait_periods()
         assert not any(drives.list_enabled()), f"enabled again, in state {rig.authority.state}: {drives.list_enabled()}"
 

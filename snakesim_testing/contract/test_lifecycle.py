@@ -99,4 +99,4 @@ def test_after_reset_and_arm_it_moves_again(rig: BackendRig) -> None:
     rig.arm_and_move_joint()
     rig.report_fault()
     rig.wait_periods(rig.count_periods(tolerances.SETTLING_TIME_S))
-    rig.arm_and_move_joint(joint=rig.joint_count - 1)
+    rig.arm_and_move_joint(joint_index=rig.joint_count - 1)

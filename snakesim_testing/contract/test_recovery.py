@@ -106,11 +106,11 @@ def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: BackendRig, drive
     assert_recovers_by_reset_alone(rig, drives)
 
 
-def assert_fault_names_joint(rig: BackendRig, since_tick: int, joint: int) -> None:
+def assert_fault_names_joint(rig: BackendRig, since_tick: int, joint_index: int) -> None:
     """Fail if the robot is not at fault, or if no fault since a tick names the joint."""
     assert rig.authority.state == "fault", f"the robot continues: {rig.authority.state}"
     faults = rig.record_since(since_tick).faults
-    name = rig.robot.joints[joint].name
+    name = rig.robot.joints[joint_index].name
     assert name in {fault.joint for fault in faults}, f"no fault of {name}: {faults}"
 
 

@@ -9,9 +9,9 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleState
 
 
-def drives_of(backend: Any, bus: int = 0) -> Any:
+def drives_of(backend: Any, bus_index: int = 0) -> Any:
     """The drives of one of its buses."""
-    return backend._drives.buses[bus].drives
+    return backend._drives.buses[bus_index].drives
 
 
 class DriveRig:

@@ -114,7 +114,7 @@ def render_depth_image(
     ground: Ground = flat_ground,
     sensor_errors: SensorErrors | None = None,
     timestamp_ns: int = 0,
-    link: int = 0,
+    link_index: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> DepthImage:
     """Render the image of a depth camera with the optics of INTRINSICS. The tick of the image is 0.
@@ -126,7 +126,7 @@ def render_depth_image(
         ground: Height of the ground as a function of x and y.
         sensor_errors: Errors of the camera. If None, the camera is exact.
         timestamp_ns: Time of the image.
-        link: Index of the link that carries the camera, as the message reports it.
+        link_index: Index of the link that carries the camera, as the message reports it.
         position_l: Position of the camera on this link, as the message reports it, m. It does not move the camera.
     """
     # Their component along the viewing direction is 1, so that distances along them are depths.
@@ -139,7 +139,7 @@ def render_depth_image(
     return DepthImage(
         tick=0,
         timestamp_ns=timestamp_ns,
-        link=link,
+        link=link_index,
         position_l=position_l,
         orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
         **asdict(INTRINSICS),

@@ -40,13 +40,13 @@ class ObservationRecorder(HoldPose):
 class ServiceThread:
     """A service that runs in a thread."""
 
-    def __init__(self, name: str, config: RunConfig, link: ConnectionSettings) -> None:
+    def __init__(self, name: str, config: RunConfig, connection: ConnectionSettings) -> None:
         self.stopped, self.error = threading.Event(), None
-        self.thread = threading.Thread(target=self._run_service, args=(name, config, link), name=name)
+        self.thread = threading.Thread(target=self._run_service, args=(name, config, connection), name=name)
         self.thread.start()
 
-    def _run_service(self, name: str, config: RunConfig, link: ConnectionSettings) -> None:
-        with open_session(link) as session:
+    def _run_service(self, name: str, config: RunConfig, connection: ConnectionSettings) -> None:
+        with open_session(connection) as session:
             try:
                 service_loop = ServiceLoop(load_service_class(config, name), config, session)
                 service_loop.connect()

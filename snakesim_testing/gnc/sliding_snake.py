@@ -159,7 +159,7 @@ class SlidingSnake:
             ground=self.ground,
             sensor_errors=self.eye,
             timestamp_ns=timestamp_ns,
-            link=link,
+            link_index=link,
             position_l=mount,
         )
 

@@ -36,12 +36,12 @@ def require_value(value: T | None) -> T:
     return value
 
 
-def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> RobotDescription:
+def make_robot(module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> RobotDescription:
     """A chain of modules of 0.11 m."""
     limits = {"speed_rad_s": 7.5, "acceleration_rad_s2": 400, "torque_nm": torque_nm, "torque_rate_nm_s": 200}
     gains = {"stiffness_nm_per_rad": 60, "damping_nm_s_per_rad": 1.5, "velocity_gain_nm_s_per_rad": 1.5}
     return make_description(
-        chain={"modules": modules, "axes": list(axes)},
+        chain={"modules": module_count, "axes": list(axes)},
         module={"length_m": 0.11, "radius_m": BODY_RADIUS_M, "mass_kg": 0.3},
         limits={"angle_rad": 1.5, **limits},
         motor={"response_time_s": 0.01, "armature_kg_m2": 0.005, **gains},
@@ -63,11 +63,11 @@ def make_world(**changes: Any) -> WorldModel:
 
 
 def make_contact(
-    obstacle: str, force_w: tuple[float, float, float], link: int = 0, body_s_m: float = 0.1
+    obstacle: str, force_w: tuple[float, float, float], link_index: int = 0, body_s_m: float = 0.1
 ) -> WorldContact:
     """A contact on the right of a body along x."""
     return WorldContact(
-        link=link,
+        link=link_index,
         obstacle=obstacle,
         body_s_m=body_s_m,
         position_w=(0.0, 0.0, 0.0),
@@ -163,10 +163,10 @@ class ObservationStage:
         )
 
 
-def make_stage(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> ObservationStage:
+def make_stage(module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> ObservationStage:
     """A robot among pegs."""
     route = make_route()
-    return ObservationStage(make_robot(modules, axes, torque_nm), route, make_pegs(route))
+    return ObservationStage(make_robot(module_count, axes, torque_nm), route, make_pegs(route))
 
 
 def compute_body_points(stage: ObservationStage, tail_s_m: float) -> np.ndarray:

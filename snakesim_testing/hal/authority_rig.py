@@ -57,9 +57,9 @@ class AuthorityRig:
     def arm(self) -> Answer:
         return self.authority.handle_lifecycle_request(ARM, self.now_ns)
 
-    def pass_tick(self, periods: int = 1) -> TickOutput:
-        self.now_ns += periods * PERIOD_NS
-        self.tick += periods
+    def pass_tick(self, period_count: int = 1) -> TickOutput:
+        self.now_ns += period_count * PERIOD_NS
+        self.tick += period_count
         self.authority.latch_faults_and_expire_lease(self.now_ns, self.tick)
         return self.authority.compute_setpoints()
 

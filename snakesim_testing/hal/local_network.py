@@ -156,9 +156,9 @@ class SineFollower:
     stopped: threading.Event = field(default_factory=threading.Event)
     silent: threading.Event = field(default_factory=threading.Event)  # receives everything, sends nothing
 
-    def run(self, link: ConnectionSettings) -> None:
+    def run(self, connection: ConnectionSettings) -> None:
         """Until stopped."""
-        with open_session(link) as session:
+        with open_session(connection) as session:
             client = HostClient(session, self.name)
             robot = client.wait_for_description()
             joints = client.subscribe(keys.JOINTS, JointState)
@@ -263,9 +263,9 @@ def running_commanded_host(
 
 
 @contextmanager
-def running_follower(link: ConnectionSettings, follower: SineFollower) -> Iterator[SineFollower]:
+def running_follower(connection: ConnectionSettings, follower: SineFollower) -> Iterator[SineFollower]:
     """A follower in a thread of its own."""
-    thread = threading.Thread(target=follower.run, args=(link,), name=follower.name)
+    thread = threading.Thread(target=follower.run, args=(connection,), name=follower.name)
     thread.start()
     try:
         yield follower

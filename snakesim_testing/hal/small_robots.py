@@ -153,12 +153,18 @@ def make_joint_command(
 
 
 def make_power(
-    motor_c: Any = 20.0, voltage_v: Any = 24.0, leak: Any = False, valid: Any = True, *, joints: int = 3, **other: Any
+    motor_c: Any = 20.0,
+    voltage_v: Any = 24.0,
+    leak: Any = False,
+    valid: Any = True,
+    *,
+    joint_count: int = 3,
+    **other: Any,
 ) -> Power:
     """Return a power sample with the health of joint modules. A single value is that of every joint."""
 
     def column(value: Any) -> list[Any]:
-        return value if isinstance(value, list) else [value] * joints
+        return value if isinstance(value, list) else [value] * joint_count
 
     values: dict[str, Any] = {"motor_c": motor_c, "voltage_v": voltage_v, "leak": leak, "valid": valid, **other}
     columns = {name: column(value) for name, value in values.items()}
@@ -173,12 +179,12 @@ def make_pose(tick: int = 0, timestamp_ns: int = 0, **other: Any) -> Pose:
     return Pose(tick=tick, timestamp_ns=timestamp_ns, **values)
 
 
-def make_link_contact(link: int = 0, **other: Any) -> Contact:
+def make_link_contact(link_index: int = 0, **other: Any) -> Contact:
     """Return a contact on the left of a link without force, with changes."""
     still = (0.0, 0.0, 0.0)
     values = {"position_l": still, "normal_l": (0.0, -1.0, 0.0), "force_l": still, "torque_l": still}
     values |= {"tangent_1_l": (1.0, 0.0, 0.0), "tangent_2_l": (0.0, 0.0, 1.0)}
-    return Contact(link=link, **{"obstacle": None, **values, **other})
+    return Contact(link=link_index, **{"obstacle": None, **values, **other})
 
 
 def make_clock(tick: int, *, arm_session: int = 0, **other: Any) -> Clock:

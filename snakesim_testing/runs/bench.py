@@ -12,9 +12,11 @@ from snakesim_testing.runs.command import SNAKESIM_COMMAND, make_environment
 from snakesim_testing.runs.in_process_command import snakesim
 
 
-def lab_folder(folder: Path, joints: int, scenario: str, files: Mapping[str, str]) -> Path:
+def lab_folder(folder: Path, joint_count: int, scenario: str, files: Mapping[str, str]) -> Path:
     """A shorter `planar13` as snake.toml, its bench.toml, and more files by their names."""
-    snake = (SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text().replace("modules = 13", f"modules = {joints}")
+    snake = (
+        (SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text().replace("modules = 13", f"modules = {joint_count}")
+    )
     for name, text in {"snake.toml": snake, "bench.toml": scenario, **files}.items():
         (folder / name).write_text(text)
     return folder

@@ -254,13 +254,13 @@ class NetworkStranger:
                 self.request("disarm" if status["lifecycle"] == "armed" else "reset")
         raise AssertionError(f"not ready to arm within {limit_s:g} s: {self.status()['reason']}")
 
-    def follows(self, commands: int = 10, limit_s: float = 1.5) -> bool:
+    def follows(self, command_count: int = 10, limit_s: float = 1.5) -> bool:
         """Whether commands of the robot's controller are applied, one after the other."""
         first = time.monotonic()
 
         def enough() -> bool:
             seen = {heard.message["sequence"] for heard in self.heard("hal/applied") if heard.at_s > first}
-            return len(seen - {None}) >= commands
+            return len(seen - {None}) >= command_count
 
         with contextlib.suppress(AssertionError):
             wait_until(enough, "commands are applied", limit_s)

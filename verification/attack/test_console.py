@@ -235,7 +235,7 @@ def test_c8_half_sent_requests_do_not_block_the_stop(robot: AttackedRobot, at: s
         }
         page.find(STOP)
         without_scene.find(STOP)
-        with half_sent(at, count=2000, processes=3):
+        with half_sent(at, count=2000, process_count=3):
             for name, act in ways.items():
                 took_s = stops(robot, act)
                 record_property(f"stopped in the flood by {name}", f"after {1000 * took_s:.0f} ms")
@@ -317,7 +317,7 @@ def test_c10_the_second_stop_works_while_the_process_of_the_pages_is_stopped(
             }
             for name, act in ways.items():
                 answers: list[tuple[int, str]] = []
-                with half_sent(at, count=2000, processes=3):
+                with half_sent(at, count=2000, process_count=3):
                     took_s = stops(robot, lambda act=act, answers=answers: answers.append(act()))
                 record_property(f"stopped without the pages' process by {name}", f"after {1000 * took_s:.0f} ms")
                 assert took_s < FLOODED_STOP_S

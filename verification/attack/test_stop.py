@@ -25,8 +25,8 @@ TIMES = range(effort(1, 5))
 Flood = Callable[[AttackedRobot], AbstractContextManager[object]]
 
 
-def flooding(kind: str, amount: int, processes: int = 1) -> Flood:
-    return lambda robot: flood(robot.run.home, kind, robot.endpoint, amount, processes)
+def flooding(kind: str, amount: int, process_count: int = 1) -> Flood:
+    return lambda robot: flood(robot.run.home, kind, robot.endpoint, amount, process_count)
 
 
 FLOODS: dict[str, Flood] = {

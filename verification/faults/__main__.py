@@ -87,19 +87,19 @@ def _select_measurements(row_names: Sequence[str], only_backends: Sequence[str] 
     return measurements
 
 
-def _measure_row(row: FaultRow, backend: Backend, trials: int) -> RowResult:
+def _measure_row(row: FaultRow, backend: Backend, trial_count: int) -> RowResult:
     """Measure a row on a backend. An exception ends the measurement, and is part of its result."""
     measure = row.measurement(backend)
     assert measure is not None, f"{row.name} does not apply to {backend}"
-    if trials >= TRIALS:
-        trials = max(trials, row.min_trials)
+    if trial_count >= TRIALS:
+        trial_count = max(trial_count, row.min_trials)
     started_s = time.monotonic()
     load = _machine_load()
     done: list[InjectionTrial] = []
     broken = ""
     print(f"{datetime.now():%H:%M:%S} {row.name} on {backend} ...", flush=True)
     with tempfile.TemporaryDirectory(prefix=f"snakesim-{row.name}-") as folder:
-        request = MeasurementRequest(backend, trials, Path(folder), [])
+        request = MeasurementRequest(backend, trial_count, Path(folder), [])
         try:
             for trial in measure(request):
                 done.append(trial)
@@ -135,7 +135,7 @@ def _print_error(error: Exception, folder: Path) -> None:
 
 
 def _measure_in_environment(
-    environment: Environment, measurements: Sequence[Measurement], trials: int, store: FaultResults
+    environment: Environment, measurements: Sequence[Measurement], trial_count: int, store: FaultResults
 ) -> None:
     """Measure rows by a process in another environment, which writes its results into the same file."""
     before = store.read()
@@ -145,7 +145,7 @@ def _measure_in_environment(
     command += ["env", f"{ENVIRONMENT_VARIABLE}={environment}", sys.executable, "-m", "verification.faults"]
     command += ["--rows", *dict.fromkeys(row.name for row, _ in measurements)]
     command += ["--backends", *dict.fromkeys(backend for _, backend in measurements)]
-    command += ["--trials", str(trials), "--json", str(store.path)]
+    command += ["--trials", str(trial_count), "--json", str(store.path)]
     try:
         subprocess.run(command, cwd=ROOT, check=False, timeout=ENVIRONMENT_LIMIT_S)
     except (OSError, subprocess.TimeoutExpired) as error:

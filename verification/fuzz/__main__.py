@@ -74,13 +74,13 @@ def of_recordings(copies: int, seed: int) -> int:
     return 1 if verdict.violations else 0
 
 
-def beside_the_wire(payloads: int, seed: int) -> None:
+def beside_the_wire(payload_count: int, seed: int) -> None:
     """Datagrams, files, flags; and frames on a CAN bus."""
     with tempfile.TemporaryDirectory(prefix="snakesim-fuzz-") as folder, inputs.all_inputs(Path(folder)) as found:
-        for name, outcome in inputs.run(found, max(payloads // len(found), 1), seed).items():
+        for name, outcome in inputs.run(found, max(payload_count // len(found), 1), seed).items():
             words = ", ".join(f"{count} {word}" for word, count in outcome.words.most_common())
             print(f"{name:24} {words}; {1e3 * outcome.longest_s:.0f} ms at most")
-    words = bus.run(payloads, seed)
+    words = bus.run(payload_count, seed)
     print("frames on a CAN bus      " + ", ".join(f"{count} {word}" for word, count in words.most_common()))
 
 

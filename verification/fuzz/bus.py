@@ -73,7 +73,7 @@ class BusIntruder:
     def __init__(self, channel: str, maker: FrameMaker, words: Counter[str]) -> None:
         self.bus, self._maker, self._words = VirtualBus(channel=channel), maker, words
 
-    def speak(self, frames: int, *, as_modules: bool = False) -> None:
+    def speak(self, frame_count: int, *, as_modules: bool = False) -> None:
         """Send so many; what was overheard meanwhile is what later ones are made of.
 
         as_modules: none that a driver takes for another host's or for a node that should not be there.
@@ -81,7 +81,7 @@ class BusIntruder:
         while (message := self.bus.recv(0)) is not None:
             if len(self._maker.heard) < 2000:
                 self._maker.heard.append(CanFrame(message.arbitration_id, bytes(message.data)))
-        for _ in range(frames):
+        for _ in range(frame_count):
             kind, (identifier, data) = self._maker.make()
             while as_modules and not is_from_module(identifier):
                 kind, (identifier, data) = self._maker.make()
@@ -94,15 +94,15 @@ def is_from_module(identifier: int) -> bool:
     return parse_opcode(identifier) not in FROM_HOST and 1 <= parse_node(identifier) <= JOINTS
 
 
-def run(frames: int, seed: int) -> Counter[str]:
+def run(frame_count: int, seed: int) -> Counter[str]:
     """So many frames. Raises whatever driver or modules raise that they must not."""
     words: Counter[str] = Counter()
     maker = FrameMaker(random.Random(seed))
     sent = 0
-    while sent < frames:
+    while sent < frame_count:
         try:
             with _opened(maker, words) as (run, stranger):
-                for _ in range(min(PER_OPENING, frames - sent) // PER_TICK + 1):
+                for _ in range(min(PER_OPENING, frame_count - sent) // PER_TICK + 1):
                     _tick(run, stranger, words)
                     sent += PER_TICK
         except BackendError:

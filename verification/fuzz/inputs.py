@@ -74,13 +74,13 @@ class PayloadOutcomes:
     longest_s: float = 0.0
 
 
-def run(inputs: list[DecoderInput], payloads: int, seed: int) -> dict[str, PayloadOutcomes]:
+def run(inputs: list[DecoderInput], payload_count: int, seed: int) -> dict[str, PayloadOutcomes]:
     """So many payloads into each. Raises whatever an input raises that it must not."""
     outcomes: dict[str, PayloadOutcomes] = {}
     for number, one in enumerate(inputs):
         maker = TextMaker(random.Random(seed * 1000 + number), one.seeds, one.max_bytes)
         outcome = outcomes[one.name] = PayloadOutcomes()
-        for _ in range(payloads):
+        for _ in range(payload_count):
             kind, payload = maker.make()
             started = time.monotonic()
             try:

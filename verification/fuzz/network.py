@@ -199,7 +199,7 @@ def _foreign(out: Path, record: HostRecord) -> list[str]:
     return found
 
 
-def _differences(quiet: ObservedPeriod, fuzzed: ObservedPeriod, sent: SentSample, payloads: int) -> list[str]:
+def _differences(quiet: ObservedPeriod, fuzzed: ObservedPeriod, sent: SentSample, payload_count: int) -> list[str]:
     found: list[str] = []
     first, last = quiet.first, fuzzed.last
     if last.lifecycle != "armed":
@@ -207,8 +207,8 @@ def _differences(quiet: ObservedPeriod, fuzzed: ObservedPeriod, sent: SentSample
     if (last.lease_holder, last.lease_epoch) != (first.lease_holder, first.lease_epoch):
         found.append(f"the lease went from {first.lease_holder} {first.lease_epoch} to {last.lease_holder}")
     arrived = sum(sent.samples.values()) + sum(sent.queries.values())
-    if arrived != payloads:
-        found.append(f"only {arrived} of {payloads} payloads were sent")
+    if arrived != payload_count:
+        found.append(f"only {arrived} of {payload_count} payloads were sent")
     if sent.unanswered:
         found.append(f"{sent.unanswered} queries to the HAL got no answer")
     found += [f"an answer {word}" for word in sent.answers if word not in ("yes", "no", "an error")]

@@ -141,7 +141,7 @@ class RecordingsVerdict:
     peak_mb: float = 0.0
 
 
-def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> RecordingsVerdict:
+def fuzz(folder: Path, copies: int, seed: int, command_count: int | None = None) -> RecordingsVerdict:
     """So many damaged copies, each into all commands, or so many of them in turn."""
     recorded(folder / "run", 0.6, 40_000)
     content, verdict = (folder / "run" / RECORDING_FILENAME).read_bytes(), RecordingsVerdict()
@@ -150,8 +150,8 @@ def fuzz(folder: Path, copies: int, seed: int, commands: int | None = None) -> R
         for number in range(copies):
             damage, chance = DAMAGES[number % len(DAMAGES)], random.Random(seed * 100_000 + number)
             spoilt = damage(chance, content)
-            first = number * (commands or 0) % len(names)
-            chosen = names if commands is None else [*names, *names][first : first + commands]
+            first = number * (command_count or 0) % len(names)
+            chosen = names if command_count is None else [*names, *names][first : first + command_count]
             _try(folder / f"{number}", snakesim, spoilt, content, chosen, f"{damage.__name__} {number}", verdict)
     return verdict
 

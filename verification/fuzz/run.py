@@ -76,12 +76,12 @@ def pass_tick(hal: AuthorityRig) -> None:
     assert all(abs(target) <= 5.0 for target in hal.authority.compute_setpoints().setpoints.target)
 
 
-def run(payloads: int, seed: int) -> FuzzReport:
+def run(payload_count: int, seed: int) -> FuzzReport:
     """Raises whatever a decoder or the authority raises that it must not."""
     maker, report = SampleMaker(random.Random(seed)), FuzzReport()
     decoders: dict[type[Message], MessageDecoder[Any]] = {message: MessageDecoder(message) for message in VERSIONS}
     hal = make_armed_rig()
-    for number in range(payloads):
+    for number in range(payload_count):
         if number % PER_ROBOT == 0:
             hal = make_armed_rig()
         sample = maker.make()
@@ -98,7 +98,7 @@ def run(payloads: int, seed: int) -> FuzzReport:
             report.answers[f"{sample.message.__name__}: {taken(hal, message)}"] += 1
         if number % PER_TICK == 0:
             pass_tick(hal)
-        if (number + 1) % max(payloads // 10, 1) == 0:
+        if (number + 1) % max(payload_count // 10, 1) == 0:
             now = vitals(os.getpid())
             assert now is not None
             report.resident_mb.append(now.resident_mb)

@@ -70,10 +70,10 @@ class SampleWriter:
         self._to_hal = 0
         self._answered = 0
 
-    def send(self, payloads: int, rate: float) -> SentSample:
+    def send(self, payload_count: int, rate: float) -> SentSample:
         """Send so many, that many a second."""
         started = time.monotonic()
-        for number in range(payloads):
+        for number in range(payload_count):
             ahead = number / rate - (time.monotonic() - started)
             if ahead > BATCH_S:
                 time.sleep(ahead)
@@ -162,10 +162,10 @@ class SampleWriter:
         return keys.done_key(rng.choice(SERVICES)) if key == keys.DONE_ALL else key
 
 
-def overhear(link: ConnectionSettings) -> tuple[list[SeedMessage], HeldCommand]:
+def overhear(connection: ConnectionSettings) -> tuple[list[SeedMessage], HeldCommand]:
     """One real message of every key on which this robot speaks, and what its controller holds."""
     arrivals: Mailbox[ReceivedSample] = Mailbox()
-    with open_session(link) as session:
+    with open_session(connection) as session:
         for key in STREAMS:
             latched = key in (keys.STATUS, keys.DESCRIPTION)
             (session.on_latched_arrival if latched else session.on_arrival)(key, arrivals.put)

@@ -39,11 +39,11 @@ class TimedSnake:
         """Return the mean CPU time of the physics steps of one round, in microseconds."""
         return self._step(STEPS_PER_ROUND) / STEPS_PER_ROUND * 1e6
 
-    def _step(self, steps: int) -> float:
+    def _step(self, step_count: int) -> float:
         """Make steps. Returns their CPU time in s, without that of the wave."""
         spent_s = 0.0
         joints = slice(FREE_QPOS, FREE_QPOS + self._count)
-        for _ in range(0, steps, STEPS_PER_TARGET):
+        for _ in range(0, step_count, STEPS_PER_TARGET):
             wanted = WAVE.at(self._step_count * self._model.opt.timestep, self._count)
             torques = SERVO_NM_PER_RAD * (wanted - self._data.qpos[joints])
             self._data.qfrc_applied[FREE_DOFS : FREE_DOFS + self._count] = torques
@@ -55,7 +55,7 @@ class TimedSnake:
 
 
 def measure_medians_us(
-    cases: dict[str, tuple[dict[str, Any], dict[str, Any]]], rounds: int
+    cases: dict[str, tuple[dict[str, Any], dict[str, Any]]], round_count: int
 ) -> dict[str, dict[LawsVersion, float]]:
     """Return the median CPU time of a step of each case, by version of the laws; all take turns in every round."""
     versions: tuple[LawsVersion, ...] = ("c", "python")
@@ -65,7 +65,7 @@ def measure_medians_us(
         for version in versions
     }
     times_us: dict[tuple[str, LawsVersion], list[float]] = {key: [] for key in snakes}
-    for _ in range(rounds):
+    for _ in range(round_count):
         for key, snake in snakes.items():
             times_us[key].append(snake.measure_us())
     return {name: {version: statistics.median(times_us[name, version]) for version in versions} for name in cases}

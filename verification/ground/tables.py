@@ -151,10 +151,10 @@ def _measure_creep_mm_s(wheels: dict[str, Any]) -> float:
     return 1e3 * float((creep.position_w - before)[1])
 
 
-def measure_cost(rounds: int) -> list[str]:
+def measure_cost(round_count: int) -> list[str]:
     """Return the rows of the CPU time of a physics step."""
     rows = ["| Ground | C version, µs | Python version, µs |", "|---|---|---|"]
-    for name, times_us in measure_medians_us(COST_CASES, rounds).items():
+    for name, times_us in measure_medians_us(COST_CASES, round_count).items():
         rows.append(f"| {name} | {times_us['c']:.1f} | {times_us['python']:.1f} |")
     return rows
 

@@ -64,11 +64,11 @@ class WheeledSnake:
         self._angles = [int(hinge.qposadr[0]) for hinge in hinges]
         self._velocities = [int(hinge.dofadr[0]) for hinge in hinges]
 
-    def _add_wheels(self, body: mujoco.MjsBody, link: int, length_m: float, mass_kg: float) -> None:
+    def _add_wheels(self, body: mujoco.MjsBody, link_index: int, length_m: float, mass_kg: float) -> None:
         bearing_nm = BEARING_FRICTION * BEARING_RADIUS_M * G * mass_kg / 2
         for side, name in ((1, "left"), (-1, "right")):
-            wheel = body.add_body(name=f"{name}_{link}", pos=[length_m / 2, side * TRACK_M, 0])
-            wheel.add_joint(name=f"{name}_{link}", axis=[0, 1, 0], frictionloss=bearing_nm)
+            wheel = body.add_body(name=f"{name}_{link_index}", pos=[length_m / 2, side * TRACK_M, 0])
+            wheel.add_joint(name=f"{name}_{link_index}", axis=[0, 1, 0], frictionloss=bearing_nm)
             wheel.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 size=[WHEEL_RADIUS_M, 0, 0],

@@ -49,13 +49,13 @@ CONDITIONS = (
 )
 
 
-def held(condition: LinkCondition, trials: int) -> str:
+def held(condition: LinkCondition, trial_count: int) -> str:
     """A line of the table: how long an armed robot keeps going, how fast, and what ends it."""
     armed_s: list[float] = []
     ended: list[str] = []
     with tempfile.TemporaryDirectory() as folder, lab(Path(folder), f"rate_hz={condition.rate_hz}") as made:
         made.link.set_quality(loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s)
-        for _ in range(trials):
+        for _ in range(trial_count):
             try:
                 made.arm(ARM_LIMIT_S)
             except AssertionError:
@@ -76,7 +76,9 @@ def held(condition: LinkCondition, trials: int) -> str:
     names = ", ".join(f"{name} {ended.count(name)}" for name in dict.fromkeys(ended)) or "-"
     median_s, min_s = statistics.median(armed_s), min(armed_s)
     kept = sum(seconds >= ARMED_S for seconds in armed_s)
-    return f"| {condition.name} | {kept} of {trials} | {median_s:.1f} | {min_s:.2f} | {names} | {speed} | {latency} |"
+    return (
+        f"| {condition.name} | {kept} of {trial_count} | {median_s:.1f} | {min_s:.2f} | {names} | {speed} | {latency} |"
+    )
 
 
 def moved(folder: Path) -> tuple[str, str]:
@@ -94,13 +96,13 @@ def moved(folder: Path) -> tuple[str, str]:
 
 
 def event(
-    name: str, trials: int, break_it: Callable[[LinkLab], None], mend: Callable[[LinkLab], None], broken_s: float
+    name: str, trial_count: int, break_it: Callable[[LinkLab], None], mend: Callable[[LinkLab], None], broken_s: float
 ) -> str:
     """A line of the other table: until the robot has stopped, and from the repair until it is armed again."""
     stopped_ms: list[float] = []
     again_s: list[float] = []
     with tempfile.TemporaryDirectory() as folder, lab(Path(folder)) as made:
-        for _ in range(trials):
+        for _ in range(trial_count):
             made.arm()
             time.sleep(1.0)
             assert made.status is not None and made.status.lifecycle == "armed", made.status
@@ -111,16 +113,16 @@ def event(
             mend(made)
             again_s.append(made.arm())
     stopped = f"{statistics.median(stopped_ms):.0f} / {max(stopped_ms):.0f}"
-    return f"| {name} | {trials} | {stopped} | {statistics.median(again_s):.2f} / {max(again_s):.2f} |"
+    return f"| {name} | {trial_count} | {stopped} | {statistics.median(again_s):.2f} / {max(again_s):.2f} |"
 
 
-def events(trials: int) -> list[str]:
+def events(trial_count: int) -> list[str]:
     """What breaks, and is mended."""
     cut, mend = (lambda made: made.link.make(cut=True)), (lambda made: made.link.make())
     return [
-        event("link cut for 0.5 s", trials, cut, mend, 0.5),
-        event("link cut for 5 s, and the machine joins again", max(trials // 4, 1), cut, mend, 5.0),
-        event("router killed, and a new one started", trials, LinkLab.kill_router, LinkLab.start_router, 0.2),
+        event("link cut for 0.5 s", trial_count, cut, mend, 0.5),
+        event("link cut for 5 s, and the machine joins again", max(trial_count // 4, 1), cut, mend, 5.0),
+        event("router killed, and a new one started", trial_count, LinkLab.kill_router, LinkLab.start_router, 0.2),
     ]
 
 

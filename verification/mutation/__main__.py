@@ -63,14 +63,14 @@ def main() -> int:
 
 
 def outcomes(
-    mutants: Iterator[SourceMutant], workers: int, limit_s: float
+    mutants: Iterator[SourceMutant], worker_count: int, limit_s: float
 ) -> Iterator[tuple[SourceMutant, int | None]]:
     """Pytest's exit code for each mutant; None for one that had to be stopped."""
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         running: list[tuple[SourceMutant, BaseProcess, float]] = []
         more = True
         while more or running:
-            while more and len(running) < workers:
+            while more and len(running) < worker_count:
                 mutant = next(mutants, None)
                 more = mutant is not None
                 if mutant is not None:

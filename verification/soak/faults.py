@@ -66,11 +66,11 @@ class SoakEvent:
 class EventDrawer:
     """Draws events; the same ones for the same seed, as long as the same ones are found impossible."""
 
-    def __init__(self, seed: int, joints: int) -> None:
+    def __init__(self, seed: int, joint_count: int) -> None:
         self._random = random.Random(seed)
         self._targets: dict[TargetType, tuple[str, ...]] = {
             **TARGETS,
-            "joint": tuple(f"joint_{i + 1}" for i in range(joints)),
+            "joint": tuple(f"joint_{i + 1}" for i in range(joint_count)),
         }
         self._impossible: set[tuple[TargetType, str]] = set()
 

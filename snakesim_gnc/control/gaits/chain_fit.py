@@ -94,30 +94,30 @@ class ChainFit:
             self._position, self._rotation, self.angles_rad, self._axes, self._lengths_m.tolist()
         )
 
-    def _do_gauss_newton_step(self, backbone: BackboneCurve, first_joint: int, end_joint: int) -> None:
+    def _do_gauss_newton_step(self, backbone: BackboneCurve, first_joint_index: int, end_joint: int) -> None:
         """Do one Gauss-Newton step of a group of joints, and of the base if the group begins at the tail.
 
         Args:
             backbone: The curve that the chain is fitted to.
-            first_joint: Index of the first joint of the group, from the tail.
+            first_joint_index: Index of the first joint of the group, from the tail.
             end_joint: Index after the last joint of the group.
         """
         origins, rotations = self._compute_link_frames()
         points = np.vstack([origins, origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]])[: end_joint + 2]
-        includes_base = first_joint == 0
-        pivots = origins[first_joint + 1 : end_joint + 1]  # (k, 3) of the joints
-        columns = [0 if axis == "pitch" else 1 for axis in self._axes[first_joint:end_joint]]
+        includes_base = first_joint_index == 0
+        pivots = origins[first_joint_index + 1 : end_joint + 1]  # (k, 3) of the joints
+        columns = [0 if axis == "pitch" else 1 for axis in self._axes[first_joint_index:end_joint]]
         axes = np.array(
-            [rotations[first_joint + 1 + k][:, 2 if column else 1] for k, column in enumerate(columns)]
+            [rotations[first_joint_index + 1 + k][:, 2 if column else 1] for k, column in enumerate(columns)]
         )  # (k, 3) of rotation, unit
 
         # Derivatives of the nodes and of the middle link's y axis by rotations about points.
-        angles = self.angles_rad[first_joint:end_joint]
+        angles = self.angles_rad[first_joint_index:end_joint]
         point_derivatives = np.cross(axes[:, None, :], points[None, :, :] - pivots[:, None, :])  # (k, n, 3)
-        is_behind_joint = np.arange(len(points))[None, :] <= np.arange(first_joint + 1, end_joint + 1)[:, None]
+        is_behind_joint = np.arange(len(points))[None, :] <= np.arange(first_joint_index + 1, end_joint + 1)[:, None]
         point_derivatives[is_behind_joint] = 0.0
         middle_y_derivatives = np.cross(axes, rotations[self._middle_link][:, 1])  # (k, 3)
-        middle_y_derivatives[np.arange(first_joint, end_joint) >= self._middle_link] = 0.0
+        middle_y_derivatives[np.arange(first_joint_index, end_joint) >= self._middle_link] = 0.0
         residuals = [(points - backbone.node_positions[: end_joint + 2]).ravel()]
         rows = [point_derivatives.reshape(len(angles), -1).T]
         if includes_base:
@@ -151,7 +151,7 @@ class ChainFit:
         jacobian = np.vstack(rows)
         normal_matrix = jacobian.T @ jacobian + DAMPING * self._mean_link_length_m**2 * np.eye(unknown_count)
         solution_step = -np.linalg.solve(normal_matrix, jacobian.T @ np.concatenate(residuals))
-        self.angles_rad[first_joint:end_joint] += solution_step[: len(angles)]
+        self.angles_rad[first_joint_index:end_joint] += solution_step[: len(angles)]
         if includes_base:
             base_rotation_step: Floats = np.array(solution_step[len(angles) : len(angles) + 3], dtype=np.float64)
             self._rotation = _make_rotation(base_rotation_step) @ self._rotation
@@ -187,17 +187,17 @@ class KeyframeWaves:
         self._cosines: Floats = np.zeros((len(self._orders), len(robot.joints)))
         self._sines: Floats = np.zeros_like(self._cosines)
 
-    def advance_fit(self, steps: int | None = None) -> bool:
+    def advance_fit(self, step_count: int | None = None) -> bool:
         """Do some steps of the fit, and compute the Fourier series when all keyframes are complete.
 
         Args:
-            steps: Maximum number of Gauss-Newton steps; None to complete the fit.
+            step_count: Maximum number of Gauss-Newton steps; None to complete the fit.
 
         Returns:
             Whether the keyframes are complete.
         """
         done_count = 0
-        while not self.is_fitted and done_count != steps:
+        while not self.is_fitted and done_count != step_count:
             if next(self._steps, "finished") == "finished":
                 self._compute_fourier_series()
             done_count += 1

@@ -110,7 +110,7 @@ def find_alternating_triples(sides: Sequence[int]) -> list[tuple[int, int, int]]
 
 
 def find_propulsion_joint(
-    body_points_s_m: Sequence[float], o_2_s_m: float, o_3_s_m: float, current_joint: int | None, hold_on_m: float
+    body_points_s_m: Sequence[float], o_2_s_m: float, o_3_s_m: float, current_joint_index: int | None, hold_on_m: float
 ) -> int | None:
     """Find the joint that propels a triplet of push-points o_1, o_2, o_3 (tail to head).
 
@@ -121,8 +121,8 @@ def find_propulsion_joint(
             Joint i is point i + 1.
         o_2_s_m: Arc length of o_2 on the body, from the tail end.
         o_3_s_m: Arc length of o_3 on the body, from the tail end.
-        current_joint: Current propulsion joint of this triplet; None if it has none. It remains the propulsion joint
-            until the joint behind it is `hold_on_m` past o_2, so that noise does not switch back and forth.
+        current_joint_index: Current propulsion joint of this triplet; None if it has none. It remains the propulsion
+            joint until the joint behind it is `hold_on_m` past o_2, so that noise does not switch back and forth.
         hold_on_m: Distance past o_2 at which the joint behind takes over.
 
     Returns:
@@ -133,12 +133,12 @@ def find_propulsion_joint(
     if joint > last_joint or body_points_s_m[joint + 1] >= o_3_s_m:
         return None
     next_joint = joint + 1
-    if current_joint != next_joint or next_joint > last_joint:
+    if current_joint_index != next_joint or next_joint > last_joint:
         return joint
     has_just_passed = body_points_s_m[joint + 1] - o_2_s_m < hold_on_m
     next_is_behind_o_3 = body_points_s_m[next_joint + 1] < o_3_s_m
     if has_just_passed and next_is_behind_o_3:
-        return current_joint
+        return current_joint_index
     return joint
 
 
@@ -210,7 +210,7 @@ class TripletFinder:
         body_points_w: Floats,
         body_point_arc_lengths_m: Sequence[float],
         current_choice: PropulsionChoice | None,
-        excluded_joint: int | None,
+        excluded_joint_index: int | None,
     ) -> tuple[list[PropulsionChoice], list[str]]:
         """Find every contact triplet against which some joint can propel the robot.
 
@@ -220,7 +220,7 @@ class TripletFinder:
                 world, m.
             body_point_arc_lengths_m: (n_points,) arc lengths of these points from the tail end.
             current_choice: The choice that propels the robot now; None if none does.
-            excluded_joint: Index of a joint that must not propel; None if every joint may.
+            excluded_joint_index: Index of a joint that must not propel; None if every joint may.
 
         Returns:
             The choices (a triplet with its propelling joint), and for each other triplet a text with its obstacles and
@@ -239,7 +239,12 @@ class TripletFinder:
             if current_choice is not None and current_choice.triplet is triplet:
                 current_joint = current_choice.joint
             choice_or_reason = self._choose_propulsion_joint(
-                triplet, contact_arc_lengths_m, body_points_w, body_point_arc_lengths_m, current_joint, excluded_joint
+                triplet,
+                contact_arc_lengths_m,
+                body_points_w,
+                body_point_arc_lengths_m,
+                current_joint,
+                excluded_joint_index,
             )
             if isinstance(choice_or_reason, PropulsionChoice):
                 choices.append(choice_or_reason)
@@ -253,8 +258,8 @@ class TripletFinder:
         contacts_s_m: tuple[float, float, float],
         body_points_w: Floats,
         body_points_s_m: Sequence[float],
-        current_joint: int | None,
-        excluded_joint: int | None,
+        current_joint_index: int | None,
+        excluded_joint_index: int | None,
     ) -> PropulsionChoice | str:
         """Return a triplet with its propulsion joint and the torque for 1 N, or the reason why it cannot propel.
 
@@ -264,16 +269,16 @@ class TripletFinder:
             body_points_w: (2, n_points) points of the body in the world, m. Joint i is point i + 1, because point 0 is
                 the tail end.
             body_points_s_m: (n_points,) arc lengths of these points from the tail end.
-            current_joint: Current propulsion joint of this triplet; None if it has none.
-            excluded_joint: Index of a joint that must not propel; None if every joint may.
+            current_joint_index: Current propulsion joint of this triplet; None if it has none.
+            excluded_joint_index: Index of a joint that must not propel; None if every joint may.
         """
         if triplet.unit_forces.reason:
             return triplet.unit_forces.reason
         _, o_2_s_m, o_3_s_m = contacts_s_m
-        joint = find_propulsion_joint(body_points_s_m, o_2_s_m, o_3_s_m, current_joint, self._hold_on_m)
+        joint = find_propulsion_joint(body_points_s_m, o_2_s_m, o_3_s_m, current_joint_index, self._hold_on_m)
         if joint is None:
             return "no joint between o_2 and o_3"
-        if joint == excluded_joint:
+        if joint == excluded_joint_index:
             return "its propulsion joint has left its reference too far"
         joint_w = (float(body_points_w[0, joint + 1]), float(body_points_w[1, joint + 1]))
         o_3 = triplet.contacts[2]

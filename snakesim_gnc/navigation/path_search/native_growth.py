@@ -42,7 +42,7 @@ class NativeExpander(PathExpander):
     """
 
     def __init__(
-        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
+        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, step_count: int
     ) -> None:
         """Copy a search into the structures of the C library, which then expands it layer by layer.
 
@@ -51,7 +51,7 @@ class NativeExpander(PathExpander):
             parameters: Size of the robot's body, and the cost weights.
             task: Goal of the search, and the body from which it starts.
             start: Nodes of the first layer.
-            steps: Maximum number of layers after the first.
+            step_count: Maximum number of layers after the first.
 
         Raises:
             PlannerLibraryError: The C library is not installed.
@@ -61,7 +61,7 @@ class NativeExpander(PathExpander):
             raise PlannerLibraryError(f"there is no C library of the planner: {explain_missing_library()}")
         self._expand_in_c = library.expand
         self._max_nodes_per_layer = max(parameters.kept_nodes, len(start.x_m))
-        self._max_layers = steps + 1
+        self._max_layers = step_count + 1
         self._memory = NativeMemory()
 
         self._native_search = NativeSearch()

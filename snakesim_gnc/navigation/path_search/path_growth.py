@@ -13,7 +13,7 @@ class PathExpander(ABC):
 
     @abstractmethod
     def __init__(
-        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
+        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, step_count: int
     ) -> None:
         """Start with the start nodes as the first layer.
 
@@ -22,7 +22,7 @@ class PathExpander(ABC):
             parameters: Size of the robot's body, and the cost weights.
             task: Goal of the search, and the body from which it starts.
             start: The nodes from which the paths grow.
-            steps: Maximum number of arcs of a path.
+            step_count: Maximum number of arcs of a path.
         """
 
     @property

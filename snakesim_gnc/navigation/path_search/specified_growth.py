@@ -39,9 +39,9 @@ class NumpyExpander(PathExpander):
     """Grows paths with NumPy, in the words of the cost's equation in `beam`."""
 
     def __init__(
-        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, steps: int
+        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, step_count: int
     ) -> None:
-        del steps  # memory is allocated layer by layer
+        del step_count  # memory is allocated layer by layer
         self._obstacles = obstacles
         self._parameters = parameters
         self._task = task

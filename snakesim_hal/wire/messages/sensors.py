@@ -23,14 +23,14 @@ class JointState(Message, frozen=True, kw_only=True):
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `timestamp_ns` each joint was measured")]
 
-    def has_joint_count(self, joints: int) -> bool:
+    def has_joint_count(self, joint_count: int) -> bool:
         """Return whether every list has an entry for each of so many joints."""
         return (
-            len(self.angle_rad) == joints
-            and len(self.velocity_rad_s) == joints
-            and len(self.torque_nm) == joints
-            and len(self.valid) == joints
-            and len(self.age_ns) == joints
+            len(self.angle_rad) == joint_count
+            and len(self.velocity_rad_s) == joint_count
+            and len(self.torque_nm) == joint_count
+            and len(self.valid) == joint_count
+            and len(self.age_ns) == joint_count
         )
 
 

@@ -142,10 +142,10 @@ class TravelRange:
         np.minimum(self.lower_rad, angle_rad, out=self.lower_rad)
         np.maximum(self.upper_rad, angle_rad, out=self.upper_rad)
 
-    def compute_limits_rad(self, joint: int) -> tuple[float, float] | None:
+    def compute_limits_rad(self, joint_index: int) -> tuple[float, float] | None:
         """Return the limits to write for a joint; None if it was not moved from end to end."""
-        lower = float(self.lower_rad[joint])
-        upper = float(self.upper_rad[joint])
+        lower = float(self.lower_rad[joint_index])
+        upper = float(self.upper_rad[joint_index])
         if upper - lower < MIN_TRAVEL_RAD:
             return None
         return lower + LIMIT_MARGIN_RAD, upper - LIMIT_MARGIN_RAD

@@ -159,60 +159,60 @@ class _JointEvaluator:
             link_force_m_s2=measurements.link_force_m_s2[:, link_order],
         )
 
-    def check_joint(self, joint: int) -> JointVerdict:
+    def check_joint(self, joint_index: int) -> JointVerdict:
         """Check the drive of a joint and how it is mounted: its order, sign, gear ratio and zero offset.
 
         Args:
-            joint: Index of the joint.
+            joint_index: Index of the joint.
 
         Returns:
             A finding for each of these properties, and the measured range of motion (rad), ratio of the motions of link
             and drive, and torque (N·m); a measurement is None if it could not be made.
         """
         measurements = self._measurements
-        torque_nm = _compute_mean_driving_torque_nm(measurements, joint)
-        motion_ratio = self._measure_motion_ratio(joint)
+        torque_nm = _compute_mean_driving_torque_nm(measurements, joint_index)
+        motion_ratio = self._measure_motion_ratio(joint_index)
         motion_range_rad = None
-        if measurements.is_moved_by_target(joint).any():
-            motion_range_rad = measurements.measure_motion_range_rad(joint)
+        if measurements.is_moved_by_target(joint_index).any():
+            motion_range_rad = measurements.measure_motion_range_rad(joint_index)
         return JointVerdict(
-            joint=measurements.joint_names[joint],
+            joint=measurements.joint_names[joint_index],
             findings={
-                "drive": _judge_drive(measurements, joint, torque_nm),
-                **self._judge_mounting(joint, motion_ratio),
+                "drive": _judge_drive(measurements, joint_index, torque_nm),
+                **self._judge_mounting(joint_index, motion_ratio),
             },
             moved_rad=motion_range_rad,
             turned=None if np.isnan(motion_ratio) else motion_ratio,
             torque_nm=torque_nm,
         )
 
-    def _measure_motion_ratio(self, joint: int) -> float:
+    def _measure_motion_ratio(self, joint_index: int) -> float:
         """Return the motion of a joint's links divided by the motion that its encoder measured; NaN if unknown."""
-        motion = self._motion_fractions[joint]
-        if motion is None or self._module_order[joint] != joint:
+        motion = self._motion_fractions[joint_index]
+        if motion is None or self._module_order[joint_index] != joint_index:
             return float("nan")
-        return float(motion.reorder_modules(self._module_order).compute_joint_motions()[joint])
+        return float(motion.reorder_modules(self._module_order).compute_joint_motions()[joint_index])
 
-    def _judge_mounting(self, joint: int, motion_ratio: float) -> dict[JointProperty, PropertyFinding]:
+    def _judge_mounting(self, joint_index: int, motion_ratio: float) -> dict[JointProperty, PropertyFinding]:
         """Judge how the module of a joint is mounted: its order, sign, gear and zero.
 
         Args:
-            joint: Index of the joint.
+            joint_index: Index of the joint.
             motion_ratio: Motion of the links divided by the motion by the encoder, with its sign; NaN if unknown.
         """
-        if self._module_order[joint] != joint:
-            return self._make_swapped_findings(joint)
-        zero = _judge_zero(self._reordered_measurements, joint, was_laid_straight=self._was_laid_straight)
-        if self._motion_fractions[joint] is None:
-            was_commanded = self._measurements.is_moved_by_target(joint).any()
+        if self._module_order[joint_index] != joint_index:
+            return self._make_swapped_findings(joint_index)
+        zero = _judge_zero(self._reordered_measurements, joint_index, was_laid_straight=self._was_laid_straight)
+        if self._motion_fractions[joint_index] is None:
+            was_commanded = self._measurements.is_moved_by_target(joint_index).any()
             unknown = PropertyFinding("unknown", NO_MOTION if was_commanded else NO_END)
             return {"order": unknown, "sign": unknown, "gear": unknown, "zero": zero}
-        drive = self._measurements.drives[joint]
+        drive = self._measurements.drives[joint_index]
         candidates = [
             self._measurements.joint_names[other]
-            for other in find_swap_candidates(self._motion_fractions, self._module_order, joint)
+            for other in find_swap_candidates(self._motion_fractions, self._module_order, joint_index)
         ]
-        lost_motion = measure_lost_motion(self._reordered_measurements, joint)
+        lost_motion = measure_lost_motion(self._reordered_measurements, joint_index)
         return {
             "order": _judge_order(motion_ratio, candidates),
             "sign": _judge_sign(motion_ratio, drive),
@@ -220,12 +220,12 @@ class _JointEvaluator:
             "zero": zero,
         }
 
-    def _make_swapped_findings(self, joint: int) -> dict[JointProperty, PropertyFinding]:
+    def _make_swapped_findings(self, joint_index: int) -> dict[JointProperty, PropertyFinding]:
         """Return the findings on a joint whose module is swapped with that of another joint: the order is wrong."""
         names = self._measurements.joint_names
-        other = names[int(self._module_order[joint])]
+        other = names[int(self._module_order[joint_index])]
         unknown = PropertyFinding(
-            "unknown", f"judged once the ids of {names[joint]} and {other} are right; run the check again then"
+            "unknown", f"judged once the ids of {names[joint_index]} and {other} are right; run the check again then"
         )
         return {
             "order": PropertyFinding("wrong", f"moves the link of {other}: their ids or cables are swapped"),
@@ -235,34 +235,34 @@ class _JointEvaluator:
         }
 
 
-def _has_followed_target(measurements: CheckMeasurements, joint: int) -> bool:
+def _has_followed_target(measurements: CheckMeasurements, joint_index: int) -> bool:
     """Return whether a joint's encoder followed its target."""
-    commanded = measurements.is_moved_by_target(joint)
+    commanded = measurements.is_moved_by_target(joint_index)
     if not commanded.any():
         return False
-    target_range_rad = float(np.ptp(measurements.target_rad[commanded, joint]))
-    is_moving = np.abs(measurements.velocity_rad_s[commanded, joint]) > MIN_RATE_RAD_S
-    moved_far_enough = measurements.measure_motion_range_rad(joint) >= max(
+    target_range_rad = float(np.ptp(measurements.target_rad[commanded, joint_index]))
+    is_moving = np.abs(measurements.velocity_rad_s[commanded, joint_index]) > MIN_RATE_RAD_S
+    moved_far_enough = measurements.measure_motion_range_rad(joint_index) >= max(
         MIN_MOVED_RAD, MIN_FOLLOWED_FRACTION * target_range_rad
     )
     moved_long_enough = bool(np.mean(is_moving) >= MIN_FOLLOWED_FRACTION)
     return moved_far_enough and moved_long_enough
 
 
-def _compute_mean_driving_torque_nm(measurements: CheckMeasurements, joint: int) -> float | None:
+def _compute_mean_driving_torque_nm(measurements: CheckMeasurements, joint_index: int) -> float | None:
     """Return the mean of a joint's torque, positive where it drives; None if it is not measured."""
-    velocity = measurements.velocity_rad_s[:, joint]
-    is_moving = measurements.is_moved_by_target(joint) & (np.abs(velocity) > MIN_RATE_RAD_S)
-    if "torque" not in measurements.drives[joint].measures or not is_moving.any():
+    velocity = measurements.velocity_rad_s[:, joint_index]
+    is_moving = measurements.is_moved_by_target(joint_index) & (np.abs(velocity) > MIN_RATE_RAD_S)
+    if "torque" not in measurements.drives[joint_index].measures or not is_moving.any():
         return None
-    return float(np.mean(measurements.torque_nm[is_moving, joint] * np.sign(velocity[is_moving])))
+    return float(np.mean(measurements.torque_nm[is_moving, joint_index] * np.sign(velocity[is_moving])))
 
 
-def _judge_drive(measurements: CheckMeasurements, joint: int, torque_nm: float | None) -> PropertyFinding:
+def _judge_drive(measurements: CheckMeasurements, joint_index: int, torque_nm: float | None) -> PropertyFinding:
     """Judge whether a joint's drive moves it. `torque_nm` is the mean along the motion; None if it is not measured."""
-    if not measurements.is_moved_by_target(joint).any():
+    if not measurements.is_moved_by_target(joint_index).any():
         return PropertyFinding("unknown", NO_END)
-    if not _has_followed_target(measurements, joint):
+    if not _has_followed_target(measurements, joint_index):
         return PropertyFinding("wrong", "did not move: motor, brake, power, or a link that is held")
     if torque_nm is not None and torque_nm < -MIN_TORQUE_NM:
         return PropertyFinding("wrong", "its torque has the wrong sign: it measures a brake while it drives")
@@ -325,7 +325,7 @@ def _judge_gear(
     return CONFIRMED
 
 
-def _judge_zero(measurements: CheckMeasurements, joint: int, *, was_laid_straight: bool) -> PropertyFinding:
+def _judge_zero(measurements: CheckMeasurements, joint_index: int, *, was_laid_straight: bool) -> PropertyFinding:
     """Judge whether the zero of a joint's angle in the robot file is right.
 
     If accelerometers measure the joint's angle by gravity, the encoder is compared with it. Otherwise it is compared
@@ -333,7 +333,7 @@ def _judge_zero(measurements: CheckMeasurements, joint: int, *, was_laid_straigh
 
     Args:
         measurements: Measurements of the check.
-        joint: Index of the joint.
+        joint_index: Index of the joint.
         was_laid_straight: Whether a person states that the robot lay straight at the start.
 
     Returns:
@@ -342,29 +342,29 @@ def _judge_zero(measurements: CheckMeasurements, joint: int, *, was_laid_straigh
     at_rest = measurements.is_at_rest()
     before_motion = measurements.is_before_motion()
     angle_by_gravity_rad = None
-    if measurements.axes[joint] == "pitch":
-        angle_by_gravity_rad = _measure_angle_by_gravity_rad(measurements, joint, at_rest)
+    if measurements.axes[joint_index] == "pitch":
+        angle_by_gravity_rad = _measure_angle_by_gravity_rad(measurements, joint_index, at_rest)
     if angle_by_gravity_rad is not None:
-        error_rad = float(np.mean(measurements.angle_rad[at_rest, joint])) - angle_by_gravity_rad
+        error_rad = float(np.mean(measurements.angle_rad[at_rest, joint_index])) - angle_by_gravity_rad
         allowed_rad = MAX_GRAVITY_ERROR_RAD
     elif not was_laid_straight:
         return PropertyFinding("unknown", NOT_STRAIGHT)
     elif not before_motion.any():
         return PropertyFinding("unknown", NO_REST)
     else:
-        error_rad = float(np.mean(measurements.angle_rad[before_motion, joint]))
+        error_rad = float(np.mean(measurements.angle_rad[before_motion, joint_index]))
         allowed_rad = MAX_STRAIGHT_ERROR_RAD
     if abs(error_rad) <= allowed_rad:
         return CONFIRMED
-    drive = measurements.drives[joint]
+    drive = measurements.drives[joint_index]
     zero_rad = drive.zero_rad + drive.sign * drive.gear * error_rad
     return PropertyFinding("wrong", f"its zero is off by {error_rad:+.3f} rad: zero_rad = {zero_rad:.3f}")
 
 
-def _measure_angle_by_gravity_rad(measurements: CheckMeasurements, joint: int, at_rest: Mask) -> float | None:
+def _measure_angle_by_gravity_rad(measurements: CheckMeasurements, joint_index: int, at_rest: Mask) -> float | None:
     """Return a pitch joint's angle from the direction of gravity in both of its links; None if that is not known."""
     tilts_rad: list[float] = []
-    for link in (joint, joint + 1):
+    for link in (joint_index, joint_index + 1):
         forces_m_s2 = measurements.link_force_m_s2[at_rest, link]
         known_forces_m_s2 = forces_m_s2[~np.isnan(forces_m_s2[:, 0])]
         if not len(known_forces_m_s2):

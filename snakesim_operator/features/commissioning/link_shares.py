@@ -54,10 +54,10 @@ class LinkMotionFractions:
         return float(np.nansum(elsewhere**2) + np.nansum(motion_across**2))
 
 
-def measure_link_motion_fractions(measurements: CheckMeasurements, joint: int) -> LinkMotionFractions:
+def measure_link_motion_fractions(measurements: CheckMeasurements, joint_index: int) -> LinkMotionFractions:
     """Measure the motion of all links and encoders while one joint moved, as fractions of that joint's motion."""
-    is_commanded = measurements.is_moved_by_target(joint)
-    speed_rad_s = measurements.velocity_rad_s[:, joint]
+    is_commanded = measurements.is_moved_by_target(joint_index)
+    speed_rad_s = measurements.velocity_rad_s[:, joint_index]
     is_moving = is_commanded & (np.abs(speed_rad_s) > MIN_RATE_RAD_S)
     encoder_fractions = np.array(
         [_fit_fraction(rate, speed_rad_s, is_moving) for rate in measurements.velocity_rad_s.T]
@@ -65,14 +65,14 @@ def measure_link_motion_fractions(measurements: CheckMeasurements, joint: int) -
     along_axes = [measurements.find_axis_component(k) for k in range(len(measurements.axes))]
     across_axes = [YAW + PITCH - component for component in along_axes]
     return LinkMotionFractions(
-        links=_compute_link_fractions(measurements, joint, is_commanded, is_moving, along_axes),
-        across=_compute_link_fractions(measurements, joint, is_commanded, is_moving, across_axes),
+        links=_compute_link_fractions(measurements, joint_index, is_commanded, is_moving, along_axes),
+        across=_compute_link_fractions(measurements, joint_index, is_commanded, is_moving, across_axes),
         encoders=encoder_fractions,
     )
 
 
 def _compute_link_fractions(
-    measurements: CheckMeasurements, joint: int, is_commanded: Mask, is_moving: Mask, components: Sequence[int]
+    measurements: CheckMeasurements, joint_index: int, is_commanded: Mask, is_moving: Mask, components: Sequence[int]
 ) -> Floats:
     """Return the motion of every link while one joint moved, as a fraction of that joint's motion by its encoder.
 
@@ -81,7 +81,7 @@ def _compute_link_fractions(
 
     Args:
         measurements: Measurements of the check.
-        joint: Index of the joint that moved.
+        joint_index: Index of the joint that moved.
         is_commanded: (ticks,) whether the joint had a moving target.
         is_moving: (ticks,) whether the joint moved fast enough for a ratio of rates.
         components: For each joint of the robot, the component of the links' rates to use: about or across its axis.
@@ -89,14 +89,14 @@ def _compute_link_fractions(
     Returns:
         (links, joints), NaN where unknown.
     """
-    speed_rad_s = measurements.velocity_rad_s[:, joint]
+    speed_rad_s = measurements.velocity_rad_s[:, joint_index]
     fractions_by_component: dict[int, list[float]] = {}  # one fraction for each link
     for component in set(components):
         link_rates_rad_s = measurements.link_rate_rad_s[:, :, component].T
         fractions_by_component[component] = [_fit_fraction(rate, speed_rad_s, is_moving) for rate in link_rates_rad_s]
     fractions = np.array([fractions_by_component[component] for component in components]).T
     if np.isnan(fractions[0]).all():  # link 0 has no IMU; motion capture may have measured its angle
-        angle_rad = _remove_mean(measurements.angle_rad[:, joint], is_commanded)
+        angle_rad = _remove_mean(measurements.angle_rad[:, joint_index], is_commanded)
         for k, component in enumerate(components):
             base_rad = _remove_mean(measurements.base_rotation_rad[:, component], is_commanded)
             fractions[0, k] = _fit_fraction(base_rad, angle_rad, is_commanded)
@@ -147,25 +147,25 @@ def find_module_order(motion_fractions: Sequence[LinkMotionFractions | None]) ->
 
 
 def find_swap_candidates(
-    motion_fractions: Sequence[LinkMotionFractions | None], order: ModuleOrder, joint: int
+    motion_fractions: Sequence[LinkMotionFractions | None], order: ModuleOrder, joint_index: int
 ) -> list[int]:
     """Find the joints whose modules might be swapped with that of a joint, because their motions do not exclude it.
 
     Args:
         motion_fractions: Measurements while each joint moved; None where a joint did not move.
         order: Index of the joint whose module is in the place of each joint, as far as it is known.
-        joint: Index of the joint.
+        joint_index: Index of the joint.
 
     Returns:
         Indices of the other joints.
     """
     candidates: list[int] = []
     for other in range(len(motion_fractions)):
-        if other == joint:
+        if other == joint_index:
             continue
-        swapped = _swap_modules(order, joint, other)
+        swapped = _swap_modules(order, joint_index, other)
         additional_misfit = 0.0
-        for mover in (joint, other):
+        for mover in (joint_index, other):
             motion = motion_fractions[mover]
             if motion is not None:
                 misfit_before = motion.reorder_modules(order).compute_misfit_at_other_joints(

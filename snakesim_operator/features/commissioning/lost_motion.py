@@ -39,7 +39,7 @@ class LostMotion:
     ratio: float  # of the link's rate to the drive's, while the teeth touch
 
 
-def measure_lost_motion(measurements: CheckMeasurements, joint: int) -> LostMotion | None:
+def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> LostMotion | None:
     """Measure the backlash of a joint that moved back and forth.
 
     Fits the ratio of the link's rate to the drive's rate and the delay between their sensors. The backlash is the range
@@ -47,17 +47,17 @@ def measure_lost_motion(measurements: CheckMeasurements, joint: int) -> LostMoti
 
     Args:
         measurements: Measurements of the check.
-        joint: Index of the joint.
+        joint_index: Index of the joint.
 
     Returns:
         The backlash and its noise; None if the joint moved too little, or no gyro measured its link.
     """
-    moved_rows = np.flatnonzero(measurements.is_moved_by_target(joint))
-    link_angle = _integrate_link_angle(measurements, joint)
+    moved_rows = np.flatnonzero(measurements.is_moved_by_target(joint_index))
+    link_angle = _integrate_link_angle(measurements, joint_index)
     if link_angle is None or len(moved_rows) < MIN_SAMPLES:
         return None
     link_rad, drift_rad_per_sqrt_s = link_angle
-    encoder_rad = measurements.angle_rad[:, joint]
+    encoder_rad = measurements.angle_rad[:, joint_index]
 
     # The part of the record in which the joint moved, where the slopes are valid.
     half_window = max(round(SLOPE_HALF_WINDOW_S / measurements.period_s), 1)
@@ -82,14 +82,14 @@ def measure_lost_motion(measurements: CheckMeasurements, joint: int) -> LostMoti
     difference_rad = np.convolve(difference_rad, mean_window, "valid")
     duration_s = len(difference_rad) * measurements.period_s
     gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s) / abs(ratio)
-    encoder_noise_rad = _measure_encoder_noise(measurements, joint) / np.sqrt(half_window)
+    encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
     noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
     return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
 
 
-def _measure_encoder_noise(measurements: CheckMeasurements, joint: int) -> float:
+def _measure_encoder_noise(measurements: CheckMeasurements, joint_index: int) -> float:
     """Return the standard deviation of the noise of a joint's encoder in rad, measured while the robot was at rest."""
-    differences_rad = np.diff(measurements.angle_rad[measurements.is_at_rest(), joint])
+    differences_rad = np.diff(measurements.angle_rad[measurements.is_at_rest(), joint_index])
     return float(np.std(differences_rad)) / np.sqrt(2)
 
 
@@ -123,22 +123,22 @@ def _refine_ratio(ratio: float, drive_rate: Floats, link_rate: Floats, accelerat
     return float(coefficients[0]), delay_s
 
 
-def _integrate_link_angle(measurements: CheckMeasurements, joint: int) -> tuple[Floats, float] | None:
+def _integrate_link_angle(measurements: CheckMeasurements, joint_index: int) -> tuple[Floats, float] | None:
     """Return a joint's angle by the gyros of its two links, and the drift of that angle by the gyros' noise.
 
     For the joint at the tail, motion capture may replace a missing gyro on the tail link.
 
     Args:
         measurements: Measurements of the check.
-        joint: Index of the joint.
+        joint_index: Index of the joint.
 
     Returns:
         (ticks,) angle in rad up to a constant, and the standard deviation of its drift after one second in rad, which
         grows with the square root of time; None if a link was not measured.
     """
-    component = measurements.find_axis_component(joint)
-    gyro_behind = _read_gyro(measurements, joint, component)
-    gyro_ahead = _read_gyro(measurements, joint + 1, component)
+    component = measurements.find_axis_component(joint_index)
+    gyro_behind = _read_gyro(measurements, joint_index, component)
+    gyro_ahead = _read_gyro(measurements, joint_index + 1, component)
     if gyro_ahead is None:
         return None
     rate_ahead, drift_ahead = gyro_ahead
@@ -147,16 +147,16 @@ def _integrate_link_angle(measurements: CheckMeasurements, joint: int) -> tuple[
         angle_rad = _integrate_rate(rate_ahead - rate_behind, measurements.period_s)
         return angle_rad, float(np.hypot(drift_ahead, drift_behind))
     base_rad = measurements.base_rotation_rad[:, component]
-    if joint == 0 and not np.isnan(base_rad).all():
+    if joint_index == 0 and not np.isnan(base_rad).all():
         known_rows = np.flatnonzero(~np.isnan(base_rad))
         base_rad = np.interp(np.arange(len(base_rad)), known_rows, base_rad[known_rows])
         return _integrate_rate(rate_ahead, measurements.period_s) - base_rad, drift_ahead
     return None
 
 
-def _read_gyro(measurements: CheckMeasurements, link: int, component: int) -> tuple[Floats, float] | None:
+def _read_gyro(measurements: CheckMeasurements, link_index: int, component: int) -> tuple[Floats, float] | None:
     """Return a link's rate at every tick, (n,), without its bias, and its drift after a second; None without a gyro."""
-    rate = measurements.link_rate_rad_s[:, link, component]
+    rate = measurements.link_rate_rad_s[:, link_index, component]
     known = np.flatnonzero(~np.isnan(rate))
     at_rest = known[measurements.is_at_rest()[known]]
     if len(at_rest) < MIN_SAMPLES:

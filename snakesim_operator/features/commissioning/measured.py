@@ -40,9 +40,9 @@ class CheckMeasurements:
     link_force_m_s2: Floats  # (n, links, 3): specific force, in the link's frame; at rest 1 g upwards
     base_rotation_rad: Floats  # (n, 3): integral of link 0's rate, in its frame; NaN without motion capture
 
-    def is_moved_by_target(self, joint: int) -> Mask:
+    def is_moved_by_target(self, joint_index: int) -> Mask:
         """Return the ticks in which the joint's target is away from its rest, (n,)."""
-        target_rad = self.target_rad[:, joint]
+        target_rad = self.target_rad[:, joint_index]
         return np.abs(target_rad - np.median(target_rad)) > MIN_TARGET_MOTION_RAD
 
     def is_at_rest(self) -> Mask:
@@ -54,16 +54,16 @@ class CheckMeasurements:
         """Return the ticks before the first joint is moved, (n,)."""
         return np.logical_and.accumulate(self.is_at_rest())
 
-    def measure_motion_range_rad(self, joint: int) -> float:
+    def measure_motion_range_rad(self, joint_index: int) -> float:
         """Return how far the joint moved by its encoder, from end to end."""
-        moved = self.is_moved_by_target(joint)
+        moved = self.is_moved_by_target(joint_index)
         if not moved.any():
             return 0.0
-        return float(np.ptp(self.angle_rad[moved, joint]))
+        return float(np.ptp(self.angle_rad[moved, joint_index]))
 
-    def find_axis_component(self, joint: int) -> int:
+    def find_axis_component(self, joint_index: int) -> int:
         """Return which component of a vector in a link's frame is about the joint's axis."""
-        return YAW if self.axes[joint] == "yaw" else PITCH
+        return YAW if self.axes[joint_index] == "yaw" else PITCH
 
 
 def read_imus(record: RunRecord) -> Iterable[Imu]:

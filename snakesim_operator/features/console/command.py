@@ -122,20 +122,22 @@ def _prepare_process() -> None:
 
 @contextlib.contextmanager
 def _run_front_server(
-    port: int | None, link: ConnectionSettings | None, stop_event: threading.Event
+    port: int | None, connection: ConnectionSettings | None, stop_event: threading.Event
 ) -> Iterator[ConsolePorts]:
     """Run the front server as a child process for the duration of a `with` block, and print the page's address.
 
     Args:
         port: Port of the page; None for the default port, or any free one.
-        link: Addresses with which the robot is reached; None for a recording.
+        connection: Addresses with which the robot is reached; None for a recording.
         stop_event: Set when the front server ends, because the pages cannot be reached then.
 
     Raises:
         NotConnectedError: The port is in use, or the front server has ended.
     """
     with open_console_ports(port) as ports:
-        front = start_console_front(ports, link, lambda output: print_line(output.decode(errors="replace").rstrip()))
+        front = start_console_front(
+            ports, connection, lambda output: print_line(output.decode(errors="replace").rstrip())
+        )
         print_line(f"console: {ports.address}")
         ports.browsers.close()  # the front server has its own copy
         start_restarting_thread("console front watch", partial(_set_after_exit, front, stop_event))
@@ -156,12 +158,12 @@ def _set_after_exit(child: children.ChildProcess, event: threading.Event) -> Non
     event.set()
 
 
-def _find_surroundings(link: ConnectionSettings):
+def _find_surroundings(connection: ConnectionSettings):
     """Return the true surroundings of a robot that runs on this computer, from its configuration; None for others."""
     from snakesim_operator.features.console.scene.drawing import TrueSurroundings
 
     for robot in list_local_robots():
-        is_same_robot = (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace)
+        is_same_robot = (robot.endpoint, robot.namespace) == (connection.endpoint, connection.namespace)
         if is_same_robot and robot.config is not None:
             try:
                 return TrueSurroundings(read_config(Path(robot.config)))

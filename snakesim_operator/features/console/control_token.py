@@ -19,17 +19,17 @@ class ControlToken:
         """The viewer in control, if any."""
         return self._holder
 
-    def acquire(self, viewer: int) -> bool:
+    def acquire(self, viewer_id: int) -> bool:
         """Acquire the token if it is free, and return whether the viewer has it now."""
         with self._lock:
             if self._holder is None:
-                self._holder = viewer
-            return self._holder == viewer
+                self._holder = viewer_id
+            return self._holder == viewer_id
 
-    def release(self, viewer: int) -> bool:
+    def release(self, viewer_id: int) -> bool:
         """Release the token, and return whether the viewer had it."""
         with self._lock:
-            had_token = self._holder == viewer
+            had_token = self._holder == viewer_id
             if had_token:
                 self._holder = None
             return had_token

@@ -63,11 +63,11 @@ class RobotOperations:
     SnakesimError when the robot refuses, or does not answer.
     """
 
-    def __init__(self, link: ConnectionSettings, log: PageLog) -> None:
-        self.link = link
-        self._selection = RobotSelection(link.endpoint, link.namespace, link.session)
+    def __init__(self, connection: ConnectionSettings, log: PageLog) -> None:
+        self.link = connection
+        self._selection = RobotSelection(connection.endpoint, connection.namespace, connection.session)
         self._log = log
-        self.stop = PreparedStop(self._selection, link, self._log_stop)
+        self.stop = PreparedStop(self._selection, connection, self._log_stop)
         # Known once the console is connected.
         self._session: Session | None = None
         self._intent_publisher: Publisher[LocomotionIntent] | None = None

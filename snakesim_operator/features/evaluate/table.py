@@ -203,7 +203,7 @@ def find_worst_failures(cases: Sequence[EvaluationCase], outcome_by_id: Results)
     return [(case, _describe_end(outcome_by_id[case.id])) for case in failed[:MAX_LISTED_FAILURES]]
 
 
-def compute_wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+def compute_wilson_interval(success_count: int, trial_count: int) -> tuple[float, float]:
     """Return the 95 % confidence interval of a success rate.
 
     With p = successes / n, n trials and z = 1.96:
@@ -212,12 +212,12 @@ def compute_wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
     Source: Wilson (1927), "Probable inference, the law of succession, and statistical inference".
     """
-    if trials == 0:
+    if trial_count == 0:
         return 0.0, 1.0
-    p = successes / trials
-    z2_by_n = Z95**2 / trials
+    p = success_count / trial_count
+    z2_by_n = Z95**2 / trial_count
     center = (p + z2_by_n / 2) / (1 + z2_by_n)
-    half_width = Z95 * math.sqrt(p * (1 - p) / trials + z2_by_n / (4 * trials)) / (1 + z2_by_n)
+    half_width = Z95 * math.sqrt(p * (1 - p) / trial_count + z2_by_n / (4 * trial_count)) / (1 + z2_by_n)
     return max(center - half_width, 0.0), min(center + half_width, 1.0)
 
 

@@ -196,18 +196,23 @@ def _draw_joint_signals(
     return figure
 
 
-def _plot_angle(axes: Axes, record: RunRecord, joint: int) -> None:
-    plot_over_time(axes, record, record.angle_rad[:, joint], "measured", color=MEASURED_COLOR)
+def _plot_angle(axes: Axes, record: RunRecord, joint_index: int) -> None:
+    plot_over_time(axes, record, record.angle_rad[:, joint_index], "measured", color=MEASURED_COLOR)
     plot_over_time(
-        axes, record, compute_reference_rad(record, joint), "reference", color=REFERENCE_COLOR, linestyle="--"
+        axes, record, compute_reference_rad(record, joint_index), "reference", color=REFERENCE_COLOR, linestyle="--"
     )
     axes.set_ylabel("angle [rad]")
 
 
-def _plot_torque(axes: Axes, record: RunRecord, joint: int) -> None:
-    plot_over_time(axes, record, record.torque_nm[:, joint], "measured", color=MEASURED_COLOR)
+def _plot_torque(axes: Axes, record: RunRecord, joint_index: int) -> None:
+    plot_over_time(axes, record, record.torque_nm[:, joint_index], "measured", color=MEASURED_COLOR)
     plot_over_time(
-        axes, record, select_commanded_torque_nm(record, joint), "commanded", color=REFERENCE_COLOR, linestyle="--"
+        axes,
+        record,
+        select_commanded_torque_nm(record, joint_index),
+        "commanded",
+        color=REFERENCE_COLOR,
+        linestyle="--",
     )
     axes.set_ylabel("torque [N·m]")
 

@@ -45,17 +45,17 @@ class CommandThread:
     """Holds the lease of the robot from `start` to `stop`. The limiter of the host limits each command."""
 
     def __init__(
-        self, link: ConnectionSettings, robot: RobotDescription, plan: MotionPlan, center_rad: float | None
+        self, connection: ConnectionSettings, robot: RobotDescription, plan: MotionPlan, center_rad: float | None
     ) -> None:
         """Prepare to command a robot with one joint.
 
         Args:
-            link: How the host is reached.
+            connection: How the host is reached.
             robot: Description of the robot.
             plan: First motion once the robot is armed.
             center_rad: Angle from which offsets count; None: the first angle that is measured.
         """
-        self._link = link
+        self._link = connection
         self._robot = robot
         self._thread = threading.Thread(target=self._run, name="qualification", daemon=True)
         self._stop_event = threading.Event()

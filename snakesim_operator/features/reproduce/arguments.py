@@ -48,7 +48,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
         arguments.names,
         arguments.out,
         seeds=arguments.seeds,
-        workers=arguments.workers,
+        worker_count=arguments.workers,
         is_quick=arguments.quick,
         as_json=arguments.json,
     )

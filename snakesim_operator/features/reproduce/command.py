@@ -25,7 +25,7 @@ def list_experiments(*, as_json: bool) -> int:
 
 
 def reproduce(
-    names: Sequence[str], out: Path | None, *, seeds: int, workers: int | None, is_quick: bool, as_json: bool
+    names: Sequence[str], out: Path | None, *, seeds: int, worker_count: int | None, is_quick: bool, as_json: bool
 ) -> int:
     """Run experiments, and print what they found.
 
@@ -33,7 +33,7 @@ def reproduce(
         names: Names of experiments, or `all`.
         out: Folder for a picture of each; None: write none.
         seeds: Seeds of experiments whose result depends on it.
-        workers: Processes that run the simulator; None: one for each core.
+        worker_count: Processes that run the simulator; None: one for each core.
         is_quick: Whether to make fewer runs.
         as_json: Whether to print one line of JSON for all.
 
@@ -45,7 +45,7 @@ def reproduce(
     """
     experiments = select_experiments(names)
     records = []
-    for experiment, findings in run_experiments(experiments, seeds=seeds, workers=workers, is_quick=is_quick):
+    for experiment, findings in run_experiments(experiments, seeds=seeds, worker_count=worker_count, is_quick=is_quick):
         if as_json:
             records.append(make_record(experiment, findings))
         else:
@@ -62,10 +62,10 @@ def reproduce(
 
 
 def run_experiments(
-    experiments: Sequence[Experiment], *, seeds: int, workers: int | None, is_quick: bool = False
+    experiments: Sequence[Experiment], *, seeds: int, worker_count: int | None, is_quick: bool = False
 ) -> Iterator[tuple[Experiment, ExperimentFindings]]:
     """Run experiments one after the other, and yield what each found."""
-    with WorkerPool(workers) as pool:
+    with WorkerPool(worker_count) as pool:
         trials = ExperimentTrials(pool, seeds, is_quick=is_quick)
         for experiment in experiments:
             yield experiment, experiment.run(trials)

@@ -55,7 +55,7 @@ class GaitRun:
 
 
 def make_serpenoid_run(
-    winding_angle_rad: float, wavelength: float, period_s: float, friction: Sequence[str], modules: int = LINKS - 1
+    winding_angle_rad: float, wavelength: float, period_s: float, friction: Sequence[str], module_count: int = LINKS - 1
 ) -> GaitRun:
     """Return a run of Hirose's serpenoid curve without directional control.
 
@@ -64,10 +64,10 @@ def make_serpenoid_run(
         wavelength: Length of a wave in body lengths.
         period_s: Period of the wave.
         friction: Settings of the friction.
-        modules: Number of joints.
+        module_count: Number of joints.
     """
     settings = (
-        f"robot.chain.modules={modules}",
+        f"robot.chain.modules={module_count}",
         "controller=serpenoid",
         "control.k_theta=0",
         f"control.winding_angle_rad={winding_angle_rad:.6g}",

@@ -54,9 +54,9 @@ class RobotFrames:
             RosTransform(self.base, self.get_link_frame(0), ORIGIN, NO_ROTATION),
         ]
 
-    def get_link_frame(self, link: int) -> str:
+    def get_link_frame(self, link_index: int) -> str:
         """Return the frame name of a link."""
-        return self._prefix + self._robot.links[link].name
+        return self._prefix + self._robot.links[link_index].name
 
     def get_optical_frame(self, kind: str, camera: str) -> str:
         """Return the frame name of a camera's images. `kind` is `depth` or `color`."""
@@ -66,14 +66,14 @@ class RobotFrames:
         """Return the frame name of a lidar, a range finder or a custom sensor."""
         return f"{self._prefix}{make_ros_name(sensor)}_frame"
 
-    def get_imu_frame(self, link: int) -> str:
+    def get_imu_frame(self, link_index: int) -> str:
         """Return the frame name of the IMU on a link."""
-        return f"{self.get_link_frame(link)}_imu_frame"
+        return f"{self.get_link_frame(link_index)}_imu_frame"
 
-    def make_imu_transform(self, link: int) -> RosTransform:
+    def make_imu_transform(self, link_index: int) -> RosTransform:
         """Return the pose of an IMU, which sits in the middle of its link."""
-        middle = (self._robot.links[link].length_m / 2, 0.0, 0.0)
-        return RosTransform(self.get_link_frame(link), self.get_imu_frame(link), middle, NO_ROTATION)
+        middle = (self._robot.links[link_index].length_m / 2, 0.0, 0.0)
+        return RosTransform(self.get_link_frame(link_index), self.get_imu_frame(link_index), middle, NO_ROTATION)
 
     def make_base_transform(self, pose: WorldModel | Pose) -> RosTransform:
         """Return the pose of the base in `odom`."""

@@ -105,9 +105,9 @@ def _connect_to_ros(endpoint: str, cleanup: contextlib.ExitStack) -> ForeignNetw
 
 
 def _make_servers(
-    session: Session, node: RosNode, link: ConnectionSettings, prefix: str, *, operate: bool
+    session: Session, node: RosNode, connection: ConnectionSettings, prefix: str, *, operate: bool
 ) -> list[ServiceServer]:
-    operating_servers = make_operating_servers(session, node, link, prefix, operate=operate)
+    operating_servers = make_operating_servers(session, node, connection, prefix, operate=operate)
     parameter_servers = make_parameter_servers(session, node, f"/{prefix}{NODE_NAME}", operate=operate)
     return operating_servers + parameter_servers
 

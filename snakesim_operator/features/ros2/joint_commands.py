@@ -100,15 +100,15 @@ class RosJointTargets:
             targets[i] = self._hold_angle_rad(i, joints)
         return RequestedSetpoints(modes, targets, self._torque_limits_nm)
 
-    def _hold_angle_rad(self, joint: int, joints: JointState) -> float:
+    def _hold_angle_rad(self, joint_index: int, joints: JointState) -> float:
         """Return the angle in rad that a joint had when it began to hold.
 
         The angle stays, because a joint that held its present angle in each cycle would sink under its load.
         """
-        held_rad = self._held_angles_rad[joint]
+        held_rad = self._held_angles_rad[joint_index]
         if held_rad is None:
-            held_rad = joints.angle_rad[joint]
-            self._held_angles_rad[joint] = held_rad
+            held_rad = joints.angle_rad[joint_index]
+            self._held_angles_rad[joint_index] = held_rad
         return held_rad
 
     def _decode_command(self, payload: bytes) -> _FollowableCommand:

@@ -78,9 +78,9 @@ def _explain_late_arm_request(attachment: bytes) -> str:
 class _RobotOperator:
     """Sends the requests of the services to the robot. Each method returns the robot's answer in words."""
 
-    def __init__(self, session: Session, link: ConnectionSettings) -> None:
+    def __init__(self, session: Session, connection: ConnectionSettings) -> None:
         self._session = session
-        self._link = link
+        self._link = connection
 
     def stop(self) -> str:
         """Stop the robot by `snakesim estop`. Raises RefusedError if the robot does not confirm it."""

@@ -344,23 +344,23 @@ def _compare_quantity(
 
 
 def _find_max_difference(
-    joint: int, time_s: Floats, a: Floats, b: Floats, known: NDArray[np.bool_]
+    joint_index: int, time_s: Floats, a: Floats, b: Floats, known: NDArray[np.bool_]
 ) -> MaxDifference | None:
     """Find the largest difference of one joint; None if no value of the joint is known in both runs.
 
     Args:
-        joint: Index of the joint.
+        joint_index: Index of the joint.
         time_s: (n,) common times, in s.
         a: (n, joints) values in A.
         b: (n, joints) values in B.
         known: (n, joints) whether the value is known in both runs.
     """
-    known_rows = np.flatnonzero(known[:, joint])
+    known_rows = np.flatnonzero(known[:, joint_index])
     if not len(known_rows):
         return None
-    squares = (b[known_rows, joint] - a[known_rows, joint]) ** 2
+    squares = (b[known_rows, joint_index] - a[known_rows, joint_index]) ** 2
     row = known_rows[np.argmax(squares)]
-    return MaxDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
+    return MaxDifference(joint_index, float(time_s[row]), float(a[row, joint_index]), float(b[row, joint_index]))
 
 
 def _compute_correlation(a: Floats, b: Floats) -> float | None:

@@ -50,7 +50,7 @@ def draw_difference_map(difference: RunDifference, gap: QuantityDifference) -> P
 
 
 def draw_joint_in_both_runs(
-    difference: RunDifference, gap: QuantityDifference, a: Floats, b: Floats, joint: int
+    difference: RunDifference, gap: QuantityDifference, a: Floats, b: Floats, joint_index: int
 ) -> PlotlyDict:
     """Draw one quantity of one joint in both runs over time, with a marker at the largest difference.
 
@@ -59,15 +59,18 @@ def draw_joint_in_both_runs(
         gap: Differences of the quantity.
         a: (n, joints) values of the quantity in A.
         b: (n, joints) values of the quantity in B.
-        joint: Index of the joint.
+        joint_index: Index of the joint.
     """
     time_s = difference.aligned.time_s
-    worst = gap.max_difference_by_joint[joint]
-    drawn = [ChartLine("A", time_s, a[:, joint], COLOR_A, width=3.5), ChartLine("B", time_s, b[:, joint], COLOR_B)]
+    worst = gap.max_difference_by_joint[joint_index]
+    drawn = [
+        ChartLine("A", time_s, a[:, joint_index], COLOR_A, width=3.5),
+        ChartLine("B", time_s, b[:, joint_index], COLOR_B),
+    ]
     marks: list[TimeMarker] = []
     if worst is not None and worst.difference:
         marks.append(TimeMarker(worst.time_s, "worst"))
-    label = f"{gap.quantity.capitalize()} of {difference.joints[joint]} in both runs"
+    label = f"{gap.quantity.capitalize()} of {difference.joints[joint_index]} in both runs"
     return make_line_chart(label, f"{gap.quantity}, {gap.unit}", drawn, float(time_s[-1]), markers=marks)
 
 

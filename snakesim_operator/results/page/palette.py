@@ -73,10 +73,10 @@ def make_joint_colors(count: int, *, dark: bool) -> dict[str, str]:
     return colors
 
 
-def make_theme_css(joints: int) -> str:
+def make_theme_css(joint_count: int) -> str:
     """Make the CSS rules with the colors of both themes as variables. A printed page is always light."""
-    light = LIGHT | make_joint_colors(joints, dark=False)
-    dark = DARK | make_joint_colors(joints, dark=True)
+    light = LIGHT | make_joint_colors(joint_count, dark=False)
+    dark = DARK | make_joint_colors(joint_count, dark=True)
     return (
         f":root{{{format_css_variables(light)}}}@media screen and (prefers-color-scheme:dark)"
         f"{{:root:not(.paper){{{format_css_variables(dark)}}}}}"

@@ -41,9 +41,9 @@ def mark_faults(record: RunRecord) -> list[TimeMarker]:
     return marks
 
 
-def get_joint_color(joint: int) -> str:
+def get_joint_color(joint_index: int) -> str:
     """Return the CSS variable with the color of a joint, by its index."""
-    return f"--joint-{joint}"
+    return f"--joint-{joint_index}"
 
 
 def draw_advance(record: RunRecord, moved: TimelineSeries) -> PlotlyDict:
@@ -86,32 +86,32 @@ def draw_states_and_propulsion(record: RunRecord, intervals: list[PropulsionInte
     )
 
 
-def draw_joint_angle(record: RunRecord, joint: int, intervals: list[PropulsionInterval]) -> PlotlyDict:
+def draw_joint_angle(record: RunRecord, joint_index: int, intervals: list[PropulsionInterval]) -> PlotlyDict:
     """Draw the measured angle of a joint and its reference (Fig. 12 of the paper), shaded while it propelled."""
     drawn = [
-        _make_line(record, "measured", record.angle_rad[:, joint], get_joint_color(joint)),
-        _make_line(record, "reference", compute_reference_rad(record, joint), "--ink", "dot"),
+        _make_line(record, "measured", record.angle_rad[:, joint_index], get_joint_color(joint_index)),
+        _make_line(record, "reference", compute_reference_rad(record, joint_index), "--ink", "dot"),
     ]
-    label = f"Angle of {record.description.joints[joint].name} over time"
-    return _make_line_chart_of_run(record, label, "angle, rad", drawn, shades=_shade_propulsion(intervals, joint))
+    label = f"Angle of {record.description.joints[joint_index].name} over time"
+    return _make_line_chart_of_run(record, label, "angle, rad", drawn, shades=_shade_propulsion(intervals, joint_index))
 
 
-def draw_joint_torque(record: RunRecord, joint: int, intervals: list[PropulsionInterval]) -> PlotlyDict:
+def draw_joint_torque(record: RunRecord, joint_index: int, intervals: list[PropulsionInterval]) -> PlotlyDict:
     """Draw the measured and the commanded torque of a joint, and the torque limits (Fig. 13 of the paper)."""
-    limit_nm = record.description.joints[joint].torque_limit_nm
-    controller_limit_nm = record.torque_limit_nm[:, joint]
+    limit_nm = record.description.joints[joint_index].torque_limit_nm
+    controller_limit_nm = record.torque_limit_nm[:, joint_index]
     lowered_nm = np.where(controller_limit_nm < LOWERED_FRACTION * limit_nm, controller_limit_nm, np.nan)
     drawn = [
-        _make_line(record, "measured", record.torque_nm[:, joint], get_joint_color(joint)),
-        _make_line(record, "commanded", select_commanded_torque_nm(record, joint), "--ink", "dot"),
+        _make_line(record, "measured", record.torque_nm[:, joint_index], get_joint_color(joint_index)),
+        _make_line(record, "commanded", select_commanded_torque_nm(record, joint_index), "--ink", "dot"),
     ]
     if np.isfinite(lowered_nm).any():
         for signed_limit_nm in (lowered_nm, -lowered_nm):
             drawn.append(_make_line(record, "limit set by the controller", signed_limit_nm, "--faint", "dot", 1.0))
-    label = f"Torque of {record.description.joints[joint].name} over time"
+    label = f"Torque of {record.description.joints[joint_index].name} over time"
     levels = [(limit_nm, "limit of the joint"), (-limit_nm, "")]
     return _make_line_chart_of_run(
-        record, label, "torque, N·m", drawn, levels=levels, shades=_shade_propulsion(intervals, joint)
+        record, label, "torque, N·m", drawn, levels=levels, shades=_shade_propulsion(intervals, joint_index)
     )
 
 
@@ -168,6 +168,6 @@ def _make_line_chart_of_run(
     return make_line_chart(label, axis, drawn, get_run_end_s(record), markers=mark_faults(record), **chart_options)
 
 
-def _shade_propulsion(intervals: list[PropulsionInterval], joint: int) -> list[ChartBar]:
-    of_joint = [interval for interval in intervals if interval.joint_index == joint]
-    return [ChartBar("", interval.start_s, interval.end_s, "", get_joint_color(joint)) for interval in of_joint]
+def _shade_propulsion(intervals: list[PropulsionInterval], joint_index: int) -> list[ChartBar]:
+    of_joint = [interval for interval in intervals if interval.joint_index == joint_index]
+    return [ChartBar("", interval.start_s, interval.end_s, "", get_joint_color(joint_index)) for interval in of_joint]

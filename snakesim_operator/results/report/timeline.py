@@ -122,21 +122,21 @@ def find_most_propelling_joints(intervals: list[PropulsionInterval], max_count: 
     return sorted(longest, reverse=True)
 
 
-def compute_reference_rad(record: RunRecord, joint: int) -> Floats:
+def compute_reference_rad(record: RunRecord, joint_index: int) -> Floats:
     """Return the reference angle of a joint, (n,): its target in position mode, else as the controller reported it."""
     reference = np.full(len(record.time_s), np.nan)
-    states = [state for state in record.control_states if len(state.reference_rad) > joint]
+    states = [state for state in record.control_states if len(state.reference_rad) > joint_index]
     if states:
         timestamps_s = np.array([state.timestamp_ns * 1e-9 for state in states])
-        angles = np.array([state.reference_rad[joint] for state in states])
+        angles = np.array([state.reference_rad[joint_index] for state in states])
         reference = np.interp(record.time_s, timestamps_s, angles, left=np.nan, right=angles[-1])
-    in_position = record.mode[:, joint] == JointMode.POSITION
-    return np.where(in_position, record.target[:, joint], reference)
+    in_position = record.mode[:, joint_index] == JointMode.POSITION
+    return np.where(in_position, record.target[:, joint_index], reference)
 
 
-def select_commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
+def select_commanded_torque_nm(record: RunRecord, joint_index: int) -> Floats:
     """Return the commanded torque of a joint in torque mode, (n,); NaN in all other modes."""
-    return np.where(record.mode[:, joint] == JointMode.TORQUE, record.target[:, joint], np.nan)
+    return np.where(record.mode[:, joint_index] == JointMode.TORQUE, record.target[:, joint_index], np.nan)
 
 
 @lru_cache(maxsize=2)  # chart and comparison of two runs need the same series

@@ -71,7 +71,7 @@ class TeleopLoop:
     def __init__(
         self,
         session: Session,
-        link: ConnectionSettings,
+        connection: ConnectionSettings,
         max_speed_m_s: float,
         keyboard: KeyReader | None,
         stick: Joystick | None,
@@ -80,13 +80,13 @@ class TeleopLoop:
 
         Args:
             session: Session on the robot's network.
-            link: How to reach the robot.
+            connection: How to reach the robot.
             max_speed_m_s: Maximum speed along the path.
             keyboard: Reads keys from the terminal. None if there is no terminal.
             stick: The joystick. None if there is none.
         """
         # The operator.
-        self._link = link
+        self._link = connection
         self._keyboard = keyboard
         self._stick = stick
         self._user = f"{get_user_name()[:40]}, teleop {os.getpid()}"  # with the process id: one user may run two
@@ -116,7 +116,9 @@ class TeleopLoop:
         self._other_user = ""
 
         # The emergency stop, which is prepared before it is needed.
-        self._prepared_stop = PreparedStop(RobotSelection(link.endpoint, link.namespace, link.session), link)
+        self._prepared_stop = PreparedStop(
+            RobotSelection(connection.endpoint, connection.namespace, connection.session), connection
+        )
         self._prepared_stop.use_session(session)
         self._pending_stop: Future[str] | None = None
 

@@ -21,14 +21,14 @@ class SteeringState:
         self.heading_w_rad: float | None = None  # None: the mission's own goal
         self.last_input_s: float | None = None  # monotonic time of the operator's last input; None: no input yet
 
-    def change_speed(self, steps: int, now_s: float) -> None:
+    def change_speed(self, step_count: int, now_s: float) -> None:
         """Change the requested speed by steps of SPEED_STEP_M_S, within the maximum speed in both directions.
 
         Args:
-            steps: Number of steps; negative steps decrease the speed.
+            step_count: Number of steps; negative steps decrease the speed.
             now_s: Monotonic time of the operator's input.
         """
-        self.set_speed_fraction((self.speed_m_s + steps * SPEED_STEP_M_S) / self._max_speed_m_s, now_s)
+        self.set_speed_fraction((self.speed_m_s + step_count * SPEED_STEP_M_S) / self._max_speed_m_s, now_s)
 
     def set_speed_fraction(self, fraction: float, now_s: float) -> None:
         """Request a fraction of the maximum speed.

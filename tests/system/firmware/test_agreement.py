@@ -70,7 +70,7 @@ def describe_event(frame: CanFrame, time_us: int) -> str:
 def arm_with(parameters: dict[ModuleParameter, float], sensors: str, target: CanFrame) -> list[str]:
     """The events after which a module with some parameters follows a setpoint."""
     events = [f"init {NODE} 7 {RATED_NM} {RATED_RAD_S} 800 1050 18000 0", sensors, f"poll {BOOTED_US}"]
-    events += [describe_event(parameter(index, value, node=NODE), BOOTED_US) for index, value in parameters.items()]
+    events += [describe_event(parameter(index, value, node_id=NODE), BOOTED_US) for index, value in parameters.items()]
     events.append(describe_event(make_command(CommandAction.ARM, NODE), BOOTED_US))
     events.append(describe_event(target, BOOTED_US))
     events.append(describe_event(make_sync(1, 0), BOOTED_US))

@@ -195,8 +195,8 @@ def test_the_number_of_threads_changes_no_bit(count: int) -> None:
     case = CASES["positions among obstacles"]
     digests: set[tuple[str, ...]] = set()
     seen: set[bytes] = set()
-    for threads in (1, 2, 4):
-        envs = make_many(case, count, threads=threads, duration=0.2)
+    for thread_count in (1, 2, 4):
+        envs = make_many(case, count, thread_count=thread_count, duration=0.2)
         actions = draw_actions(make(case), seed=1)
         envs.reset(seed=1)
         for _ in range(3):
@@ -326,7 +326,7 @@ def test_wrappers_of_gymnasium_accept_it() -> None:
     assert [info["ended"] for info in infos] == ["time", "time"] and infos[0]["episode"]["l"] == 2
 
 
-WRONG = [{"num_envs": 0}, {"num_envs": 2.0}, {"threads": 0}, {"threads": 1.5}, {"autoreset_mode": "sometimes"}]
+WRONG = [{"num_envs": 0}, {"num_envs": 2.0}, {"thread_count": 0}, {"thread_count": 1.5}, {"autoreset_mode": "sometimes"}]
 
 
 @pytest.mark.parametrize("given", WRONG)

@@ -82,7 +82,7 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
         (msgspec.structs.replace(make_joint_state(ROBOT, 0.1), angle_rad=[0.0] * 13), "wrong_length"),
         (msgspec.structs.replace(make_joint_state(ROBOT, 0.1), valid=[]), "wrong_length"),
         (make_power(), None),
-        (make_power(joints=4), "wrong_length"),
+        (make_power(joint_count=4), "wrong_length"),
         (imu([0, 3], 2), None),
         (imu([], 0), None),
         (imu([0, 4], 2), "wrong_length"),

@@ -90,10 +90,15 @@ def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None
 
 def test_what_is_not_there_cannot_go_wrong() -> None:
     validate_injection_targets(
-        [parse_injection("mute:joint_13@1"), parse_injection("kill:host@1")], services=["control"], joints=13, buses=0
+        [parse_injection("mute:joint_13@1"), parse_injection("kill:host@1")],
+        services=["control"],
+        joint_count=13,
+        bus_count=0,
     )
     with raises_error(ConfigError, code="injection/unknown-target"):
-        validate_injection_targets([parse_injection("drop:guidance/world@1")], services=["control"], joints=13, buses=0)
+        validate_injection_targets(
+            [parse_injection("drop:guidance/world@1")], services=["control"], joint_count=13, bus_count=0
+        )
 
 
 def test_a_request_is_checked_like_a_text() -> None:
@@ -141,7 +146,7 @@ def test_a_runs_plan_names_the_entry_that_is_wrong() -> None:
 
 
 def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
-    backend = {"supported_kinds": ("leak",), "buses": 1, "reason": "it is a toy"}
+    backend = {"supported_kinds": ("leak",), "bus_count": 1, "reason": "it is a toy"}
     validate_faults_for_backend(
         make_run_config(faults=["leak:joint_1@1", "mute:joint_1@1", "slow:simulator@1"]), **backend
     )

@@ -18,11 +18,11 @@ READY_S = 30.0
 
 @contextmanager
 def flood(
-    folder: Path, kind: str, endpoint: str, amount: int, processes: int = 1
+    folder: Path, kind: str, endpoint: str, amount: int, process_count: int = 1
 ) -> Iterator[list[subprocess.Popen[bytes]]]:
     """So many processes of one kind of `verification.attack.means.flooder`, at work; killed at the end."""
     command = [sys.executable, "-m", "verification.attack.means.flooder", kind, endpoint, str(amount)]
-    logs = [folder / f"{kind}-{i}.printed" for i in range(processes)]
+    logs = [folder / f"{kind}-{i}.printed" for i in range(process_count)]
     with contextlib.ExitStack() as stack:
         started: list[subprocess.Popen[bytes]] = []
         for log in logs:
@@ -42,13 +42,13 @@ def flood(
 
 
 @contextmanager
-def half_sent(console: str, count: int, processes: int) -> Iterator[None]:
+def half_sent(console: str, count: int, process_count: int) -> Iterator[None]:
     """Half-sent HTTP requests at a console, so many of each process, held open for as long as the context lives."""
     host, port = address(origin_of(console).replace("http://", "tcp/"))
     command = [sys.executable, "-m", "verification.attack.means.half_sent", host, str(port), str(count)]
     with contextlib.ExitStack() as stack:
         started: list[subprocess.Popen[bytes]] = []
-        for _ in range(processes):
+        for _ in range(process_count):
             process = subprocess.Popen(command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             started.append(stack.enter_context(process))
             stack.callback(process.kill)

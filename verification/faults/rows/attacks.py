@@ -24,8 +24,8 @@ STANDING = {"controller": "hold", "rate_hz": 50}
 Flood = Callable[[ProcessRobot], AbstractContextManager[object]]
 
 
-def _flooding(kind: str, amount: int, processes: int) -> Flood:
-    return lambda started_robot: flood(started_robot.folder, kind, started_robot.endpoint, amount, processes)
+def _flooding(kind: str, amount: int, process_count: int) -> Flood:
+    return lambda started_robot: flood(started_robot.folder, kind, started_robot.endpoint, amount, process_count)
 
 
 FLOODS: dict[str, Flood] = {

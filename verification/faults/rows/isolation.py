@@ -33,11 +33,13 @@ def set_aside(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial
             yield recovered(observer, value, "; ".join(failures))
 
 
-def _let_go(observer: Observer, joint: int, since_ns: int) -> ReceivedMessage[AppliedCommand]:
+def _let_go(observer: Observer, joint_index: int, since_ns: int) -> ReceivedMessage[AppliedCommand]:
     """The first setpoints without the joint; by the controller, not by the host alone."""
 
     def found() -> list[ReceivedMessage[AppliedCommand]]:
-        passive = (h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint] is JointMode.PASSIVE)
+        passive = (
+            h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint_index] is JointMode.PASSIVE
+        )
         return [received for received in passive if received.message.sequence is not None]
 
     return observer.until(found, "the joint is let go", 3.0)[0]

@@ -74,9 +74,9 @@ def _prepare_stop(arguments: argparse.Namespace) -> PreparedStop:
     return stop
 
 
-def _keep_session(stop: PreparedStop, link: ConnectionSettings) -> None:
+def _keep_session(stop: PreparedStop, connection: ConnectionSettings) -> None:
     """Give the stop a network session, for as long as this process lives."""
-    with open_session(link, SERVICE_START_LIMIT_S) as session:
+    with open_session(connection, SERVICE_START_LIMIT_S) as session:
         stop.use_session(session)
         threading.Event().wait()
 

@@ -79,11 +79,11 @@ class CommissioningTab:
             self._step_output = gui.add_html("", order=1)
             self._terminal_commands = gui.add_html("", order=3)
 
-    def start_step(self, viewer: int, step_name: str, joint_name: str | None, options: list[str]) -> str:
+    def start_step(self, viewer_id: int, step_name: str, joint_name: str | None, options: list[str]) -> str:
         """Start a commissioning step as a command in a process of its own, whose output the page shows.
 
         Args:
-            viewer: Client id of the viewer in control, from 0.
+            viewer_id: Client id of the viewer in control, from 0.
             step_name: Name of the step, a key of `DESCRIPTION_BY_STEP`.
             joint_name: Name of the joint to commission; None for all joints.
             options: Further words of the command line.
@@ -108,17 +108,17 @@ class CommissioningTab:
                 )
             robot_flags = shlex.split(make_robot_flags(self._connection, None))  # None: without the robot's name
             self._step = JointStep([step_name, str(self.robot_file), *joint_names, *options, *robot_flags])
-            self._viewer = viewer
+            self._viewer = viewer_id
             self._last_keypress_time_s = time.monotonic()
             self._measured_ranges = []
         command = " ".join([format_command_name(step_name), *joint_names])
-        self._log.write(f"viewer {viewer + 1}: {command}")  # viewers are shown from 1
+        self._log.write(f"viewer {viewer_id + 1}: {command}")  # viewers are shown from 1
         return command
 
-    def press_key(self, viewer: int, key: bytes) -> None:
+    def press_key(self, viewer_id: int, key: bytes) -> None:
         """Send a key to the running step, if the viewer that started the step presses it and is still in control."""
         step = self._step
-        if step is None or viewer != self._viewer or self._token.holder != viewer:
+        if step is None or viewer_id != self._viewer or self._token.holder != viewer_id:
             return
         if _accepts_key(step, key):
             self._last_keypress_time_s = time.monotonic()

@@ -195,10 +195,10 @@ class ConsolePage:
         self._log.write(line)
         self._on_control_changed()
 
-    def _forget_viewer(self, viewer: int) -> None:
+    def _forget_viewer(self, viewer_id: int) -> None:
         if self._viewers is not None:
-            self._viewers.remove(viewer)
-        self._server.admission.remove_viewer(viewer)
+            self._viewers.remove(viewer_id)
+        self._server.admission.remove_viewer(viewer_id)
 
     def _on_control_changed(self) -> None:
         if self._viewers is not None:

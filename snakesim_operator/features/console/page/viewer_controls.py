@@ -363,6 +363,6 @@ class ViewerControls:
             self._operation_slots.release()
 
 
-def format_viewer(viewer: int | None) -> str:
+def format_viewer(viewer_id: int | None) -> str:
     """Return the name of a viewer; None is no viewer."""
-    return "no viewer" if viewer is None else f"viewer {viewer + 1}"
+    return "no viewer" if viewer_id is None else f"viewer {viewer_id + 1}"

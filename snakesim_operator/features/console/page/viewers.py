@@ -43,10 +43,10 @@ class Viewers:
                 controls.show_parameters(snapshot.parameters)
             self._controls[client.client_id] = controls
 
-    def remove(self, viewer: int) -> None:
+    def remove(self, viewer_id: int) -> None:
         """Forget the controls of a viewer."""
         with self._lock:
-            self._controls.pop(viewer, None)
+            self._controls.pop(viewer_id, None)
 
     def refresh(self) -> None:
         """Show each viewer the controls that it may use now."""
@@ -73,13 +73,13 @@ class Viewers:
 
     # --- messages of browsers --------------------------------------------------------------------------------
 
-    def stop_robot(self, viewer: int, _action: PageAction) -> None:
+    def stop_robot(self, viewer_id: int, _action: PageAction) -> None:
         """Stop the robot, however old the press is, and whichever viewer has control.
 
         A page that cannot draw the scene has no controls, but may stop the robot.
         """
-        stopped = self._context.operations.stop.request_stop(format_viewer(viewer))
-        controls = self._controls.get(viewer)  # without the lock: the thread that holds it may wait for this one
+        stopped = self._context.operations.stop.request_stop(format_viewer(viewer_id))
+        controls = self._controls.get(viewer_id)  # without the lock: the thread that holds it may wait for this one
         if controls is not None:
             stopped.add_done_callback(partial(self._show_stop_result, controls))
 
@@ -91,9 +91,9 @@ class Viewers:
             else:
                 controls.notify("Emergency stop", stopped.result())
 
-    def on_drive_key(self, key_name: str, viewer: int, action: PageAction) -> None:
+    def on_drive_key(self, key_name: str, viewer_id: int, action: PageAction) -> None:
         """Drive the robot by a key of a viewer."""
-        controls = self._controls.get(viewer)  # without the lock, as in `stop_robot`
+        controls = self._controls.get(viewer_id)  # without the lock, as in `stop_robot`
         if controls is not None:
             controls.drive_controls.on_key(key_name, action)
 

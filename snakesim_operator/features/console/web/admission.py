@@ -128,7 +128,7 @@ class ControlAdmission:
     def admit_control(
         self,
         handle: HandleT,
-        viewer: int | None = None,
+        viewer_id: int | None = None,
         is_allowed: Callable[[], bool] = lambda: True,
         hold_hz: float = 0.0,
         *,
@@ -141,7 +141,7 @@ class ControlAdmission:
 
         Args:
             handle: The control.
-            viewer: The only viewer that may use the control; None for every viewer.
+            viewer_id: The only viewer that may use the control; None for every viewer.
             is_allowed: Returns whether the control may be used now.
             hold_hz: Rate at which the page repeats that a button is held; 0 for other controls.
             handler: Called for each message that is admitted, in the thread that receives: it must not wait. None:
@@ -163,7 +163,7 @@ class ControlAdmission:
             name = type(handle).__name__
         admitted = _AdmittedControl(
             name=name,
-            viewer=viewer,
+            viewer=viewer_id,
             is_allowed=is_allowed,
             accepts=_make_message_validator(control, hold_hz),
             handler=handler,
@@ -180,70 +180,70 @@ class ControlAdmission:
         with self._lock:
             self._controls.pop(handle._impl.uuid, None)
 
-    def remove_viewer(self, viewer: int) -> None:
+    def remove_viewer(self, viewer_id: int) -> None:
         """Forget all controls of a viewer whose page is closed."""
         with self._lock:
-            self._controls = {uuid: control for uuid, control in self._controls.items() if control.viewer != viewer}
+            self._controls = {uuid: control for uuid, control in self._controls.items() if control.viewer != viewer_id}
 
-    def filter_message(self, viewer: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
+    def filter_message(self, viewer_id: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
         """Check a message of a browser, and handle it here if its control has a handler.
 
         A message is dropped and counted if it cannot be decoded, if its control does not allow it, or if it is too old.
 
         Args:
-            viewer: Client id of the viewer that sent the message; None while viser has not numbered the viewer.
+            viewer_id: Client id of the viewer that sent the message; None while viser has not numbered the viewer.
             data: The message as it was received.
             age: Measures how old the messages of this page are.
 
         Returns:
             The message that is passed on to viser, encoded anew; None if it was dropped or handled here.
         """
-        if viewer is None or isinstance(data, str):
-            self.count_dropped_message(viewer, "no message", "a text, or of no viewer")
+        if viewer_id is None or isinstance(data, str):
+            self.count_dropped_message(viewer_id, "no message", "a text, or of no viewer")
             return None
         try:
             message = self._decoder.decode(data)
         except (msgspec.DecodeError, RecursionError) as error:  # a ValidationError is a DecodeError
-            self.count_dropped_message(viewer, "unknown", str(error))
+            self.count_dropped_message(viewer_id, "unknown", str(error))
             return None
         if isinstance(message, QuestionAnswer):
             age.note_answer(message.request_uuid)
         elif isinstance(message, UpdateMessage | HoldMessage | TriggerMessage):
-            control = self._find_control(viewer, message)
+            control = self._find_control(viewer_id, message)
             if control is None:
                 return None
             action = age.date_action(time.monotonic())
             if control.is_late(message, action):
                 control.on_late(action.age_s)
-                self.count_dropped_message(viewer, "too old", f"{control.name}: {format_age(action.age_s)}")
+                self.count_dropped_message(viewer_id, "too old", f"{control.name}: {format_age(action.age_s)}")
                 return None
             if control.handler is not None:
-                control.handler(viewer, action)
+                control.handler(viewer_id, action)
                 return None
         return msgspec.msgpack.encode(message)
 
-    def _find_control(self, viewer: int, message: ControlMessage) -> _AdmittedControl | None:
+    def _find_control(self, viewer_id: int, message: ControlMessage) -> _AdmittedControl | None:
         """Return the control that a viewer may change now with this message; None if the message was dropped."""
         with self._lock:
             control = self._controls.get(message.uuid)
-        if control is None or control.viewer not in (None, viewer):
-            self.count_dropped_message(viewer, "no control of this viewer", type(message).__name__)
+        if control is None or control.viewer not in (None, viewer_id):
+            self.count_dropped_message(viewer_id, "no control of this viewer", type(message).__name__)
             return None
         if not control.is_allowed():
-            self.count_dropped_message(viewer, "without control of the robot", control.name)
+            self.count_dropped_message(viewer_id, "without control of the robot", control.name)
             return None
         if not control.accepts(message):
-            self.count_dropped_message(viewer, "not what the control is for", f"{control.name}: {message}")
+            self.count_dropped_message(viewer_id, "not what the control is for", f"{control.name}: {message}")
             return None
         return control
 
-    def count_dropped_message(self, viewer: int | None, kind: str, detail: str) -> None:
+    def count_dropped_message(self, viewer_id: int | None, kind: str, detail: str) -> None:
         """Count a message or connection that is not passed on, and report the first of its kind."""
         with self._lock:
             self.dropped[kind] += 1
             is_first = self.dropped[kind] == 1
         if is_first:
-            sender = "a page" if viewer is None else f"viewer {viewer + 1}"
+            sender = "a page" if viewer_id is None else f"viewer {viewer_id + 1}"
             shown = escape_invisible(detail)[:MAX_REPORTED_CHARACTERS]
             self.report(f"dropped a message of {sender}: {kind}: {shown}; more are only counted")
 

@@ -31,9 +31,9 @@ class BrowserConnection:
         self._allowance = MAX_BURST
         self._allowance_time_s = time.monotonic()
 
-    def note_number(self, viewer: int) -> None:
+    def note_number(self, viewer_id: int) -> None:
         """Note the number that viser gave this viewer; from any thread."""
-        self.viewer = viewer
+        self.viewer = viewer_id
         self._loop.call_soon_threadsafe(self._is_numbered.set)
 
     async def wait_for_number(self) -> None:

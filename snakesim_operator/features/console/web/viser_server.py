@@ -68,24 +68,24 @@ class PageServer(viser.ViserServer):
     def _on_viewer_gone(self, client: Any) -> None:
         self._browsers.pop(client.client_id, None)
 
-    def prefers_dark(self, viewer: int) -> bool:
+    def prefers_dark(self, viewer_id: int) -> bool:
         """Return whether a viewer's browser was set to dark pages when it connected."""
-        browser = self._browsers.get(viewer)
+        browser = self._browsers.get(viewer_id)
         return browser is not None and browser.prefers_dark
 
     def count_viewers(self) -> int:
         """Return how many pages are open, also of those that cannot draw the scene."""
         return len(self._browsers)
 
-    def ask_for_age(self, viewer: int, robot_ns: int | None) -> None:
+    def ask_for_age(self, viewer_id: int, robot_ns: int | None) -> None:
         """Send a viewer's page the next question by which the age of its messages is known.
 
         Args:
-            viewer: The viewer to ask.
+            viewer_id: The viewer to ask.
             robot_ns: The robot's time now, if it is known.
         """
-        browser = self._browsers.get(viewer)
-        page = self.get_clients().get(viewer)
+        browser = self._browsers.get(viewer_id)
+        page = self.get_clients().get(viewer_id)
         if browser is None or page is None or not browser.age.may_ask():
             return
         question = uuid.uuid4().hex

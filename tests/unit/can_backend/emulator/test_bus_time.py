@@ -44,7 +44,7 @@ def test_a_module_keeps_its_own_order():
 def test_the_host_s_frames_take_their_time():
     bus = BusTime()
     for node in range(10):
-        bus.record_host_frame(setpoint(0, node=node + 1), 0.0)
+        bus.record_host_frame(setpoint(0, node_id=node + 1), 0.0)
     bus.enqueue(1, frame(Opcode.JOINT_STATE, 1), 0.0)
     assert bus.next_us() == 10 * compute_max_frame_bits(6) + FULL
     for _ in range(10_000):

@@ -105,7 +105,7 @@ def test_chain_two_buses_with_same_sync_share_one_step():
     assert [s["count"] for s in only(made.pop_frames(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
     made.receive(1, make_command(CommandAction.ARM))
     assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
-    made.receive(0, setpoint(0, node=4))
+    made.receive(0, setpoint(0, node_id=4))
     assert made.slots[3].module._pending_demand is None, "node 4 is on the other bus"
 
 

@@ -50,7 +50,7 @@ def served(made: ModuleChain) -> Iterator[Wall]:
 def send_tick(near: VirtualWire, tick: int) -> None:
     near.send(make_sync(tick, 0))
     for node in range(1, JOINTS + 1):
-        near.send(setpoint(tick, JointMode.POSITION, 0.2, node=node))
+        near.send(setpoint(tick, JointMode.POSITION, 0.2, node_id=node))
 
 
 def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():

@@ -74,7 +74,7 @@ def test_a_force_shifts_the_phases_beside_it(gain: float, sign: float) -> None:
             controller.update(free)
         theta = controller._oscillators.theta_rad
         joint = int(np.cos(theta[0]).argmax())
-        contact = make_contact("peg", (0.0, force_n, 0.0), link=joint)
+        contact = make_contact("peg", (0.0, force_n, 0.0), link_index=joint)
         before = float(theta[0, joint])
         controller.update(stage.make_observation(200, 0.3, contacts=[contact]))
         changes.append(float(controller._oscillators.theta_rad[0, joint]) - before)
@@ -86,7 +86,7 @@ def test_no_force_stops_an_oscillator() -> None:
     stage = make_stage(13)
     parameters = CpgParameters(k_theta=0.0, force_gain=-10.0)
     controller = Cpg(stage.robot, parameters)
-    contacts = [make_contact("peg", (0.0, 500.0, 0.0), link=link) for link in range(14)]
+    contacts = [make_contact("peg", (0.0, 500.0, 0.0), link_index=link) for link in range(14)]
     observation = stage.make_observation(0, 0.3, contacts=contacts)
     for _ in range(200):
         feedback = controller._compute_feedback_rad_s(observation.world)

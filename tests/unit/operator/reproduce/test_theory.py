@@ -70,7 +70,7 @@ def test_feet_share_the_weight_and_the_directions_of_their_links() -> None:
 
 @pytest.mark.parametrize(("drag_ratio", "sign"), [(4.0, 1.0), (1.0, 0.0)])
 def test_a_chain_travels_only_on_ground_that_rubs_more_sideways(drag_ratio: float, sign: float) -> None:
-    run = make_serpenoid_run(0.6, 1.0, 1.0, set_viscous(2.0, 2.0 * drag_ratio), modules=6)
+    run = make_serpenoid_run(0.6, 1.0, 1.0, set_viscous(2.0, 2.0 * drag_ratio), module_count=6)
     motion = find_chain_motion(run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 1.0, 1.0), run.friction)
     wave_m_s = run.robot.length_m
     assert motion.speed_m_s / wave_m_s == pytest.approx(0.15 * sign, abs=0.1 if sign else 0.01)
@@ -78,7 +78,7 @@ def test_a_chain_travels_only_on_ground_that_rubs_more_sideways(drag_ratio: floa
 
 
 def test_a_chain_dissipates_what_dragging_costs_and_more() -> None:
-    run = make_serpenoid_run(0.6, 0.8, 1.0, set_skin(0.1, 0.1, 1.0), modules=8)
+    run = make_serpenoid_run(0.6, 0.8, 1.0, set_skin(0.1, 0.1, 1.0), module_count=8)
     motion = find_chain_motion(run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 0.8, 1.0), run.friction)
     weight_n = 9.81 * sum(run.robot.link_masses_kg)
     assert motion.ground_power_w > 0.1 * weight_n * motion.speed_m_s > 0.0
